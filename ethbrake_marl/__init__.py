@@ -111,7 +111,10 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_
 
 
 def _usable() -> list[str]:
-    """Return the public names that can be imported here; using any other name says which extra it needs."""
+    """Return the public names that can be imported with the installed packages.
+
+    Importing one of the other public names raises an error that says which optional extra it needs.
+    """
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]
 

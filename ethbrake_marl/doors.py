@@ -17,7 +17,10 @@ from typing import Any
 
 @cache
 def names_behind(file: str) -> dict[str, str]:
-    """Return name -> module for every import in the ``if TYPE_CHECKING`` block of an ``__init__`` file."""
+    """Return name -> module for every import in the ``if TYPE_CHECKING`` block of an ``__init__``.
+
+    ``file``: path of the ``__init__`` file.
+    """
     content = ast.parse(Path(file).read_text("utf-8")).body
     table = next(part for part in content if isinstance(part, ast.If)).body
     lines = [line for line in table if isinstance(line, ast.ImportFrom)]

@@ -47,15 +47,18 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return a count with its noun, as messages write it: ``1 world``, ``10,000 worlds``."""
+    """Return the number ``n`` with its noun, as messages write it: ``1 world``, ``10,000 worlds``.
+
+    ``thing``: the noun in the singular.
+    """
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the line of code that raised it.
 
-    With ``path``, the line is the last one of that file in the traceback. Errors of this package are returned as their
-    own message.
+    ``path``: the user's file; the line is then the last one of that file in the traceback. None: the innermost line.
+    Errors of this package are returned as their own message.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -128,7 +131,7 @@ class MissingExtra(EthBrakeError, ImportError):
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """Context manager: if an import in the block fails for want of an extra's package, raise ``MissingExtra``.
+    """Context manager: raise ``MissingExtra`` if an import in the block fails for want of an optional extra.
 
     Any other import error passes unchanged.
     """
@@ -196,7 +199,7 @@ class AgentFailed(InvalidInput):
         return one_line(f"agent {self.agent!r}{where}, {self.reason}")
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
-        """Return this error with the row of a larger batch, like ``PhysicsError.renumbered``."""
+        """Return this error with the row of a larger batch: world k here is world ``rows[k]`` there."""
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
     @staticmethod
@@ -220,7 +223,10 @@ class Unfamiliar(UserWarning):
 
 @contextmanager
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
-    """Context manager: name failed worlds by row of a larger batch; ``rows[k]`` is the row of world k there."""
+    """Context manager: a ``PhysicsError`` or ``AgentFailed`` raised in the block is raised again with other rows.
+
+    For a block that works on part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
+    """
     try:
         yield
     except (PhysicsError, AgentFailed) as error:
@@ -228,13 +234,18 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
 
 
 class UncertifiedStep(EthBrakeError):
-    """The engine was asked to make another step than the one its shield certified; the step was not made."""
+    """A step of the engine differs from the step that its shield certified; the step was not made."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown ``name``: it suggests a similar known name, or lists the known ones.
+    """Return the error for an unknown name: it suggests a similar known name, or lists the known ones.
 
-    ``may_be_own``: users can register names of this kind, so the message adds that theirs may not be registered yet.
+    Args:
+        kind: what the name stands for, for example ``scenario``.
+        name: the unknown name.
+        known: the known names.
+        may_be_own: users can register names of this kind, so the message adds that theirs may not be registered yet.
+
     """
     names = sorted(known)
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
@@ -244,7 +255,10 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit)."""
+    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
+
+    ``what`` names the value in the message.
+    """
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"

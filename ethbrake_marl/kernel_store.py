@@ -30,7 +30,7 @@ def cache_folder() -> Path:
 
 
 def is_temporary(folder: Path) -> bool:
-    """Return whether a ``cache_folder`` is deleted when this process ends."""
+    """Return whether ``folder``, a result of ``cache_folder``, is deleted when this process ends."""
     return folder.name.startswith(_TEMPORARY)
 
 

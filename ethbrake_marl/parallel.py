@@ -41,10 +41,11 @@ class WorkerLost(EthBrakeError):
 
 
 def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = None) -> Iterator[Any]:
-    """Run the calls in parallel and yield their results in the order of the calls.
+    """Run function calls in parallel and yield their results in the order of the calls.
 
     Args:
-        calls: functions with their arguments; each call is taken from the iterable shortly before it starts.
+        calls: tuples (function, argument, ...), functions of a module; each is taken from the iterable shortly before
+            it starts.
         jobs: number of calls that run at once. None: one, or as many as Ray has cores. One call at a time runs in this
             process.
         ray: ``local`` for a Ray on this machine alone, or the address of a Ray cluster. None: no Ray.
@@ -80,7 +81,10 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
 
 def _answer(call: bytes) -> Any:
-    """Run a pickled call in a worker; what the call prints goes to stderr."""
+    """Run the pickled call ``(function, argument, ...)`` in a worker and return its result.
+
+    Text that the call prints goes to stderr.
+    """
     _end_with_parent()
     with redirect_stdout(sys.stderr):
         function, *given = pickle.loads(call)
@@ -114,12 +118,33 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
+def own_signals() -> Iterator[None]:
+    """Context manager: restore the caller's signal handlers after the block, in which Ray sets handlers of its own.
+
+    Ray and Ray Tune leave their handlers behind; Tune's would swallow the caller's next Ctrl-C. Does nothing outside
+    the main thread, where no handler can be set.
+    """
+    in_main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()} if in_main else {}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None and signal.getsignal(number) != handler:  # None: not set by Python
+                signal.signal(number, handler)
+
+
+@contextmanager
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
-    """Start joblib's backend; yield its settings and the number of calls that run at once."""
+    """Context manager: start joblib's backend; yield its settings and the number of calls that run at once.
+
+    Arguments are those of ``run_each``.
+    """
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1
         return
-    connected = connect_ray(ray, jobs)
+    with own_signals():
+        connected = connect_ray(ray, jobs)
     from ray.util.joblib import register_ray
 
     register_ray()

@@ -14,12 +14,9 @@ class Progress:
 
     In training a unit is a decision of a learner, and ``total`` is rounded up to whole updates.
 
-    Of a training ``done`` counts decisions of learners, and ``total`` is what they come to in whole updates.
-
     >>> import ethbrake_marl as eb
     >>> eb.Progress("full_brake", 500, 1000)
     Progress(name='full_brake', done=500, total=1000, metrics={}, note='', updates=0, wall_s=0.0)
-
     """
 
     name: str  # "training", the name of an agent, "figures", ...
@@ -33,7 +30,7 @@ class Progress:
 
     @property
     def harm(self) -> str:
-        """Harm in the last evaluation, as text with the name of the count or objective; empty without an evaluation."""
+        """Harm in the last evaluation, as text with its name: ``total harm 24.19``; empty without an evaluation."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
@@ -42,7 +39,10 @@ class Progress:
 
     @staticmethod
     def listener(told: Told) -> OnProgress | None:
-        """Return the progress callback: ``told`` itself, or for ``show`` a callback that prints on stderr."""
+        """Return the function to call with each ``Progress``; None: nobody is informed.
+
+        ``told`` is this function itself, ``"show"`` for one that prints on stderr, or None.
+        """
         return ShownProgress() if told == "show" else told
 
 

@@ -35,17 +35,15 @@ T = TypeVar("T")
 
 
 class Part:
-    """Value of an entry point that needs more than a function or a class.
+    """Value of an entry point: all arguments for a ``register_...`` function but the name, which the entry point has.
 
-    It holds the arguments of the ``register_...`` function of its kind, without the name:
-
-    It holds what the ``register_...`` function of its kind takes behind the name:
+    An entry point in the group ``ethbrake_marl.measures`` that names the part below has the effect of
+    ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):
     ...     '''Largest closing speed of an impact in the line.'''
     >>> part = eb.Part(closing, unit="m/s")
-
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -54,7 +52,12 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return name -> entry points of a group, this package's own first; a name may come from several distributions."""
+    """Return name -> entry points with this name in a group; a list, because several packages may use one name.
+
+    This package's own names come first.
+
+    ``group``: its name without the prefix ``ethbrake_marl.``, for example ``agents``.
+    """
     found: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
     for point in in_order:
@@ -68,7 +71,10 @@ def giver(point: EntryPoint) -> str:
 
 
 def versions_used() -> dict[str, str]:
-    """Return name -> version of every other distribution with a part that was loaded in this process."""
+    """Return name -> version of every other installed package that has added a part, such as an agent, to this process.
+
+    Parts that are registered by entry points but were not loaded do not count.
+    """
     return dict(sorted(_VERSIONS.items()))
 
 
@@ -113,9 +119,10 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load the part with this name if it is not loaded yet, and return the names of all parts it stands for.
+        """Load the part called ``name`` if it is not loaded yet, and return the names of all parts that it defines.
 
-        Raise ``UnknownName`` if there is none.
+        An entry point usually defines the one part; it may define several by a dictionary. Raises ``UnknownName`` if
+        there is none, and ``InvalidInput`` or ``MissingExtra`` if it cannot be loaded.
         """
         given = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in given]
@@ -155,9 +162,10 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add a part under ``name``. Raise ``AlreadyExists`` if the name has another part.
+        """Add ``part`` under ``name``; raise ``AlreadyExists`` if the name belongs to another part.
 
-        ``is_same`` says whether a part that already has the name equals the new one; adding it again is then allowed.
+        ``is_same`` is called with the part that has the name and returns whether it equals the new one; if so, nothing
+        changes.
         """
         if name not in self.loaded and name in self and name not in self._loading:
             self.load(name)
@@ -173,7 +181,7 @@ class Registry(Mapping[str, T]):
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Load a part; return the error message if that fails, otherwise None."""
+        """Load the part called ``name``; return the error message if that fails, otherwise None."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:
@@ -181,7 +189,7 @@ class Registry(Mapping[str, T]):
         return None
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """Return the error for a name that no part has.
+        """Return the error for a ``name`` that no part has.
 
         ``known``: names to suggest or list; None: all names of this registry.
         """

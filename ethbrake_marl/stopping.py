@@ -13,9 +13,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Context manager: yield a function that returns whether to stop; a second Ctrl-C or SIGTERM has its usual effect.
+    """Context manager: yield a function that returns whether Ctrl-C or SIGTERM has asked to stop.
 
-    Outside the main thread, where Python delivers no signals, the function always returns False.
+    A second Ctrl-C or SIGTERM has its usual effect. Outside the main thread, where Python delivers no signals, the
+    function always returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():

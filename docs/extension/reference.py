@@ -12,7 +12,7 @@ from ethbrake_marl import ethbrake_v0
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.app import Installed, whole_command
-from ethbrake_marl.evaluation.measures import measures
+from ethbrake_marl.evaluation.measure_sets import measures
 from ethbrake_marl.game.features import Feature
 from ethbrake_marl.game.full_state import state_features
 from ethbrake_marl.game.measures import BUILT_IN

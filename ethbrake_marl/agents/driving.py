@@ -22,20 +22,30 @@ from ethbrake_marl.scenario.schema import Scenario
 
 @dataclass(frozen=True, slots=True)
 class Episodes:
-    """Result of a batch of episodes."""
+    """Result of running a batch of n episodes (worlds) to their ends."""
 
-    ledger: Ledger
+    ledger: Ledger  # harm and impacts of every pair of vehicles over the whole episode
     final: Worlds  # each world at the end of its episode
     at_rest: Bools  # [n] whether the line came to rest; otherwise the episode ended at the horizon
     guarded: Any  # memory of the shield at the end; None without a shield
-    memories: Mapping[int, Memory]  # controlled vehicle -> memory of its agent at the end
-    terms: Mapping[str, Floats] = field(default_factory=dict)  # reward terms summed over the episodes, [n] or [n, N]
+    memories: Mapping[int, Memory]  # index of a controlled vehicle -> memory of its agent at the end
+    terms: Mapping[str, Floats] = field(default_factory=dict)  # name of a reward term -> its sum, [n] or [n, N]
 
     @classmethod
     def of(
         cls, engine: Engine, worlds: Worlds, watched_by: Sequence[Watch] = (), summed: Sequence[str] = ()
     ) -> Episodes:
-        """Run an ``episode_engine`` from the first decision in ``worlds`` to the end; raise ``PhysicsError``."""
+        """Run an engine from the first decision to the end of every episode.
+
+        Args:
+            engine: an engine made by ``episode_engine``, not stepped yet.
+            worlds: the engine's worlds at the alert; observers get them as ``before`` of the first step.
+            watched_by: observers that are called after every step.
+            summed: names of reward terms to sum over the episodes.
+
+        Raises ``PhysicsError`` naming the worlds that could not be advanced.
+
+        """
         at_rest = np.zeros(worlds.n, np.bool_)
         terms: dict[str, Floats] = {}
         now = _show(watched_by, worlds, engine, engine.worlds.command_mps2)
@@ -59,16 +69,27 @@ class Watch(Protocol):
     """Observer of every step of a batch of episodes."""
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Called with a step: ``before`` moves to the times ``until_s`` [n] under ``command_mps2`` [n, N].
+        """Receive one step, or a part of it, of all n worlds.
 
-        Ended worlds stay at their times. The first step is from the alert to the first decision. If a script decides
-        within a step, the step is passed in parts. The arguments must not be changed.
+        The first step is from the alert to the first decision. A step within which a script decides arrives in parts.
+
+        Args:
+            before: the worlds at the start of the step. Do not change any of the arguments.
+            command_mps2: command of every vehicle during the step, [n, N] m/s2.
+            until_s: time of each world at the end of the step, [n] s. A world whose episode has ended keeps its time.
+
         """
         ...
 
 
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Return vehicle -> agent for the scenario's scripts, without the vehicles in ``except_for``."""
+    """Return the agents of the scenario's scripts: vehicle index (0 = front) -> agent.
+
+    Args:
+        scenario: the scenario.
+        except_for: index or indices of vehicles to leave out; None: none.
+
+    """
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
     return {i: make_role(scenario, i) for i in scenario.scripts if i not in left_out}
 
@@ -76,12 +97,22 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
 def episode_engine(
     worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, reward: Reward = "harm"
 ) -> Engine:
-    """Return an engine over ``worlds`` in which ``agent`` drives ``vehicle``, or a team drives its vehicles.
+    """Return an engine in which agents drive whole episodes; step it with ``engine.step({})`` until all have ended.
 
-    The other vehicles follow their scripts. The agents decide when their first vehicle's latency has elapsed and every
-    time step after that, like learners; their commands are applied without rounding. Behind a shield they propose
-    commands, and the engine treats their vehicles as learners. An agent that looks ahead knows the scripts, and assumes
-    that other controlled vehicles brake fully. Raises ``InvalidInput`` for a learner without an agent.
+    The agents decide when the latency of the first of their vehicles has elapsed and every time step after that, like
+    learners; their commands are applied without rounding. Behind a shield they propose commands, and the engine treats
+    their vehicles as learners. An agent that looks ahead knows the scripts, and assumes that other controlled vehicles
+    brake fully.
+
+    Args:
+        worlds: n worlds at the alert.
+        agent: an agent for ``vehicle``, or a team, which has its own vehicles.
+        scenario: scenario whose scripts drive the other vehicles.
+        vehicle: index of the agent's vehicle (0 = front); None for a team.
+        reward: reward whose terms the engine computes.
+
+    Raises ``InvalidInput`` if one of the scenario's learners gets no agent.
+
     """
     team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
     drivers = team.drivers
@@ -114,11 +145,18 @@ def drive(
     worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, *,
     watched_by: Sequence[Watch] = (), summed: Sequence[str] = (),
 ) -> Episodes:  # fmt: skip
-    """Let ``agent`` drive ``vehicle``, or a team its vehicles, in every world from t = 0 to the end of its episode.
+    """Let an agent or a team drive in every world from the alert (t = 0) to the end of its episode.
 
-    ``watched_by`` sees every step. ``summed`` names reward terms to sum over the episodes, with the default settings of
-    ``RewardParams``. Raises ``PhysicsError`` with all worlds that could not be advanced; the others are valid without
-    them.
+    Args:
+        worlds: n worlds at the alert.
+        agent: an agent for ``vehicle``, or a team, which has its own vehicles.
+        scenario: scenario whose scripts drive the other vehicles.
+        vehicle: index of the agent's vehicle (0 = front); None for a team.
+        watched_by: observers that are called after every step.
+        summed: names of reward terms to sum over the episodes, with the default settings of ``RewardParams``.
+
+    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others can be driven without them.
+
     """
     reward: Reward = {"harm": 1.0} | dict.fromkeys(summed, 1.0) if summed else "harm"
     engine = episode_engine(worlds, agent, scenario, vehicle, reward)
@@ -126,7 +164,15 @@ def drive(
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
-    """Show the step that the engine has just made to the observers; return the worlds after it."""
+    """Pass the step that the engine has just made to the observers; return the worlds after it.
+
+    Args:
+        watched_by: the observers; without any, ``before`` is returned.
+        before: the worlds at the start of the step.
+        engine: the engine, after the step.
+        command_mps2: command of every vehicle during the step, [n, N] m/s2.
+
+    """
     if not watched_by:
         return before
     now = engine.packed.worlds(before.vehicles)  # same episodes, same vehicles
@@ -137,10 +183,10 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 
 
 def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
-    """Return the commands that ``agent`` gives ``vehicle`` in the first ``steps`` decisions, [n, steps] m/s2.
+    """Return the first ``steps`` commands that ``agent`` gives ``vehicle`` (index, 0 = front), [n, steps] m/s2.
 
-    ``worlds`` are at the alert. After the end of an episode its last command is repeated. Raises ``PhysicsError`` with
-    the worlds that cannot be driven to the end.
+    ``worlds`` are n worlds at the alert. Once an episode has ended, its last command is repeated. Raises
+    ``PhysicsError`` naming the worlds that cannot be driven to the end.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
@@ -150,9 +196,16 @@ def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: 
 
 
 def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
-    """Run an episode engine to the end; return ``column()`` [n, K] after each of the first steps, [n, steps, K].
+    """Run an engine to the end of all episodes and record a value after each of the first ``steps`` steps.
 
-    NaN after the end of an episode. Raises ``PhysicsError``.
+    Args:
+        engine: an engine made by ``episode_engine``.
+        steps: number of steps to record.
+        column: returns the present values of the engine's n worlds, [n, K].
+
+    Returns [n, steps, K], NaN after the end of an episode. Raises ``PhysicsError`` naming worlds that could not be
+    advanced.
+
     """
     columns = np.full((steps, *column().shape), np.nan)
     while not engine.ended.all():

@@ -25,11 +25,11 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 
-State = Any  # arrays whose first axis is the world, or tuples, lists and mappings of arrays
+State = Any  # memory of a policy: arrays whose first axis is the world, or tuples, lists and mappings of such arrays
 
-Infer = Callable[[Observations, State], tuple[Any, State]]
+Infer = Callable[[Observations, State], tuple[Any, State]]  # (observations [n, F], memory) -> (actions, new memory)
 
-Begin = Callable[[int], State]  # returns the memory of n episodes at their start
+Begin = Callable[[int], State]  # number of episodes -> memory at their start
 
 _KINDS = (
     "a function of observations, an object with predict, a torch module, an ONNX session or the path of an .onnx file"
@@ -37,9 +37,16 @@ _KINDS = (
 
 
 def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | None) -> tuple[Infer, Begin | None]:
-    """Return a policy as a function ``(observation, state) -> (action, state)``, and what makes its initial state.
+    """Return two functions for a policy: ``(observations, state) -> (actions, state)``, and ``n -> initial state``.
 
-    The second result is None for a policy without a state. Raises ``InvalidInput`` if it is not a policy.
+    Args:
+        policy: a policy of one of the kinds that ``policy_agent`` accepts.
+        name: name of the agent in error messages.
+        features: number F of features in an observation.
+        initial_state: for a function or torch module with a memory: makes the memory of n episodes at their start.
+
+    The second result is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is not a policy.
+
     """
     if isinstance(policy, str | os.PathLike):
         policy = _open_onnx(Path(policy), name)
@@ -68,9 +75,16 @@ def _without_memory(action: Any) -> Any:
 
 
 def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
-    """Adapt a model with ``predict``; a state that it returns (sb3-contrib's recurrent models) is kept in memory.
+    """Adapt a model with a method ``predict`` (Stable-Baselines3, sb3-contrib), as ``adapt_policy`` does.
 
-    The state's axis of worlds is found by predicting for two worlds and for three.
+    A memory that it returns (recurrent models) is kept. Which axis of the memory counts the worlds is found by
+    predicting for two worlds and for three.
+
+    Args:
+        model: the model.
+        name: name of the agent in error messages.
+        features: number of features in an observation.
+
     """
 
     def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
@@ -135,7 +149,7 @@ def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
 
 
 def _is_torch_module(policy: Any) -> bool:
-    """Return whether ``policy`` is a torch module. Never imports torch: whoever has a module has imported it."""
+    """Return whether ``policy`` is a torch module. Never imports torch: without torch in memory, nothing is one."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(policy, torch.nn.Module)
 
@@ -152,9 +166,10 @@ def _open_onnx(path: Path, name: str) -> Any:
 
 
 def weights_sha256(policy: Any) -> str | None:
-    """Return the SHA-256 of an .onnx file, or of the present weights of a torch module or Stable-Baselines3 model.
+    """Return the SHA-256 of an .onnx file (given by its path), or of the present weights of a torch or SB3 model.
 
-    The statistics of a ``VecNormalize`` count as weights. None for any other policy, whose weights cannot be read.
+    The statistics of a ``VecNormalize`` count as weights. Returns None for any other policy, whose weights cannot be
+    read.
     """
     if isinstance(policy, str | os.PathLike):
         return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
@@ -174,7 +189,7 @@ def weights_sha256(policy: Any) -> str | None:
 
 
 def to_array(value: Any) -> NDArray[Any]:
-    """Return an array or tensor as an array; masked entries become NaN."""
+    """Return an array, torch tensor or sequence as a NumPy array; masked entries become NaN."""
     if isinstance(value, np.ma.MaskedArray):
         return np.ma.filled(value.astype(np.float64), np.nan)
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
@@ -207,9 +222,9 @@ def policy_agent(
         initial_state: makes the memory of ``n`` episodes at their start: an array whose first axis is the world, or
             tuples and mappings of arrays. None: a function has no memory.
         clip: clip actions to [-1, 1]; by default an action beyond is an error.
-        appended: ``number`` or ``state``, as for ``make_sb3_vec_env``, if the policy was trained on such rows; needs
-            the scenario with its learners. None: as in the model's environment. A policy that gets ``state`` knows the
-            true state of the line.
+        appended: what training appended to each observation: ``number`` (the learner's number) or ``state`` (the true
+            state of the line), as for ``make_sb3_vec_env``; needs the scenario with its learners. None: as in the
+            model's training environment, or nothing.
         ignore_wrappers: accept a model even if wrappers of its training may have changed observations or actions, if
             its actions have other bounds, or if the statistics of its ``VecNormalize`` are missing.
 
@@ -261,7 +276,11 @@ def policy_agent(
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
-    """Return a function of worlds and vehicle that returns what follows the own observation, [n, features]."""
+    """Return a function ``(worlds, vehicle)`` that computes the K features appended to a vehicle's observation, [n, K].
+
+    ``appended`` is ``number`` (the vehicle's number among the scenario's learners) or ``state`` (the true state of the
+    whole line).
+    """
 
     def number(worlds: Worlds, vehicle: int) -> Observations:
         if vehicle not in scenario.learners:
@@ -306,7 +325,14 @@ class PolicyAgent:
         return self.weights_sha256()
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the memory before the first decision, with the policy's initial state."""
+        """Return the agent's memory before the first decision, with the policy's initial state.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: the scripts of the line; not used.
+
+        """
         n, state = alert.n, None
         try:
             if self._initial_state is not None:
@@ -316,7 +342,7 @@ class PolicyAgent:
         return {"steps": np.zeros(n, np.int64), "state": state}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the commanded acceleration, [n] m/s2, and the new memory.
+        """Return the commanded acceleration of ``vehicle``, [n] m/s2, and the agent's new memory.
 
         Raises ``AgentFailed`` naming world and step if the policy raises, or returns a wrong shape, a value that is not
         a number, or one outside [-1, 1].
@@ -341,14 +367,20 @@ class PolicyAgent:
             raise AgentFailed(self.name, k, reason) from error
 
     def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
-        """Return the policy's actions for some rows of the batch, and its new memory of them."""
+        """Return the policy's raw actions for the worlds with the indices ``rows``, and its new memory of these worlds.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
         if self._initial_state is None:
             return to_array(self._infer(seen[rows], None)[0]), None
         action, state = self._infer(seen[rows], take_memory(state, rows))
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Return a row that fails on its own, found by bisection; None if neither half fails."""
+        """Return the index of a world for which the policy alone raises, found by bisection; None if there is none.
+
+        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        """
 
         def fails(rows: Ints) -> bool:
             try:
@@ -367,7 +399,10 @@ class PolicyAgent:
         return int(rows[0])
 
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
-        """Check the actions and return them as [n] in [-1, 1]."""
+        """Return a policy's raw actions as [n] in [-1, 1]; raise ``AgentFailed`` for wrong shapes or values.
+
+        ``seen``, ``worlds`` and ``steps`` [n] (steps taken) are used in the message only.
+        """
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
             first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0

@@ -38,9 +38,9 @@ _INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attribute
 
 
 def changes(layer: type[Any]) -> bool:
-    """Return whether a wrapper or environment may change observations or actions.
+    """Return whether a class of wrappers or environments may change observations or actions.
 
-    It does not if each of its methods is defined by a class in ``HARMLESS`` or by a class of this package.
+    A class does not if each of its methods is defined by a class in ``HARMLESS`` or by a class of this package.
     """
     for method in _METHODS:
         definer = next((each for each in layer.__mro__ if method in vars(each)), object)
@@ -56,14 +56,23 @@ class _WhatChanges(type):
 
 
 class _Changing(metaclass=_WhatChanges):
-    """Class whose instances are all objects that ``changes``, for ``env_is_wrapped``, which asks in another process."""
+    """Stand-in class for ``env_is_wrapped``: every object whose class may change something is an instance of it.
+
+    ``env_is_wrapped`` also runs in other processes, where ``changes`` cannot be called directly.
+    """
 
 
 def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False) -> Any:
-    """Return this package's environment in which a Stable-Baselines3 model is trained, unwrapped; None without one.
+    """Return this package's environment inside the training environment of a Stable-Baselines3 model.
 
-    Raises ``InvalidInput`` for a wrapper, in any copy, that may change observations or actions, for copies with
-    different features, and for missing statistics of ``VecNormalize``.
+    Args:
+        model: any policy; returns None for one that has no environment, or none of this package.
+        name: name of the agent in error messages.
+        ignore_wrappers: accept everything that raises an error otherwise.
+
+    Raises ``InvalidInput`` for a wrapper, in any copy of the environment, that may change observations or actions; for
+    copies with different features; and for missing statistics of ``VecNormalize``.
+
     """
     statistics = normalisation(model)
     if statistics is None and not ignore_wrappers and _was_normalised(model):
@@ -98,10 +107,10 @@ def normalisation(model: Any) -> Any:
 
 
 def _was_normalised(model: Any) -> bool:
-    """Return whether a model's saved training data show that its observations were normalised.
+    """Return whether the saved training data of a Stable-Baselines3 model show that its observations were normalised.
 
-    They were if the last observation lies outside the space, or its original is saved too. Off-policy algorithms always
-    save an original, so for them only the space counts.
+    They were if the last observation lies outside the observation space, or its original is saved too. Off-policy
+    algorithms always save an original, so for them only the space counts.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True
@@ -111,7 +120,10 @@ def _was_normalised(model: Any) -> bool:
 
 
 def _layers(env: Any) -> Iterator[Any]:
-    """Yield an environment and all layers inside, in every copy, from the outside in, down to this package's."""
+    """Yield an environment, then every wrapper and environment inside it, from the outside in, in every parallel copy.
+
+    It stops at environments of this package.
+    """
     yield env
     for name in [] if _is_ours(env) else _INSIDE:
         inside = _own(env).get(name, [])
@@ -120,7 +132,16 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
-    """Return the name of a layer that may change something, otherwise None, and this package's environments in it."""
+    """Return which class of a layer may change observations or actions, and this package's environments in it.
+
+    Args:
+        layer: one wrapper or environment, from ``_layers``.
+        name: name of the agent in error messages.
+
+    The first result is the name of that class; None if the layer changes nothing. The environments are the layer itself
+    or, if it runs environments in other processes, those.
+
+    """
     if changes(type(layer)):
         modifier = _own(layer).get("modifier_class", type(layer))  # the modifier of a SuperSuit wrapper
         return getattr(modifier, "__name__", type(layer).__name__), [layer] if _is_ours(layer) else []
@@ -143,5 +164,5 @@ def _is_ours(env: Any) -> bool:
 
 
 def _own(layer: Any) -> dict[str, Any]:
-    """Return the attributes of a layer itself; wrappers also forward those of the wrapped environment."""
+    """Return the attributes of a wrapper or environment itself, without those that it forwards from inside."""
     return getattr(layer, "__dict__", {})

@@ -20,16 +20,18 @@ class LearnedPolicy(Protocol):
 
     @property
     def observation(self) -> ObservationSpec:
-        """The observation that the policy takes."""
+        """The observation that the policy takes: its features and their order."""
         ...
 
     def __call__(self, observation: Observations, /) -> Observations:
-        """Map observation [n, F] to action [n, 1] in [-1, 1], each row independently."""
+        """Return the action of each observation: [n, F] -> [n, 1] in [-1, 1]; rows do not influence each other."""
         ...
 
 
 class LearnedAgent(ByPolicy):
-    """Agent that drives one vehicle by a policy's deterministic action; has no memory between steps.
+    """Agent that drives one vehicle by the deterministic action of a ``policy``; it has no memory between steps.
+
+    ``name`` stands in tables and error messages.
 
     >>> import ethbrake_marl as eb
     >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
@@ -44,7 +46,7 @@ class LearnedAgent(ByPolicy):
         self.name = name
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return the commanded acceleration, [n] m/s2; a world's command does not depend on the rest of the batch."""
+        """Return the commanded acceleration of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
         action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
         if action.shape != (worlds.n, 1):
             raise InvalidInput(

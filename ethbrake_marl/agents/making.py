@@ -40,8 +40,8 @@ def make_agent(
             none.
         scenario: scenario, its name or the path of its file; needed by teams, by wrappers, and to find the shipped
             policy for this scenario.
-        harm_count: harm that an optimising agent minimises, ``first`` or ``total``.
-        horizon_s: time until which it looks ahead, s; None: the scenario's horizon, or 8 s.
+        harm_count: impacts whose harm an optimising agent minimises: ``first`` (each pair's first) or ``total`` (all).
+        horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: upper limit for the candidates of a search, to try an agent out quickly.
         uncertainty: what a shield for uncertain worlds does not know, for example ``"gaps_m=0.5"``.
         time_step_s: time between two decisions for agents that search or follow a control law; None: the scenario's, or
@@ -86,10 +86,11 @@ def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
 
 
 def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None = None) -> Agent:
-    """Make the agent for the role of ``vehicle`` in the scenario, optimising first-impact harm.
+    """Make the agent that the scenario assigns to ``vehicle`` (index, 0 = front) as its script.
 
-    ``most_candidates`` is as in ``make_agent``. Raises what ``make_agent`` raises, and ``InvalidInput`` for a wrapper,
-    and for a team without this vehicle.
+    An optimising agent minimises first-impact harm. ``most_candidates`` is the upper limit for the candidates of a
+    search; None: no limit. Raises what ``make_agent`` raises, and ``InvalidInput`` for a script with a shield or search
+    around it, and for a team without this vehicle.
     """
     spec = scenario.scripts[vehicle]
     name, _, argument = spec.partition(":")
@@ -110,7 +111,8 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 def find_entry(spec: AgentSpec | str) -> Entry:
     """Return the registry's entry of an agent.
 
-    Raises ``UnknownName`` with a suggestion; ``InvalidInput`` for an argument or a policy that the agent does not take.
+    ``spec`` is a specification such as ``planner:64`` or ``ppo@shipped``, as a text or parsed. Raises ``UnknownName``
+    with a suggestion for an unknown agent; ``InvalidInput`` for an argument or a policy that the agent does not take.
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
@@ -130,7 +132,17 @@ def find_entry(spec: AgentSpec | str) -> Entry:
 
 
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-    """Make the driver of an entry; check it, and turn errors of other people's agents into ``InvalidInput``."""
+    """Make an agent or a team from its registry entry, and check it.
+
+    Errors of agents from outside this package become ``InvalidInput``.
+
+    Args:
+        entry: the entry.
+        argument: text after the colon in the specification; None without one.
+        settings: passed on.
+        inside: for a shield or a search, the agent or team that it goes around.
+
+    """
     try:
         driver = entry.call(argument, settings, *inside)
     except Exception as error:
@@ -143,10 +155,11 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
 
 
 def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
-    """Return what the named function of a Python file makes, called with argument and settings, or without arguments.
+    """Call the function in a Python file that ``settings.spec`` names (``FILE.py:FUNCTION``), and return its result.
 
-    A function without parameters takes neither argument nor policy. Raises ``InvalidInput`` if one is given, and if
-    something is wrong with the file.
+    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``; a function
+    without parameters is called without arguments. Raises ``InvalidInput`` if such a function is given an argument or a
+    policy, and if the file cannot be loaded.
     """
     named = parse_spec(settings.spec).file
     assert named is not None

@@ -32,13 +32,18 @@ class Source(StrEnum):
 
 
 class Knowledge(tuple[Source, ...]):
-    """Sources in the order of ``Source``, each once."""
+    """Set of sources of knowledge: a tuple of ``Source`` values in increasing order, each once."""
 
     @classmethod
     def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
-        """Return the combined knowledge of agents or teams, and of a wrapper around them (``also``).
+        """Return the combined knowledge of several agents or teams.
 
-        An agent without ``knows`` counts as ``UNSTATED``. Raises ``InvalidInput`` for an unknown source.
+        Args:
+            agents: agents or teams; one without an attribute ``knows`` counts as ``UNSTATED``.
+            also: knowledge that a shield or search around them adds; None: none.
+
+        Raises ``InvalidInput`` for an unknown source.
+
         """
         known = set() if also is None else {also}
         for agent in agents:
@@ -56,12 +61,12 @@ class Knowledge(tuple[Source, ...]):
 
     @property
     def text(self) -> str:
-        """Sources as text, ``messages + true model``; a dash for none, as for a team without agents."""
+        """The sources as one text, such as ``messages + true model``; a dash if there are none."""
         return " + ".join(self) or "–"
 
     @property
     def sees_through(self) -> bool:
-        """Whether it includes information about the line that no channel transmitted."""
+        """Whether the true state or the true model, which no message or sensor delivers, is among the sources."""
         return Source.STATE in self or Source.MODEL in self
 
 
@@ -95,11 +100,18 @@ class Agent(Script, Protocol):
 
     """
 
-    name: str
+    name: str  # name in tables and messages
 
 
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
-    """Raise ``InvalidInput`` unless ``agent`` is an agent or, without ``alone``, a team or a shielded driver."""
+    """Raise ``InvalidInput`` unless ``agent`` is an agent.
+
+    Args:
+        agent: any object.
+        where: beginning of the error message, for example ``agent 'mine'``.
+        alone: accept only an agent for one vehicle; if False, also a team or a driver behind a shield.
+
+    """
     if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
         missing = [what for what in ("name", "act") if not hasattr(agent, what)]
         raise InvalidInput(
@@ -121,11 +133,19 @@ def fixed_commands(
     is_fixed: Callable[[Script], bool] = is_state_free,
     advice: str = ADVICE,
 ) -> Floats:
-    """Return every vehicle's constant command from the alert on, [n, N] m/s2; vehicles without a script brake fully.
+    """Return every vehicle's constant command from the alert on, [n, N] m/s2, for an agent that looks ahead.
 
-    ``worlds`` are at the alert. ``who`` names the agent that looks ahead; it drives ``vehicle``, whose script is
-    ignored. Raises ``InvalidInput``, beginning with ``who`` and ending with ``advice``, for a script whose command is
-    not fixed at the alert according to ``is_fixed``; and where messages lack a piece that looking ahead needs.
+    Args:
+        scripts: index of each scripted vehicle -> its script; vehicles without a script brake fully.
+        worlds: n worlds at the alert.
+        who: name of the agent that looks ahead; errors begin with it.
+        vehicle: index of the vehicle that this agent drives, whose script is ignored; None: none.
+        is_fixed: whether the command of a script is fixed at the alert.
+        advice: end of the error message.
+
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, for worlds whose braking profiles are
+    not those of the scripts, and where messages lack a piece that looking ahead needs.
+
     """
     if vehicle is not None:
         refuse_untold(worlds, [vehicle], who)
@@ -149,22 +169,25 @@ def fixed_commands(
 
 
 class ByPolicy:
-    """Base class of agents that use a ``policy``, or wrap an agent that does; it identifies the policy."""
+    """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps.
 
-    policy: Any
+    It derives the hash and the manifest from ``policy``, which a subclass sets; nothing has to be overridden.
+    """
+
+    policy: Any  # the trained policy, or the wrapped agent
 
     def policy_sha256(self) -> str | None:
-        """Return the hash of the policy; None without a policy, or if the policy has no hash."""
+        """Return the SHA-256 of the policy; None without a policy, or if the policy has no hash."""
         return policy_sha256(self.policy)
 
     @property
     def manifest(self) -> Any:
-        """Manifest of the policy; None without one."""
+        """Manifest of the policy's bundle (its origin, network and hashes); None for a policy without a bundle."""
         return getattr(self.policy, "manifest", None)
 
 
 def policy_sha256(agent: object) -> str | None:
-    """Return the hash of the policy that an agent uses, inside any wrappers; None without one.
+    """Return the SHA-256 of the policy that an agent uses, also inside shields and searches; None without a policy.
 
     For a policy bundle it is the hash in its manifest, which covers names, network and weights. For a policy of another
     library it is the hash of its weights.
@@ -174,9 +197,11 @@ def policy_sha256(agent: object) -> str | None:
 
 
 class AgentAround(ByPolicy):
-    """Base class of agents that wrap a ``policy``, which is any agent; subclasses define only what differs.
+    """Base class of agents that wrap another agent, called ``policy``.
 
-    ``adds`` is knowledge beyond the policy's. By default the memory is the policy's.
+    By default everything is passed to the wrapped agent. A subclass overrides ``begin``, ``act`` or both. The class
+    attribute ``adds`` is the knowledge that it has beyond the wrapped agent's, for example ``Source.MODEL``; None: no
+    more. ``name`` is the new agent's name; None: the wrapped agent's name.
     """
 
     adds: ClassVar[Source | None] = None
@@ -187,38 +212,48 @@ class AgentAround(ByPolicy):
 
     @property
     def knows(self) -> Knowledge:
-        """Knowledge of the policy, plus what the wrapper adds."""
+        """Knowledge of the wrapped agent, plus ``adds``."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @property
     def time_step_s(self) -> float | None:
-        """Time step that the policy requires (s); None: any."""
+        """Time between two decisions that the wrapped agent requires (s); None: any."""
         return getattr(self.policy, "time_step_s", None)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the policy's initial memory."""
+        """Return the wrapped agent's initial memory.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: index of each scripted vehicle -> its script.
+
+        """
         return begin_script(self.policy, alert, vehicle, scripts)
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the policy's command, [n] m/s2, and its new memory."""
+        """Return the wrapped agent's command for ``vehicle``, [n] m/s2, and its new memory."""
         return ask_script(self.policy, worlds, memory, vehicle)
 
 
 @runtime_checkable
 class Shielding(Protocol):
-    """A driver behind a shield that is not assigned to vehicles yet."""
+    """Interface of an agent or team behind a shield, before it is known which vehicles it drives."""
 
-    name: str
+    name: str  # name in tables and messages
 
     @property
     def knows(self) -> Knowledge:
-        """Knowledge of the driver, including the shield's."""
+        """Combined knowledge of the agents and the shield."""
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return the team that drives these vehicles."""
+        """Return the team, with this shield, that drives the vehicles with these indices (0 = front)."""
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """Return the shield for an engine; ``policies`` maps each learner to the agent that proposes its commands."""
+        """Return the shield's part that checks commands in ``engine``.
+
+        ``policies`` maps the index of each learner to the agent that proposes its commands.
+        """
 
 
 class Team:
@@ -245,12 +280,15 @@ class Team:
 
     @property
     def knows(self) -> Knowledge:
-        """Combined knowledge of the agents and the shield; empty without agents."""
+        """Combined knowledge of the agents and the shield; empty for a team without agents."""
         return Knowledge.of(*self.drivers.values(), *(() if self.shield is None else (self.shield,)))
 
     @staticmethod
     def of(driver: Driver, vehicles: Collection[int]) -> Team:
-        """Return the team for ``vehicles``; a single agent drives all. Raise ``InvalidInput`` for a team of others."""
+        """Return the team in which ``driver`` drives the vehicles with the indices ``vehicles`` (0 = front).
+
+        A single agent drives all of them. Raises ``InvalidInput`` for a team that drives other vehicles.
+        """
         if isinstance(driver, Shielding):
             return driver.on(vehicles)
         if not isinstance(driver, Team):

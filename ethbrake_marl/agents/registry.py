@@ -20,32 +20,41 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """An entry of the registry: an agent, or a wrapper (a shield or search)."""
+    """Entry of the registry: an agent, or a wrapper, which is a shield or a search that goes around an agent.
 
-    name: str
-    form: str  # how it is written; no argument if there is no ":", no policy if there is no "@"
+    A wrapper is written after a ``+``: ``ppo+step`` is the agent ``ppo`` inside the shield ``step``.
+    """
+
+    name: str  # plain name, without argument
+    form: str  # how it is written, as "name[:ARGUMENT][@POLICY]"; without ":" no argument, without "@" no policy
     about: str  # description in one line
-    knows: Source | Sequence[Source]  # knowledge while driving; for a wrapper: knowledge that it adds
-    make: Factory | Wrapper
-    inner: bool = False  # for a wrapper: it goes directly around the agent, inside a shield
-    teams: bool = False  # for a wrapper: it can go around a team too
-    needs: Mapping[str, object] = field(default_factory=dict)  # required settings -> an example
-    options: type | None = None  # settings class of a shield that also goes around environments
+    knows: Source | Sequence[Source]  # knowledge of the agent while it drives; for a wrapper: knowledge that it adds
+    make: Factory | Wrapper  # function that makes the agent, or makes the wrapper around an agent
+    inner: bool = False  # whether a wrapper goes directly around the agent, inside a shield
+    teams: bool = False  # whether a wrapper can go around a team too
+    needs: Mapping[str, object] = field(default_factory=dict)  # name of a required ``AgentSettings`` -> an example
+    options: type | None = None  # settings class of a shield that can also go around an environment
 
     @property
     def is_ours(self) -> bool:
-        """Whether this package makes the agent; errors of other agents are reported as theirs."""
+        """Whether this package makes the agent; an error in someone else's agent is reported with the agent's name."""
         is_from_file = ":" in self.name
         return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
     @property
     def whole_form(self) -> str:
-        """How it is written, including its variants."""
+        """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:believed]``.
+
+        A variant is a last word that selects another function to make the agent or wrapper.
+        """
         return self.form + "".join(f"[:{variant}]" for variant in variants_of(self.name))
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Everything that may be written after the ``+`` for a wrapper whose arguments are fixed words."""
+        """Every way to write a wrapper after the ``+`` of a specification, for example ``("step", "step:believed")``.
+
+        Only for a wrapper whose ``form`` lists all arguments that it takes.
+        """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         found = [name]
         for option in options:
@@ -53,12 +62,20 @@ class Entry:
         return tuple(found)
 
     def takes(self, argument: str) -> bool:
-        """Return whether a wrapper takes this argument; empty: no argument."""
+        """Return whether a wrapper takes this argument, the text after the colon; an empty text means no argument."""
         name = self.words[0]
         return "[:ARGUMENT]" in self.form or (f"{name}:{argument}" if argument else name) in self.words
 
     def call(self, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-        """Make the agent; a wrapper is put around ``inside``."""
+        """Make the agent or wrapper.
+
+        Args:
+            argument: text after the first colon, such as ``pairwise``; if its last word is a registered variant
+                (``pairwise:believed``), the variant's function is called. None: no argument.
+            settings: passed on to the function that makes it.
+            inside: for a wrapper, the one agent or team that it goes around.
+
+        """
         make: Any = self.make
         before, _, last = (argument or "").rpartition(":")
         if last in variants_of(self.name):
@@ -68,7 +85,10 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the entry of a wrapper as written after a ``+``."""
+    """Return the entry of a shield or search; ``each`` is its text in a specification, such as ``episode:pairwise``.
+
+    In ``ppo+episode:pairwise`` this is the text after the ``+``.
+    """
     return SHIELDS[each.partition(":")[0]]
 
 
@@ -78,13 +98,20 @@ def agent_names() -> tuple[str, ...]:
 
 
 def agent_entries() -> tuple[Entry, ...]:
-    """Return the entries of all agents and then of all wrappers that can be loaded, each with its variants."""
+    """Return the entries of all agents, then of all shields and searches, that can be loaded.
+
+    The form and description of an entry include its variants.
+    """
     agents = [entry for name, entry in AGENTS.usable().items() if name != PROFILE]
     return tuple(_with_variants(entry) for entry in (*agents, *SHIELDS.usable().values()))
 
 
 def _with_variants(entry: Entry) -> Entry:
-    """Return the entry with the forms and descriptions of its variants that can be loaded, for a list."""
+    """Return ``entry`` with its variants added to ``form`` and ``about``, as far as they can be loaded.
+
+    A variant is a last word that selects another function: ``e_v2x_bm`` becomes ``e_v2x_bm[:believed]``, with the
+    variant's description.
+    """
     usable = VARIANTS.usable()
     for word in variants_of(entry.name):
         if variant := usable.get(f"{entry.name}.{word}"):
@@ -93,65 +120,89 @@ def _with_variants(entry: Entry) -> Entry:
 
 
 def agents_refused() -> list[str]:
-    """Return why some of the installed agents, shields and variants cannot be loaded."""
+    """Return one sentence for each registered agent, shield or variant of one that cannot be loaded, with the reason.
+
+    The list is empty if everything can be loaded.
+    """
     found = [each.why_not(name) for each in (AGENTS, SHIELDS, VARIANTS) for name in each]
     return [reason for reason in found if reason is not None]
 
 
 def around_forms() -> tuple[str, ...]:
-    """Return everything that may follow a ``+``."""
+    """Return every shield and search as it is written in a specification, after the ``+`` of ``ppo+episode``.
+
+    For example ``("search", "episode", "episode:pairwise")``: with each argument and variant that it takes.
+    """
     return tuple(word for entry in SHIELDS.usable().values() for word in entry.words)
 
 
 def shield_forms() -> tuple[str, ...]:
-    """Return the shields that may follow a ``+``, without their variants."""
+    """Return every shield as it is written after the ``+`` of a specification: ``("episode", "robust:interior", ...)``.
+
+    Arguments are included, variants (last words that select another function) and searches are not.
+    """
     return tuple(each for each in around_forms() if not (around_entry(each).inner or is_variant(each)))
 
 
 def around_one_vehicle() -> list[str]:
-    """Return the names of the wrappers that cannot go around a team; those that go inside a shield come first."""
+    """Return the names of the shields and searches that cannot go around a team, searches first."""
     return [entry.name for inner in (True, False) for entry in SHIELDS.usable().values()
             if entry.inner is inner and not entry.teams]  # fmt: skip
 
 
 def shield_settings(name: object) -> Any:
-    """Return the settings class of a shield that also goes around environments; None for any other name."""
+    """Return the settings class of the shield called ``name`` if it can also go around environments; otherwise None."""
     return SHIELDS[name].options if isinstance(name, str) and name in SHIELDS else None
 
 
 def shield_modes() -> dict[str, Any]:
-    """Return name -> settings class of every loadable shield that also goes around environments."""
+    """Return, for every loadable shield that can also go around environments, its name -> its settings class."""
     return {name: entry.options for name, entry in SHIELDS.usable().items() if entry.options is not None}
 
 
 def variants_of(name: str) -> tuple[str, ...]:
-    """Return the variants of an agent or a shield: words that may follow its argument."""
+    """Return the variants of the agent or shield called ``name``, for example ``("believed",)``.
+
+    A variant is a last word after a further colon, as in ``episode:pairwise:believed``, that selects another function
+    to make the agent or shield.
+    """
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
 
 
 def is_variant(form: str) -> bool:
-    """Return whether the last word of ``NAME:WORD`` is a variant."""
+    """Return whether the last word of ``form`` is a registered variant, as in ``step:believed``.
+
+    ``form``: an agent or shield with its argument, without ``+``.
+    """
     return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
 def settings_needed(shield: str | None) -> Mapping[str, object]:
-    """Return the settings that a shield requires, each with an example; a variant requires none."""
+    """Return the settings that a shield requires, each with an example: ``{"uncertainty": "gaps_m=0.5"}``.
+
+    ``shield`` is a shield with its argument, such as ``robust`` or ``episode:pairwise``. The result is empty for None
+    and for a variant, such as ``robust:believed``.
+    """
     return {} if shield is None or is_variant(shield) else around_entry(shield).needs
 
 
 def shields_with(setting: str) -> tuple[str, ...]:
-    """Return the installed shields that require a setting."""
+    """Return the names of the installed shields that require ``setting``, a name such as ``uncertainty``."""
     return tuple(entry.words[0] for entry in SHIELDS.usable().values() if setting in entry.needs)
 
 
 def group_names() -> tuple[str, ...]:
-    """Return the names that stand for several agents in ``--agents``."""
+    """Return the names that stand for several agents in the command option ``--agents``, such as ``ladder``."""
     return tuple(dict.fromkeys(name.partition(".")[0] for name in GROUPS))
 
 
 def agents_of_group(group: str) -> tuple[str, ...]:
-    """Return the agents of a group: first its own, then those of ``GROUP.MORE``, sorted by name."""
+    """Return the specifications of all agents in ``group``, a name from ``group_names``.
+
+    The group ``ladder`` also contains the agents registered under ``ladder.search``, or any other ``ladder.WORD``: its
+    own come first, then these, sorted by name.
+    """
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
 
@@ -166,8 +217,8 @@ def register_agent(
 ) -> None:
     """Register an agent, so that ``make_agent`` and every command know ``name`` and ``name:argument``.
 
-    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or a
-    ``Part`` with the factory.
+    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or
+    ``Part(factory, about=...)`` with arguments of this function.
 
     Args:
         name: plain name without argument.
@@ -206,20 +257,20 @@ def register_shield(
     """Register a shield or another wrapper, so that ``+name`` may follow every agent.
 
     An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``: its wrapper, or
-    a ``Part`` with the wrapper.
+    ``Part(wrapper, about=...)`` with arguments of this function.
 
     Args:
         name: plain name without argument.
         wrapper: ``wrapper(agent, argument, settings)`` makes the agent around ``agent``; ``argument`` is the text after
             the colon, or None, and ``settings`` an ``AgentSettings``.
         about: description in one line, for ``ethbrake agent list``.
-        knows: knowledge that it adds to the agent's.
+        knows: knowledge that the wrapper adds to the agent's.
         form: how it is written, ``+name[:WORD]`` with every word that it takes; None: any argument.
-        inner: it is not a shield, and goes around the agent before a shield.
-        teams: it can also go around a team.
-        needs: required settings of ``AgentSettings``, each with an example.
-        options: its settings class, ``shield.options.ShieldOptions`` or a subclass, which makes its guard. Then
-            ``eb.shield(env, mode=name)`` knows it too.
+        inner: whether it is no shield and goes directly around the agent, inside a shield.
+        teams: whether it can also go around a team.
+        needs: name of each required setting of ``AgentSettings`` -> an example; None: none.
+        options: settings class of a shield, ``shield.options.ShieldOptions`` or a subclass, with which
+            ``eb.shield(env, mode=name)`` knows it too; None: it cannot go around environments.
 
     Registering the same wrapper again changes nothing. Raises ``AlreadyExists`` if the name belongs to another wrapper,
     ``InvalidInput`` for a name that is not plain.
@@ -238,7 +289,7 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
     An installed package registers a variant with an entry point of the group ``ethbrake_marl.variants``.
 
     Args:
-        key: ``name.variant``.
+        key: ``name.variant``: ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
         make: replaces the factory or wrapper of that name, with the same arguments; the argument does not contain the
             variant.
         about: description in one line, for ``ethbrake agent list``.

@@ -14,9 +14,9 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 class StateFree:
     """Agent with a fixed command: ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2) or a ``profile``.
 
-    For a ``profile`` the command is that of the first piece; the engine applies the later ones
-    (``Worlds.play_pieces``). ``full_brake`` for every vehicle is the paper's non-ethical strategy. Raises
-    ``InvalidInput`` for any other script and for a constant beyond the vehicle's capacity.
+    ``spec`` is one of these. A profile is a list of intervals of constant command: this agent commands the first, and
+    the engine applies the later ones (``Worlds.play_pieces``). ``full_brake`` for every vehicle is the paper's
+    non-ethical strategy. Raises ``InvalidInput`` for any other script and for a constant beyond the vehicle's capacity.
     """
 
     state_free = True
@@ -28,7 +28,7 @@ class StateFree:
         self.name, self.braking_pieces = spec, ScriptSpec.parse(spec).pieces
 
     def act(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return the constant command, [n] m/s2."""
+        """Return the constant command of ``vehicle`` (index, 0 = front) in each of n worlds, [n] m/s2."""
         vehicles = worlds.vehicles
         command = ScriptSpec.parse(self.name).command(
             vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
@@ -38,7 +38,7 @@ class StateFree:
 
 
 def make_script(argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the script that ``settings.spec`` names."""
+    """Return the script that ``settings.spec`` names, such as ``constant:3.5``; ``argument`` is ignored."""
     return StateFree(settings.spec)
 
 

@@ -1,4 +1,4 @@
-"""``AgentSettings``: what the function that makes an agent is given."""
+"""Settings for making an agent, and the signatures of the functions that make one."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class AgentSettings:
 
     """
 
-    spec: str  # the specification, with the wrappers so far
-    policy: str | None = None  # text after the @
-    scenario: Scenario | None = None  # scenario of the agent, if known
-    harm_count: HarmCount = "first"  # harm that an optimising agent minimises
-    horizon_s: float = HORIZON_S  # time until which it looks ahead (s)
-    most_candidates: int | None = None  # upper limit for a search, stricter than its argument; None: no limit
-    uncertainty: object = None  # what a shield does not know about the worlds, in that shield's format
-    time_step_s: float = 0.1  # time between two decisions
-    role: int | None = None  # index of the vehicle, if the agent is its role in the scenario; otherwise None
+    spec: str  # specification of the agent, such as "planner:64", with the wrappers made so far
+    policy: str | None = None  # text after the @ of the specification; None without one
+    scenario: Scenario | None = None  # scenario in which the agent drives; None: unknown
+    harm_count: HarmCount = "first"  # impacts whose harm an optimising agent minimises: each pair's first, or all
+    horizon_s: float = HORIZON_S  # time after the alert until which an agent looks ahead (s)
+    most_candidates: int | None = None  # upper limit for the candidates of a search; None: no limit
+    uncertainty: object = None  # what a shield does not know about the worlds, in that shield's format; None: nothing
+    time_step_s: float = 0.1  # time between two decisions (s)
+    role: int | None = None  # index of the vehicle for which the scenario names this agent; None: not from a scenario
 
     def needed_scenario(self) -> Scenario:
-        """Return the scenario; raise ``InvalidInput`` if there is none."""
+        """Return ``scenario``; raise ``InvalidInput`` if it is None."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r}, scenario='paper-random')"
@@ -43,15 +43,17 @@ class AgentSettings:
         return self.scenario
 
 
+# Called as (argument, settings).
 Factory = Callable[[str | None, AgentSettings], Driver]
 """Makes the agent of an argument (what stands after the colon, or None)."""
 
+# Called as (agent or team, argument, settings); makes a shield or a search around the agent.
 Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 """Makes the agent around an agent."""
 
 
 class Variant(NamedTuple):
-    """A variant of an agent or a shield, selected by a word after its argument."""
+    """Variant of an agent or a shield, selected by a last word: ``believed`` in ``step:believed``."""
 
-    make: Factory | Wrapper
+    make: Factory | Wrapper  # makes the agent or wrapper in place of the original function
     about: str  # description in one line

@@ -25,28 +25,28 @@ _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
 @dataclass(frozen=True, slots=True)
 class AgentSpec:
-    """A parsed agent specification."""
+    """Parsed agent specification, for example of ``ppo@shipped+search+step``."""
 
-    name: str  # or FILE.py:FUNCTION
-    argument: str | None  # after the colon
-    policy: str | None  # after the @: a path, or "shipped"
-    around: tuple[str, ...]  # wrappers with their arguments, innermost first
+    name: str  # plain name of the agent, or FILE.py:FUNCTION
+    argument: str | None  # text after the colon; None without one
+    policy: str | None  # text after the @: a path, or "shipped"; None without one
+    around: tuple[str, ...]  # searches and shields with their arguments, innermost first, as ("search", "step")
 
     @property
     def core(self) -> str:
-        """The agent without its wrappers."""
+        """Specification without the searches and shields around the agent, for example ``ppo@shipped``."""
         argument = "" if self.argument is None else f":{self.argument}"
         return f"{self.name}{argument}" + ("" if self.policy is None else f"@{self.policy}")
 
     @property
     def file(self) -> tuple[str, str] | None:
-        """The Python file and the function in it that makes the agent; None for any other agent."""
+        """Path of the Python file and name of the function in it that makes the agent; None for any other agent."""
         file, _, function = self.name.rpartition(":")
         return (file, function) if file else None
 
     @property
     def shield(self) -> str | None:
-        """The outermost wrapper if it is a shield; otherwise None."""
+        """The shield as it is written after the ``+``, for example ``episode:pairwise``; None without a shield."""
         return self.around[-1] if self.around and not around_entry(self.around[-1]).inner else None
 
     def __str__(self) -> str:
@@ -54,7 +54,7 @@ class AgentSpec:
 
 
 def parse_spec(spec: str) -> AgentSpec:
-    """Parse an agent specification. A path in it may contain any character.
+    """Return a parsed agent specification, such as ``ppo@c+step``. A path in it may contain any character.
 
     ``ppo@c+step`` is the folder ``c+step`` if it exists, otherwise the folder ``c`` behind the shield; ``ppo@c/+step``
     is always the latter. Raises ``InvalidInput`` for invalid syntax, two shields or another order; ``UnknownName`` for
@@ -77,7 +77,11 @@ def parse_spec(spec: str) -> AgentSpec:
 
 
 def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
-    """Split a comma-separated list of names; commas inside a name are kept if ``is_one`` accepts the longer text."""
+    """Split a comma-separated list of names, some of which may contain commas.
+
+    Of all texts that begin at the same place, the longest one that ``is_one`` accepts counts as one name; if it accepts
+    none, the name ends at the next comma. By default ``is_one`` tests whether a file or folder of that name exists.
+    """
     parts, names = text.split(","), list[str]()
     while parts:
         joined = (k for k in range(len(parts), 1, -1) if is_one(",".join(parts[:k])))
@@ -88,7 +92,10 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications; commas in paths that exist are kept."""
+    """Split a comma-separated list of agent specifications, such as ``coast,ppo@shipped``.
+
+    Commas in paths that exist do not split.
+    """
     return split_names(text, _is_one_spec)
 
 
@@ -99,13 +106,13 @@ def _is_one_spec(text: str) -> bool:
 
 
 def _existing_file(core: str) -> str:
-    """Return the longest existing Python file with which a specification begins; empty without one."""
+    """Return the longest path of an existing Python file with which the specification ``core`` begins, or ""."""
     ends = (match.start() for match in re.finditer(r"(?<=\.py):", core))
     return max((core[:end] for end in ends if os.path.isfile(core[:end])), key=len, default="")
 
 
 def _python_file(core: str) -> str:
-    """Return the Python file with which a specification begins, whether it exists or not; empty without one."""
+    """Return the path of the Python file, existing or not, with which ``core`` begins, or "" without one."""
     return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
 
 
@@ -114,7 +121,10 @@ def _policy_path(core: str) -> str:
 
 
 def _strip_around(spec: str) -> tuple[str, list[str]]:
-    """Split a specification into the agent and its wrappers; a path of an existing policy is kept whole."""
+    """Split a specification into the agent and the list of its searches and shields.
+
+    A ``+`` in the path of an existing policy does not split.
+    """
     core, around = spec, list[str]()
     while True:
         before, plus, last = core.rpartition("+")
@@ -144,7 +154,16 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Return whether an unknown word after a ``+`` is a misspelt wrapper, rather than part of an argument or a path."""
+    """Return whether an unknown word after a ``+`` was probably meant as a search or shield, but misspelt.
+
+    If not, the word is part of an argument or a path.
+
+    Args:
+        before: specification up to the ``+``.
+        core: specification up to the end of the word.
+        last: the unknown word.
+
+    """
     file = _python_file(core)
     if ".py" in last or (file and _IN_FILE.fullmatch(core, len(file))):
         return False  # the + belongs to the path of a Python file, or to its argument

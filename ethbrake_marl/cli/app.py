@@ -59,21 +59,21 @@ def _about(
         bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Options of ``ethbrake`` itself."""
+    """Options of ``ethbrake`` without a command: ``--version``."""
 
 
 def main() -> None:
-    """Entry point: run the command line and exit with its status."""
+    """Run the command line of this process, and exit with its status; the entry point of the program ``ethbrake``."""
     gc.set_threshold(20_000)  # Python's 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
     sys.exit(run_command(sys.argv[1:]))
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run a command line and return its exit status.
+    """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    It is 2, with one line on stderr, for bad input, bad usage or a file error. Other errors are defects, and are
-    raised.
+    It is 0 for success, and 2, with one line on stderr, for bad input, bad usage or a file error. Other errors are
+    defects, and are raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -108,10 +108,10 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Return whether a shell's completion runs this command, as the script from ``--show-completion`` does.
+    """Return whether a shell runs this command to complete a line, as the script from ``--show-completion`` does.
 
-    The completion variable is ignored if the other variables of such a script are missing, so that a command never
-    fails because of it.
+    ``environment`` are the environment variables. The completion variable is ignored if the other variables of such a
+    script are missing, so that a command never fails because of it.
     """
     if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -120,7 +120,7 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
-    """Print the reason in one line on stderr, and return the exit status for an error."""
+    """Print the reason in one line on stderr, and return 2, the exit status for an error."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
@@ -154,6 +154,11 @@ def tell_compilation(folder: Path, empty: bool) -> None:
     """Announce that kernels are being compiled, and report their number every ten seconds while this continues.
 
     The report comes from a thread, because a single kernel may take a minute.
+
+    Args:
+        folder: the cache folder of compiled kernels; a temporary one is not kept.
+        empty: whether nothing was in that folder yet.
+
     """
     kept = "the physics, once: minutes of one core" if empty else "what was not used before, once"
     lost = "the physics; no folder can be written to keep it, so every command does (ethbrake doctor)"
@@ -191,10 +196,15 @@ def abandon_output() -> None:
 
 
 def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog: str | None = None) -> None:
-    """Add the command ``ethbrake NAME``: a function, as ``app.command`` takes it, or a Typer with commands of its own.
+    """Add the command ``ethbrake NAME``.
 
     An installed package or an extension does the same with an entry point of the group ``ethbrake_marl.commands``.
-    ``GROUP.NAME`` is a command of a group that another entry point adds. ``epilog`` is the end of a function's help.
+
+    Args:
+        name: name of the command; ``GROUP.NAME`` for a command inside an existing group of commands.
+        command: a function, as ``app.command`` of Typer takes it, or a Typer with commands of its own.
+        epilog: text at the end of the help page of a function.
+
     """
     if isinstance(command, typer.Typer):
         given = command
@@ -206,7 +216,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
 
 def _names() -> list[str]:
-    """Return the names of the commands that were added to the app."""
+    """Return the names of the commands and command groups of ``app``, without those of extensions."""
     return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),
@@ -218,7 +228,7 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an extension or an installed package, loaded only when it is called.
+    """A command of an extension or an installed package, which is imported only when it is called.
 
     ``entry`` is the name of its entry point, ``NAME`` or ``GROUP.NAME``.
     """
@@ -230,22 +240,31 @@ class Installed(TyperCommand):
         self.entry, self.is_ours = entry, givers == [OURS]
 
     def command(self) -> Any:
-        """Load and return the actual command."""
+        """Import the actual command of the entry point, and return it as a Typer (click) command."""
         found = COMMANDS[self.entry]
         found.name = self.name
         return with_installed(found, self.entry)
 
     def make_context(self, *given: Any, **settings: Any) -> Any:
-        """Return the context of the actual command."""
+        """Return the context in which the actual command runs; the arguments are those of Typer's own method."""
         return self.command().make_context(*given, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """Return the line for the list of commands; for another package it names the package, without loading it."""
+        """Return the command's line, of at most ``limit`` characters, in the list of commands.
+
+        For a command of another package, the line names the package, so that the package need not be imported.
+        """
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Return the group, with the commands that entry points ``NAME.COMMAND`` add to it."""
+    """Add the commands of the entry points ``NAME.COMMAND`` to the command group called ``name``, and return it.
+
+    Args:
+        group: the group, a Typer (click) command with subcommands. It is changed.
+        name: name of the group.
+
+    """
     for entry in points(COMMANDS.group):
         of, _, own = entry.rpartition(".")
         if of == name:
@@ -254,9 +273,10 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """Return the command line with the commands of core, extensions, installed packages, and a user's program.
+    """Return the command ``ethbrake`` as a Typer (click) group.
 
-    Raises ``AlreadyExists`` if a program's command has the name of another command.
+    It has the commands of the core, of extensions and installed packages, and those that a program added with
+    ``add_command``. Raises ``AlreadyExists`` if two commands have the same name.
     """
     added = [name for name in COMMANDS if name not in _OURS and "." not in name]
     names = [*_names(), *added]

@@ -57,7 +57,14 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as J
 
 
 def schema_option(module: str, model: str, kind: str) -> Any:
-    """Return the option ``--schema`` of a command: print the JSON Schema of its files and exit."""
+    """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
+
+    Args:
+        module: name of the module with the model, which is imported only when needed.
+        model: name of the model's class, which has a method ``json_schema``.
+        kind: kind of files, for the help text: ``recipe``.
+
+    """
 
     def show_schema(asked: bool) -> None:
         if asked:
@@ -69,21 +76,26 @@ def schema_option(module: str, model: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Return the end of a help page: example command lines, each after ``ethbrake``."""
+    """Return the end of a help page, one example for each of ``lines``: ``run --seed 1`` (without ``ethbrake``)."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
 def say(text: str) -> None:
-    """Print one line to the user, on stderr."""
+    """Print a text as one line on stderr."""
     typer.echo(one_line(text), err=True)
 
 
 class Out:
-    """Output of one command, used as ``with Out() as out``.
+    """Output of one command of ``ethbrake``, used as ``with Out() as out``.
 
-    ``as_json``: print results as JSON. ``force``: replace existing files. ``kept``: what remains after Ctrl-C, in
-    words. Inside ``with``, only results go to stdout; everything else that is printed, for instance by a user's agent,
-    goes to stderr. Ctrl-C ends the command with one line and status 130.
+    Inside ``with``, only results go to stdout; everything else that is printed, for instance by a user's agent, goes to
+    stderr. Ctrl-C ends the command with one line and status 130.
+
+    Args:
+        as_json: print results as JSON.
+        force: replace existing files.
+        kept: sentence, without its capital, that tells the user after Ctrl-C what remains.
+
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, kept: str = "nothing was written") -> None:
@@ -97,7 +109,7 @@ class Out:
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
-        """Redirect stdout to stderr, and register the environments for the user's code."""
+        """Redirect stdout to stderr, register the environments for the user's code, and return this object."""
         self._turned.__enter__()
         register_environments()
         return self
@@ -105,26 +117,39 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leave the progress bars as they are, and print what remains after Ctrl-C."""
+        """Stop redirecting stdout, and after Ctrl-C print what remains and end the command with status 130.
+
+        The arguments describe the exception that ended the block, if there is one, as for every context manager.
+        """
         self._turned.__exit__(kind, error, trace)
         self.end_progress()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.kept}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """Print the result: ``content`` if JSON is requested, else ``shown``."""
+        """Print the result of the command on stdout.
+
+        Args:
+            content: plain data to print if JSON is requested.
+            shown: texts and tables to print otherwise.
+            end: characters after each text.
+
+        """
         if self.as_json:
             self.print_json(content)
         else:
             self.show(*shown, end=end)
 
     def print_json(self, content: Any) -> None:
-        """Print JSON on stdout, whether or not ``--json`` was passed."""
+        """Print ``content`` (plain data) as JSON on stdout, whether or not ``--json`` was passed."""
         self.end_progress()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
     def show(self, *shown: RenderableType, end: str = "\n") -> None:
-        """Print texts and tables on stdout. In texts, only line ends and tabs can move the cursor."""
+        """Print texts and tables (of rich) on stdout, each text followed by ``end``.
+
+        Control characters in texts are replaced, except line ends and tabs.
+        """
         self.end_progress()
         for each in shown:
             if isinstance(each, str):
@@ -133,12 +158,19 @@ class Out:
                 _PlainConsole(self._stdout, width=None if self._stdout.isatty() else 100).print(each)
 
     def note(self, text: str) -> None:
-        """Print one line to the user on stderr, below the progress."""
+        """Print a text as one line on stderr, below the progress bars."""
         self.end_progress()
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput``, before any work, if a file cannot be written; None: no file is requested."""
+        """Raise ``InvalidInput``, before any work, if a file cannot be written.
+
+        Args:
+            path: the file; None: no file was requested, so nothing is checked.
+            endings: allowed endings of the name, such as ``.csv``; none: any.
+            what: name of the content, for the message.
+
+        """
         if path is None:
             return
         if endings and path.suffix.lower() not in endings:
@@ -148,7 +180,10 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write a file atomically, and print ``what`` it is."""
+        """Write ``content`` to a file, completely or not at all, and print ``WHAT: PATH`` on stderr.
+
+        ``what`` None: print nothing.
+        """
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -156,15 +191,22 @@ class Out:
             self.note(f"{what}: {path}")
 
     def interrupted(self, told: str) -> NoReturn:
-        """End the command as Ctrl-C does, with one line."""
+        """Print ``told`` as one line on stderr, and end the command with status 130, as after Ctrl-C."""
         self.note(told)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:
-        """Show that the part ``name`` has reached ``done`` of ``total``; ``note`` is printed once, above the bars.
+        """Show that one part of the command's work has reached ``done`` of ``total`` units.
 
-        On a terminal there is one bar per part; otherwise one line at the beginning and every ten seconds. Text after
-        ": " in a name is a stage of the part before it, and shares its bar.
+        On a terminal there is one bar per part; otherwise one line at the beginning and every ten seconds.
+
+        Args:
+            name: name of the part; ``PART: STAGE`` shares the bar of ``PART``.
+            done: number of units done.
+            total: number of all units.
+            harm: latest result, shown behind the name.
+            note: message that is printed once, above the bars.
+
         """
         label = one_line(f"{name}, {harm}" if harm else name)
         if not self._stderr.is_terminal:
@@ -192,23 +234,29 @@ class Out:
             self._said_s = now
 
     def show_progress(self, progress: PartProgress) -> None:
-        """Show a ``Progress`` object of the package."""
+        """Show the progress that a function of the package reported to its ``on_progress``."""
         self.progress(progress.name, progress.done, progress.total, progress.harm, progress.note)
 
     def end_progress(self) -> None:
-        """Leave the bars as they are; later output stands below them."""
+        """Stop updating the progress bars; they stay on the screen, and later output stands below them."""
         if self._bars is not None:
             self._bars.stop()
             self._bars, self._tasks = None, {}
 
 
 class _PlainConsole(Console):
-    """Console that prints text literally: no markup in names of agents and paths, and no control characters."""
+    """Console of rich that prints text literally: no markup in names of agents and paths, and no control characters.
+
+    ``width`` is the number of columns; None: the terminal's.
+    """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """Yield the segments of a line or table, with control characters of texts replaced."""
+        """Yield the styled segments of ``renderable`` (a text or table) as rich does, without control characters.
+
+        ``options`` are rich's options of this output.
+        """
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)

@@ -67,17 +67,18 @@ _CHECKOUT = _PACKAGE.parent  # of an installed package: the folder of packages, 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check: its name, whether all is in order, and details."""
+    """Result of one check of the installation."""
 
-    name: str
-    ok: bool
-    detail: str
+    name: str  # name of what was checked
+    ok: bool  # whether it is in order
+    detail: str  # version, folder or error, for the user
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Return all checks, in the order in which problems should be fixed; no check raises.
+    """Check the installation, and return all results in the order in which problems should be fixed.
 
-    ``compile_all``: call the usual commands on a few worlds first, so that everything they use is compiled and stored.
+    No check raises. ``compile_all``: also call the usual commands on a few worlds, so that all kernels that they use
+    are compiled and stored.
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -94,7 +95,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """Return the result of ``look``; an exception becomes a failed check, so that the other checks still run."""
+    """Return the check ``name`` with the result (ok, detail) of ``look()``; an exception becomes a failed check."""
     try:
         return Check(name, *look())
     except Exception as error:
@@ -102,9 +103,9 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Yield one check per dependency of the package: installed, and within the required versions.
+    """Yield one check per dependency: whether it is installed in a required version.
 
-    Packages of an extra may be missing.
+    A missing package of an extra counts as in order.
     """
     from packaging.version import Version
 
@@ -125,7 +126,7 @@ def _dependencies() -> Iterator[Check]:
 
 
 def _requirements() -> list[tuple[str, Requirement]]:
-    """Return (extra, requirement) pairs, with "" for requirements that are always needed.
+    """Return the package's dependencies as pairs (extra, requirement); the extra is "" if it is always needed.
 
     They come from the checkout's ``pyproject.toml``, or else from the metadata of the installed package.
     """
@@ -143,7 +144,7 @@ def _requirements() -> list[tuple[str, Requirement]]:
 
 
 def _pinned_versions(constraints: Path) -> dict[str, str]:
-    """Return the version of every ``name==version`` line, by lower-case name; empty outside a checkout."""
+    """Return the versions in a pip constraints file: lower-case package -> version; empty if there is no file."""
     text = constraints.read_text("utf-8") if constraints.is_file() else ""
     return {name.lower(): pin for name, pin in re.findall(r"^([^\s#=]+)==([^\s#]+)", text, re.MULTILINE)}
 
@@ -168,7 +169,10 @@ def _scenarios() -> tuple[bool, str]:
 
 
 def _golden_impact() -> tuple[bool, str]:
-    """Check the harm of a car at 10 m/s that brakes with 5 m/s2, 8 m behind a parked car: ``10^2 - 2 * 5 * 8 = 20``."""
+    """Check the physics on a car at 10 m/s that brakes with 5 m/s2, 8 m behind a parked car.
+
+    The exact harm is ``10^2 - 2 * 5 * 8 = 20``. Returns whether it is right, and a text.
+    """
     import numpy as np
 
     from ethbrake_marl.physics.advance import advance
@@ -184,7 +188,10 @@ def _golden_impact() -> tuple[bool, str]:
 
 
 def _golden_baseline() -> tuple[bool, str]:
-    """Check E-V2X-BM in the paper's distance scenario at 7 m and 7 m: it brakes with 5.17021 m/s2, harm 4.03447."""
+    """Check the baseline E-V2X-BM in the paper's distance scenario with gaps of 7 m and 7 m.
+
+    It must brake with 5.17021 m/s2, at harm 4.03447 m2/s2. Returns whether it does, and a text.
+    """
     import numpy as np
 
     from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise
@@ -202,10 +209,14 @@ def _golden_baseline() -> tuple[bool, str]:
 
 
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
-    """Call the commands of ``_DOORS`` on a few worlds, in parallel on all cores, and report the progress.
+    """Compile and store the kernels that the usual commands use, by calling these commands on a few worlds.
 
-    ``training``: include the command that needs torch. ``run_alone``: call only ``_FOR_A_RUN``, which `make venv` uses.
-    Returns whether all commands succeeded, and a message.
+    The commands run in parallel on all cores; the progress is printed. Returns whether all succeeded, and a message.
+
+    Args:
+        training: include ``ethbrake run``, which needs torch.
+        run_alone: instead, call a single command that compiles nearly all kernels of ``ethbrake run``.
+
     """
     if is_temporary(cache_folder()):
         return False, "no folder can be written to keep what is compiled; set NUMBA_CACHE_DIR to a writable folder"
@@ -228,7 +239,10 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """Return the last line that a command prints on stderr if it fails; empty if it succeeds."""
+    """Run Python with these arguments in ``folder``.
+
+    Returns the last line that it prints on stderr if it fails; empty if it succeeds.
+    """
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

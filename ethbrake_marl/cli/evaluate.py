@@ -46,7 +46,15 @@ _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """Return the task of a scenario (name or path) with these settings, including ``harm_count``."""
+    """Load a scenario with settings, and return the task of controlling its learners.
+
+    Args:
+        scenario: name or path.
+        settings: ``KEY=VALUE`` overrides of the scenario, and ``harm_count=total``; None: none.
+
+    Raises ``InvalidInput`` for a scenario without a learner.
+
+    """
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
 
 
@@ -58,7 +66,14 @@ def _task_of(scenario: str, given: Settings) -> Task:
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Return the agents named on the command line (``make_lineup``), and print what ``@shipped`` stands for."""
+    """Return the agents of a command line by spec (``make_lineup``), and print which policy ``@shipped`` stands for.
+
+    Args:
+        agents: specs, as a list or with commas between them.
+        task: the scenario, and the harm that the agents minimise.
+        bare: refuse agents with a shield, because the command adds its own.
+
+    """
     lineup = evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
     _tell_shipped(lineup)
     return lineup
@@ -150,7 +165,10 @@ def evaluate_command(
 def _evaluate_long_list(
     out: Out, lineup: evaluation.Lineup, episodes: int, seed: int, jobs: int | None, ray: str | None
 ) -> evaluation.SummaryTable:
-    """Evaluate the agents on a list whose worlds are not held in memory."""
+    """Evaluate the agents on a list that is too long to hold in memory, and return the results table.
+
+    The list is ``episodes`` worlds of ``seed``; ``jobs`` processes or the Ray cluster ``ray`` do the work.
+    """
     scenario = lineup.scenario
     evaluation.check_agents(lineup.make(), scenario.sample(1_000, seed).worlds, scenario, warn=True)
     tally = evaluation.tally_list(lineup, episodes, seed, jobs=jobs, ray=ray, on_done=_tell_worlds(out, episodes))
@@ -167,7 +185,19 @@ def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
 def _evaluate_group(
     out: Out, output: Path | None, group: Sequence[Task], agents: str, episodes: int | None, seed: int | None
 ) -> None:
-    """Evaluate each agent in each scenario of a group: whether vehicles collide, and how hard the worst impact is."""
+    """Evaluate each agent in each scenario of a group, and print one table with a row for each of them.
+
+    It shows whether vehicles collide, how hard the worst impact is, and harm.
+
+    Args:
+        out: output of the command.
+        output: folder that also gets the results as JSON; None: no folder.
+        group: the scenarios, each with its controlled vehicles.
+        agents: specs with commas between them.
+        episodes: number of worlds of each scenario; None: 400.
+        seed: seed of the worlds; None: the standard seed.
+
+    """
     told: list[dict[str, Any]] = []
     rows: list[Any] = []
     seed = evaluation.LIST_SEED if seed is None else seed
@@ -214,7 +244,10 @@ def _evaluate_group(
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Raise ``InvalidInput``, before any work, if the output folder cannot be written or holds other results."""
+    """Raise ``InvalidInput``, before any work, if the folder ``output`` cannot be written or holds other files.
+
+    ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files are requested; they need a folder.
+    """
     if output is None:
         for option in (name for name, given in (("--per-world", per_world), ("--report", report)) if given):
             raise InvalidInput(f"{option}: needs a folder for it: --output FOLDER")
@@ -225,7 +258,10 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
 
 
 def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, per_world: str | None) -> Path | None:
-    """Write the file with one row per world and agent, if requested, and return its path."""
+    """Write the file with one row per world and agent into the folder ``output``, and return its path.
+
+    ``per_world`` is the format, ``csv`` or ``parquet``. If it or ``output`` is None, return None.
+    """
     if output is None or per_world is None:
         return None
     file = output / f"{WORLDS}.{per_world}"
@@ -236,7 +272,10 @@ def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, p
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
-    """Write ``results.json``, and delete files of earlier results except those in ``beside``."""
+    """Write ``results.json`` into the folder ``output``, and delete files of earlier results except ``beside``.
+
+    ``output`` None: write nothing.
+    """
     if output is None:
         return
     output.mkdir(parents=True, exist_ok=True)
@@ -251,7 +290,15 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Print in how many worlds something still moved at the horizon, by shielded driver, if there are any."""
+    """Print in how many worlds something still moved at the horizon, if there are any.
+
+    Args:
+        out: output of the command.
+        moving: name of an agent with a shield -> number of such worlds.
+        worlds: number of all worlds.
+        horizon_s: time of the horizon (s).
+
+    """
     found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
     if found:
         out.note(
@@ -261,7 +308,10 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return in how many worlds something still moves at the horizon, by shielded driver."""
+    """Return name of each agent behind a shield -> number of worlds in which something still moves at the horizon.
+
+    ``rows`` is the results table.
+    """
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
@@ -321,7 +371,10 @@ def shield_command(
 
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
-    """Return the rows of these agents, and show the progress on stderr."""
+    """Compare ``agents`` (specs with commas between them) without and behind the shield in the worlds of ``sample``.
+
+    The progress is shown on stderr.
+    """
     lineup = make_drivers(agents, task, bare=True)
     n = sample.worlds.n
     return evaluation.compare_modes(
@@ -330,7 +383,7 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
-    """Print the worlds that were left out, of ``whole``, in one line on stderr, if there are any."""
+    """Print in one line on stderr which of ``whole`` worlds were left out, if there are any."""
     if left_out:
         told = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
         out.note(evaluation.LeftOut.line(told, whole))

@@ -20,7 +20,7 @@ from ethbrake_marl.files.yaml import flow_text
 
 TRIED_WORLDS = 200  # number of worlds that `scenario validate` tries
 
-MOST_RANGES = 8  # largest number of ranges that it shows separately
+MOST_RANGES = 8  # largest number of ranges that `scenario validate` shows separately
 
 SCREEN = 24  # lines of a screen
 
@@ -110,7 +110,11 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """Return a table of the ranges of varying quantities, a text about fixed ones, and all ranges by column."""
+    """Return three descriptions of the quantities of the worlds in ``sample``: (lines, text, columns).
+
+    ``lines`` are a table with the range of each varying quantity; ``text`` lists the fixed ones. ``columns`` is for
+    JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
+    """
     import numpy as np
 
     worlds, varying = sample.worlds, evaluation.drawn_alike(sample.worlds, scenario)
@@ -137,7 +141,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
-    """Return the text wrapped into at most ``most`` lines."""
+    """Return the text as at most ``most`` lines of ``width`` characters; what does not fit becomes ``...``."""
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
@@ -158,7 +162,7 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
-    """Yield a sentence about each part of the scenario; empty if there is nothing to say."""
+    """Yield a sentence about each part of the scenario; an empty text if there is nothing to say about a part."""
     from ethbrake_marl.agents.making import find_entry
     from ethbrake_marl.game.objectives import OBJECTIVES
 
@@ -205,7 +209,7 @@ def _obstacle_in_words(scenario: scenarios.Scenario) -> str:
 
 
 def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
-    """Describe how a quantity is drawn; empty if it is not declared, or if each type declares it."""
+    """Describe how the quantity ``key`` is drawn; empty if the scenario does not declare it."""
     if scenario.members:
         told = key in scenarios.QUANTITY.usual or (
             key == "friction" and all(each.declares(key) for each in scenario.members)
@@ -222,7 +226,7 @@ def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
 
 
 def _in_words(quantity: Any) -> str:
-    """Describe a number or a distribution."""
+    """Describe ``quantity``, a number or a distribution of a scenario, in words: ``5 to 9 (uniform)``."""
     if isinstance(quantity, float):
         return f"{quantity:g}"
     (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
@@ -233,7 +237,7 @@ def _in_words(quantity: Any) -> str:
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
-    """Describe the V2X channel: who knows what, and when."""
+    """Return a sentence about the scenario's V2X channel: which vehicle knows what, and when."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}

@@ -37,7 +37,10 @@ OutputOption = Annotated[
 
 
 def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
-    """Return the default folder of a run. If the recipe names a scheme, the scheme follows the recipe's name."""
+    """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
+
+    If the recipe names a scheme for several learners, it follows the recipe's name. ``seed`` None: the recipe's seed.
+    """
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
 
@@ -101,7 +104,7 @@ def run_command(
 
 
 def quickest() -> str:
-    """Return the recipe that `ethbrake run` trains by default."""
+    """Return the name of the recipe that `ethbrake run` trains by default."""
     usable = training.TrainingRecipe.usable()
     return next(name for name in QUICKEST if name in usable)
 
@@ -178,7 +181,7 @@ def train_command(
 
 
 def _tell(out: Out, result: training.TrainResult) -> None:
-    """Print the result of a training."""
+    """Print the result of a training as JSON on stdout, and how it ended on stderr."""
     out.result({
         "directory": str(result.directory),
         "status": result.status,
@@ -193,7 +196,7 @@ def _tell(out: Out, result: training.TrainResult) -> None:
 
 
 def _end(out: Out, result: training.TrainResult) -> None:
-    """Print how a training ended and where it is; an interrupted training ends the command with that status."""
+    """Print how the training of ``result`` ended and where it is; if it was interrupted, exit with status 130."""
     if result.status == "interrupted":
         left = f"go on with: ethbrake train --resume {result.directory} (its policy is there)"
         out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")

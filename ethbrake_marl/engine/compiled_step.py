@@ -1,6 +1,7 @@
 """The engine's compiled step: actions to commands, motion, ends of episodes, and the reward that vehicles share.
 
-Worlds are rows as in ``physics.columns``; ``clock`` [n, 4] holds the additional state of each episode.
+Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
+``clock`` [n, 4] holds the time of the first decision, the numbers of steps, and whether the episode has ended.
 """
 
 from __future__ import annotations
@@ -55,61 +56,61 @@ BAD_ACTION = -1
 
 
 class Step(NamedTuple):
-    """Results of one step in every world of the batch."""
+    """Results of one step of n worlds with N vehicles."""
 
     reward: Floats  # [n, N] reward of each vehicle
-    outcome: Floats  # [OUTCOME_ROWS, n] raw results of the kernel; use the properties to read them
-    params: RewardParams
-    further: dict[str, Floats]  # unweighted reward terms that need more than the step's facts, each [n] or [n, N]
+    outcome: Floats  # [OUTCOME_ROWS, n] raw results of the compiled step; use the properties to read them
+    params: RewardParams  # settings of the reward
+    further: dict[str, Floats]  # name -> unweighted reward term that the compiled step does not know, [n] or [n, N]
 
     @property
     def terminated(self) -> Bools:
-        """Episodes that this step ended at rest, with no command that would move a vehicle, [n]."""
+        """Whether this step ended the episode because the line is at rest and no command would move a vehicle, [n]."""
         return self._is(TERMINATED)
 
     @property
     def truncated(self) -> Bools:
-        """Episodes that reached the horizon with this step, [n]."""
+        """Whether this step ended the episode at the horizon, or because the world could not be advanced, [n]."""
         return self._is(TRUNCATED)
 
     @property
     def ended(self) -> Bools:
-        """Episodes that ended with this step, [n]."""
+        """Whether this step ended the episode, for either reason, [n]."""
         return self.terminated | self.truncated
 
     @property
     def failed(self) -> Ints:
-        """Status code of the kernel in the worlds that could not be advanced, 0 elsewhere, [n]."""
+        """Status code of the physics for each world that could not be advanced, 0 for the others, [n]."""
         return np.asarray(self.outcome[FAILED], np.int64)
 
     @property
     def safe_end(self) -> Bools:
-        """Episodes that ended with this step without any impact, [n]."""
+        """Whether this step ended the episode and the whole episode had no impact, [n]."""
         return self._is(SAFE_END)
 
     @property
     def first_impact_harm(self) -> Floats:
-        """First-impact harm of the whole line in this step, [n] m2/s2."""
+        """Harm that the step added to the whole line, counting each pair's first impact only, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
 
     @property
     def total_harm(self) -> Floats:
-        """Total harm of the whole line in this step, every impact counted, [n] m2/s2."""
+        """Harm that the step added to the whole line, counting every impact, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
 
     @property
     def shared(self) -> dict[str, Floats]:
-        """Unweighted reward terms that are the same for all vehicles of a world, each [n]."""
+        """Unweighted reward terms that are the same for all vehicles of a world: name -> value, [n]."""
         return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
 
     @property
     def terms(self) -> dict[str, Floats]:
-        """Every unweighted reward term, each [n], the same for all vehicles, or [n, N]."""
+        """Every unweighted reward term: name -> value, [n] if it is the same for all vehicles, otherwise [n, N]."""
         return self.shared | self.further
 
     @property
     def counted_harm(self) -> Floats:
-        """Harm of the whole line in this step, under the reward's harm count, [n] m2/s2."""
+        """Harm that the step added to the whole line, counting the impacts that the reward counts, [n] m2/s2."""
         return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
@@ -118,9 +119,10 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Put forces, rates of build-up and braking pieces of world ``k`` into the table, by ``place_forces``.
+    """Add to the ``table`` of world ``k`` what is needed only if brakes take time to build up.
 
-    This is a separate function because it would slow down the loop for worlds without build-up.
+    These are accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the braking
+    profiles ``pieces`` [N, 2 K]. A separate function, because it would slow down the loop for worlds without build-up.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -135,13 +137,28 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     state: Floats, params: Floats, clock: Floats, actions: Floats, learners: Ints, settings: Floats, no_rows: Floats,
     builds_up: bool, pieces: Floats, wanted: Floats, reward: Floats, outcome: Floats,
 ) -> tuple[int, int]:  # fmt: skip
-    """Advance every running world by one step, in place (state, clock, wanted); fill ``reward`` and ``outcome``.
+    """Advance every running world by one step.
 
-    ``actions`` [n, L] become the learners' commands in ``wanted`` [n, N]. If an action is not in [-1, 1], nothing is
-    moved. A world that cannot be advanced keeps its state; its episode is cut off there, without a reward, and marked
-    in ``outcome``. ``builds_up`` must be True if brakes build up in any world; ``pieces`` [N, 2 K], the same in all
-    worlds, are used only then. Returns the row of a world and its error (BAD_ACTION, or the status of a world that
-    could not be advanced), or (-1, DONE).
+    An action outside [-1, 1] moves nothing. A world that cannot be advanced keeps its state; its episode is cut off
+    there, without a reward, and marked in ``outcome``.
+
+    Args:
+        state: [n, S] motion and harm of the worlds, changed in place.
+        params: [n, K] parameters of the vehicles.
+        clock: [n, CLOCK_WIDTH] changed in place.
+        actions: [n, L] actions of the learners.
+        learners: [L] indices of the learners.
+        settings: [5] ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL``, ``TERMINAL_WEIGHT``.
+        no_rows: ``NO_ROWS``, so that no single impact is recorded.
+        builds_up: must be True if brakes build up in any world, or if a script follows a profile.
+        pieces: [N, 2 K] braking profiles with K intervals of constant command; used only if ``builds_up``.
+        wanted: [n, N] commands, m/s2; the learners' are written.
+        reward: [n, N] written.
+        outcome: [OUTCOME_ROWS, n] written.
+
+    Returns the row of a world and its error (``BAD_ACTION``, or the status of a world that could not be advanced), or
+    ``(-1, FLAG.DONE)``.
+
     """
     n, N = wanted.shape
     for k in range(n):
@@ -244,17 +261,29 @@ NO_ROWS = np.empty((0, LISTED.WIDTH))  # an empty list of impacts, so that none 
 
 
 class Rules(NamedTuple):
-    """What all steps of an engine have in common, and the compiled step under it."""
+    """Settings that all steps of an engine share, and the compiled step that uses them."""
 
     learners: Ints  # [L] indices of the learners
     settings: Floats  # [5] TIME_STEP, HORIZON, HARM_WEIGHT, HARM_IS_TOTAL, TERMINAL_WEIGHT
-    builds_up: bool  # whether the brakes of some world may build up, or follow ``pieces``
-    pieces: Floats  # [N, 2 K] braking profile of each scripted vehicle, as in ``Vehicles``; K may be 0
+    builds_up: bool  # whether brakes take time to build up in some world, or a script follows a braking profile
+    pieces: Floats  # [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``; K may be 0
 
     def step(
         self, worlds: Packed, clock: Floats, actions: Floats, wanted: Floats, reward: Floats, outcome: Floats
     ) -> int:
-        """Advance every running world by one step, in place; return a status. See ``step_worlds``."""
+        """Advance every running world by one step and return a status.
+
+        Args:
+            worlds: rows of n worlds, changed in place.
+            clock: [n, CLOCK_WIDTH] changed in place.
+            actions: [n, L] actions of the learners in [-1, 1].
+            wanted: [n, N] commands, m/s2; the learners' are written.
+            reward: [n, N] written.
+            outcome: [OUTCOME_ROWS, n] written.
+
+        The status is ``FLAG.DONE``, ``BAD_ACTION`` (nothing was moved), or the code of the failed check of some world.
+
+        """
         _, status = step_worlds(
             *worlds, clock, actions, self.learners, self.settings, NO_ROWS, self.builds_up, self.pieces, wanted,
             reward, outcome,
@@ -262,7 +291,7 @@ class Rules(NamedTuple):
         return status
 
     def unpack(self, packed: Packed) -> Worlds:
-        """The worlds of these rows, in their own memory, with the pieces in which their scripts brake."""
+        """Return packed worlds as ``Worlds`` in new arrays, whose vehicles follow the braking profiles ``pieces``."""
         worlds = packed.worlds()
         if self.pieces.shape[1] == 0:
             return worlds

@@ -47,28 +47,34 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 
 
 class Watcher(Protocol):
-    """Follow an engine's episodes without changing them, as the trace of a picture does.
+    """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
 
     The engine keeps the watcher's memory beside its state. Both change in one assignment, or, after an error or an
     interrupt, neither does. So a watcher never changes its memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the memory after episodes have started in ``rows``; ``alert`` holds only those worlds, at t = 0."""
+        """Return the watcher's memory after episodes have started in the rows with the indices ``rows``.
+
+        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is the watcher's memory before.
+        """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """Return the memory after a step that led the engine from ``before`` to ``after``."""
+        """Return the watcher's memory after a step, given its ``memory`` before.
+
+        ``before`` and ``after`` are the engine before and after the step.
+        """
 
 
 class Ruling(NamedTuple):
     """Answer of a guard in one step, for n worlds and L learners."""
 
-    proposed: Floats  # [n, L] actions; NaN: none, or no number
-    applied: Floats  # [n, L] actions
-    stepped_in: Bools  # [n] something else is applied than what was proposed
-    asked: Bools  # [n] worlds that it is about
-    decision: Any  # what else there is to tell of it
-    memory: Any  # the guard's once the step is made
+    proposed: Floats  # [n, L] actions that the learners proposed; NaN: none, or not a number
+    applied: Floats  # [n, L] actions to apply, in [-1, 1]
+    stepped_in: Bools  # [n] whether the guard replaced an action, or chose E-V2X-BM (mode ``episode``)
+    asked: Bools  # [n] whether the guard decided in this world; False for ended episodes
+    decision: Any  # further details, in the guard's own format
+    memory: Any  # the guard's memory after the step
 
 
 class Guard(Protocol):
@@ -80,40 +86,58 @@ class Guard(Protocol):
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the memory after episodes have started in ``rows``; ``alert`` holds only those worlds, at t = 0.
+        """Return the guard's memory after episodes have started in the rows with the indices ``rows``.
 
-        ``memory`` is None before the first episode.
+        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is the memory before, None before the first
+        episode.
         """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
-        """Return the actions to apply instead of ``proposed`` [n, L]; a column of NaN: that learner proposed none."""
+        """Return the actions to apply in the next step.
+
+        Args:
+            running: the engine before the step.
+            memory: the guard's memory.
+            proposed: [n, L] actions of the learners; a column of NaN means that this learner proposed none.
+
+        """
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
-        """Return the memory to keep after the step. Raise ``UncertifiedStep`` to roll the step back."""
+        """Return the memory to keep after the step, or raise ``UncertifiedStep`` to undo the step.
+
+        ``ruling`` is the guard's own answer before the step, ``after`` the engine after it.
+        """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the infos of every vehicle by name, each [n, N]: of the last step, or of the alert before it."""
+        """Return the guard's infos about the last step: name -> values [n, N].
+
+        Before the first step of an episode, they are about the alert. ``running`` is the engine.
+        """
 
 
 class Now(NamedTuple):
     """Everything that a reset or a step of an engine changes; replaced in one assignment."""
 
-    state: State
-    roster: Roster  # who runs in which row, and which worlds failed
-    stream: Stream
-    obstacle: bool  # the rows have columns of an obstacle
-    by_link: bool  # ... of news by link
-    rules: Rules
-    watched: dict[Watcher, Any]  # what each watcher remembers
-    ruling: Ruling | None = None  # of the last step
-    stops: tuple[Stop, ...] = ()  # of scripts on their own grid within the last step
+    state: State  # the running episodes
+    roster: Roster  # the world that runs in each row, and the worlds that could not be advanced
+    stream: Stream  # the source of the next episodes
+    obstacle: bool  # whether the rows have columns for an obstacle ahead
+    by_link: bool  # whether the rows have columns for messages over links between vehicles
+    rules: Rules  # settings of every step
+    watched: dict[Watcher, Any]  # watcher -> its memory
+    ruling: Ruling | None = None  # the guard's answer in the last step; None without one
+    stops: tuple[Stop, ...] = ()  # decisions of scripts within the last step, see ``own_grid``
 
     def apart(self) -> Now:
-        """Return a copy whose arrays can be changed independently."""
+        """Return a copy whose arrays can be changed without changing these."""
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return rows widened to the columns of this batch: those for an obstacle and for messages over links."""
+        """Return ``packed`` with the same columns as the rows of this engine.
+
+        Columns for an obstacle and for messages are added if the engine has them, even if these worlds do not need
+        them.
+        """
         return packed.widened(self.obstacle, self.by_link)
 
 
@@ -128,9 +152,9 @@ class Engine:
         scenario: the scenario of all episodes, or another ``Game``.
         n: number of worlds that are advanced together, at least 1.
         learners: indices of the vehicles (0 = front) that need an action in every step.
-        scripts: the script of every vehicle that does not learn, by index.
-        reward: a name, a mapping of settings, or ``RewardParams``.
-        observation: what the vehicles observe, the same for all or by name; None: as the scenario says.
+        scripts: index of every vehicle that does not learn -> its script.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: what the vehicles observe: one for all, or vehicle name -> observation; None: as the scenario says.
         seed: seed of the training stream, which provides the worlds unless ``worlds`` does.
         deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. An evaluation has no
             learner: there a script is the decider.
@@ -172,7 +196,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
-        self._terms = Terms(reward, scenario, self.deciders)
+        self._terms = Terms(reward, scenario, self.learners or self.deciders)
         self.reward = self._terms.params
         self.observations = observations_of(scenario, observation)  # of each vehicle
         self._plans = tuple(each.plan for each in self.observations)
@@ -190,7 +214,11 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` if a driver was made for another time between decisions (``time_step_s``)."""
+        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario's.
+
+        ``drivers`` maps vehicle indices to agents or scripts; those without an attribute ``time_step_s`` fit every
+        scenario.
+        """
         for script in drivers.values():
             step, here = getattr(script, "time_step_s", None), self.scenario.time_step_s
             if step not in (None, here):
@@ -200,9 +228,12 @@ class Engine:
                 )
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
-        """Start new episodes in all rows, with these worlds (at t = 0) or with the next ones of the training stream.
+        """Start new episodes in all rows. If anything fails, the running episodes go on.
 
-        With ``seed``, the stream restarts from its first world. If anything fails, the running episodes go on.
+        Args:
+            seed: restart the training stream from the first world of this seed; None: continue in the stream.
+            worlds: n worlds at t = 0; None: the next worlds of the training stream.
+
         """
         stream = copy.copy(self._now.stream)
         if seed is not None:
@@ -210,7 +241,10 @@ class Engine:
         self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
 
     def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
-        """Return new episodes in all rows, with these worlds or with the next ones of the ``stream``."""
+        """Return new episodes in all rows, in ``worlds`` (at t = 0) or, if None, in the next worlds of ``stream``.
+
+        ``guarded`` and ``watched`` are the memories of the guard and the watchers so far.
+        """
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
         first = None if worlds is not None else stream.position
@@ -228,7 +262,11 @@ class Engine:
         return new._now
 
     def _begin(self, rows: Ints, start: Start) -> None:
-        """Start episodes in ``rows``: memories, decisions and messages before the first step, potentials."""
+        """Start episodes in the rows with the indices ``rows``, in place.
+
+        ``start`` holds their worlds at the alert and at the first decision. Scripts, guard and watchers get their first
+        memory. Messages that arrive before the first step are delivered, and scripts that decide before it do so.
+        """
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
             with renumbered(rows):
@@ -261,11 +299,11 @@ class Engine:
             potential[rows] = self._terms.potentials(rules.unpack(Packed(motion[rows], params[rows])), self.scenario)
 
     def step(self, actions: Actions) -> Step:
-        """Advance every running episode by one time step.
+        """Advance every running episode by one time step and return the results.
 
         ``actions`` are numbers in [-1, 1] for each learner: an array [n, L] with columns in the order of ``learners``,
-        or a mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. Rows whose episode has
-        ended do not move until ``renew`` or ``reset``. If the guard refuses the step, nothing changes.
+        or a mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. An episode that has
+        ended does not move until ``renew`` or ``reset``. If the guard refuses the step, nothing changes.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -289,7 +327,10 @@ class Engine:
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
-        """Return the learners' actions as [n, L]. Their range is checked where they are used."""
+        """Return the learners' actions as an array [n, L], from an array or a mapping as in ``step``.
+
+        Their range is checked later.
+        """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
             return np.ascontiguousarray(actions, np.float64)
@@ -311,19 +352,25 @@ class Engine:
         return columns
 
     def _in_range(self, columns: Floats) -> Floats:
-        """Return the actions [n, L] clipped by a rounding error of float32 at most; else raise ``InvalidInput``."""
+        """Return the actions ``columns`` [n, L], with values up to a rounding error of float32 outside [-1, 1] clipped.
+
+        Raises ``InvalidInput`` for other values outside [-1, 1].
+        """
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
         return np.stack(each, axis=1) if each else columns
 
     def _ruled(self, before: Engine, columns: Floats, *, checked: bool) -> Ruling:
-        """Return the guard's ruling on these actions [n, L]; ``checked`` says that they are in range."""
+        """Return the guard's answer to the actions ``columns`` [n, L].
+
+        ``before`` is the engine before the step. ``checked`` says that the actions are known to be in [-1, 1].
+        """
         assert self.guard is not None
         if before.guarded is None:
             raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
         return self.guard.decide(before, before.guarded, columns if checked else self._in_range(columns))
 
     def _advance(self, columns: Floats) -> Step:
-        """Advance every running episode by one time step, in place: scripts, motion, failed worlds, reward."""
+        """Advance every running episode by one time step, in place, under the learners' actions ``columns`` [n, L]."""
         harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
         start = None if self.state.impacts is None else self.worlds
         asked = self._ask_scripts()
@@ -338,7 +385,10 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Let the scripts with a memory decide that are deciders; return their new memories, by vehicle."""
+        """Ask the scripts with a memory whose vehicles decide at every step; return vehicle index -> new memory.
+
+        Their commands are written to ``state.wanted``.
+        """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
         if len(self._remembering) > len(own_grid):
@@ -350,7 +400,10 @@ class Engine:
         return asked
 
     def _move(self, columns: Floats) -> tuple[Step, bool]:
-        """Move the worlds under these actions [n, L], and deliver messages. Also return whether a world failed."""
+        """Move the worlds by one step under the actions ``columns`` [n, L], and deliver messages.
+
+        Returns the results of the step, and whether some world could not be advanced.
+        """
         if self._now.stops:
             self._now = self._now._replace(stops=())
         way = self._drive_own_grid(columns) if self._own_grid.scripts else None
@@ -370,19 +423,24 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Let the scripts on their own grids decide within the step that begins."""
+        """Move the worlds to the last decision that a script makes within the step; return this part of the step.
+
+        Such scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
+        learners' actions.
+        """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
         self._now = self._now._replace(stops=way.stops)
         return way
 
     def _add_terms(self, step: Step, harm_before: Floats | None, start: Worlds | None) -> None:
-        """Add the reward terms that the compiled step does not know.
+        """Add the reward terms that the compiled step does not know to the step's results.
 
         Args:
-            step: the step just made.
-            harm_before: harm of each vehicle's objective before the step, [n, N]; None without objectives.
-            start: the worlds before the step, where a measure of impacts is rewarded; else None.
+            step: the step just made; changed in place.
+            harm_before: harm that each vehicle's objective counted before the step, [n, N] m2/s2; None if the reward
+                counts the harm of the whole line.
+            start: the worlds before the step; None unless the reward has a measure of single impacts.
 
         """
         impacts = self.state.impacts
@@ -394,19 +452,24 @@ class Engine:
         self._now = self._now._replace(state=state)
 
     def _change(self, **fields: Any) -> None:
-        """Replace fields of the state."""
+        """Replace the named fields of ``state``."""
         self._now = self._now._replace(state=self._now.state._replace(**fields))
 
     def observe(self, vehicle: int) -> Observations:
-        """Return the current observation of one vehicle, [n, F]."""
+        """Return the current observation of the vehicle with this index (0 = front) in each world, [n, F]."""
         if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
             raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
         return self.observe_all(np.array([vehicle]))[:, 0]
 
     def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
-        """Return the current observations of several vehicles, [n, len(vehicles), F]; None: of all learners.
+        """Return the current observations of several vehicles, [n, len(vehicles), F].
 
-        ``rows`` selects worlds. Raises ``InvalidInput`` if these vehicles observe different features.
+        Args:
+            vehicles: indices of the vehicles (0 = front); None: all learners.
+            rows: indices of the worlds to observe, in place of all n; None: all.
+
+        Raises ``InvalidInput`` if these vehicles observe different features.
+
         """
         vehicles = self._learner_index if vehicles is None else vehicles
         if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
@@ -422,7 +485,11 @@ class Engine:
         return plan.observe(motion, params, vehicles, clock[:, STEP] if rows is None else clock[rows, STEP])
 
     def renew(self, rows: Ints) -> None:
-        """Start new episodes of the training stream in these rows (autoreset). If anything fails, nothing changes."""
+        """Start the next episodes of the training stream in the rows with the indices ``rows``.
+
+        The other rows continue. If anything fails, nothing changes. Raises ``InvalidInput`` for a repeated or unknown
+        row.
+        """
         if len(rows) == 0:
             return
         if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
@@ -443,15 +510,23 @@ class Engine:
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
-        """Truncate the episodes that have taken ``most_steps`` steps, in this engine and in the last ``step``."""
+        """Truncate the episodes that have taken ``most_steps`` steps.
+
+        ``step``, the result of the last step, is changed accordingly.
+        """
         cut = (self.steps >= most_steps) & (step.ended | ~self.ended)
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the parts of the last step between which a script decided; after a reset, from the alert on.
+        """Yield the parts of the last step: usually one, but a script that decides within the step begins a new one.
 
-        Each part is the worlds at its start, the commands [n, N] that they followed, and its end [n]. ``before`` are
-        the worlds at the start of the step, ``last_mps2`` the commands of the last part.
+        Right after a reset, the parts lead from the alert to the first step. Each part is a tuple: the worlds at its
+        start, the commands that the vehicles followed [n, N] m/s2, and the time at its end [n] s.
+
+        Args:
+            before: the worlds at the start of the step.
+            last_mps2: commands of the last part, [n, N] m/s2.
+
         """
         for motion, wanted in self._now.stops:
             then = Packed(motion, self.state.params).worlds(before.vehicles)
@@ -460,26 +535,30 @@ class Engine:
         yield before, last_mps2, self.state.time_s.copy()
 
     def protect(self, guard: Guard | None) -> None:
-        """Set the guard, from the next reset on; None removes it."""
+        """Use this guard from the next reset on; None removes the present one."""
         self.guard = guard
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
     def remember(self, guarded: Any) -> None:
-        """Replace the guard's memory, for a caller that decides itself and uses ``place`` instead of ``step``."""
+        """Set the memory of the guard, for a caller that moves the worlds by ``place`` instead of ``step``.
+
+        ``guarded`` is what ``Guard.begin`` or ``Guard.check`` has returned.
+        """
         self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
     def memory(self, watcher: Watcher) -> Any:
-        """Return the memory of a watcher."""
+        """Return the present memory of a watcher that ``watch`` has added."""
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add a watcher, with its first memory."""
+        """Add an observer of the episodes. ``memory`` is its memory until the next episode begins."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
-        """Return copies of everything that changes while the engine runs: rows, place in the stream, memories.
+        """Return copies of everything that changes while the engine runs, by name, for ``restore``.
 
-        Worlds are pure functions of the seed and their number, so the stream is one number.
+        These are the state, the place in the stream of worlds and the memories of the scripts. Worlds are pure
+        functions of the seed and their number, so the stream is one number.
         """
         arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
         arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
@@ -489,7 +568,7 @@ class Engine:
         return arrays | {f"script.{name}": array for name, array in flat(self.memories).items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue exactly from a ``snapshot`` of an engine of the same scenario, size and scripts.
+        """Continue exactly from ``arrays``, a ``snapshot`` of an engine of the same scenario, size and scripts.
 
         Raises ``InvalidInput`` before anything changes: for a missing array, an array of another shape, or an engine
         with a guard, whose memory the snapshot does not hold.
@@ -515,20 +594,31 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """Return the rules for other rows, whose brakes may build up where those of the rows before did not."""
+        """Return the settings with which steps must advance the worlds of ``state``, instead of this engine's worlds.
+
+        They differ from the present ones if only the worlds of ``state`` have brakes that take time to build up.
+        """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
 
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
-        """Set the running worlds in all rows, as another simulator has moved them, with their ``ledger`` so far.
+        """Replace the worlds in all rows, for example by worlds that another simulator has moved.
 
         Vehicles, memories and times of decisions stay those of the last reset; the next step goes to the next decision
-        after the worlds' time. ``ended`` [n]: worlds that no step moves any more; None: the worlds at the horizon.
-        Raises ``InvalidInput`` for another number of worlds or vehicles.
+        after the worlds' time.
+
+        Args:
+            worlds: n worlds at any time of their episodes.
+            ledger: harm so far; None: none.
+            ended: [n] whether the episode has ended, so that no step moves the world; None: ended if the worlds' time
+                is at or after the horizon.
+
+        Raises ``InvalidInput`` for another number of worlds or vehicles, and if the reward needs every single impact.
+
         """
         state = self.state
         if state.impacts is not None:
-            names = ", ".join(self.reward.terms)
+            names = ", ".join(self._terms.impact_names)
             raise InvalidInput(f"place: reward: {names} needs every impact, which is not known of worlds placed here")
         if worlds.speeds_mps.shape != state.wanted.shape:
             n, N = state.wanted.shape
@@ -541,11 +631,11 @@ class Engine:
         self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 
     def moment(self) -> State:
-        """Return a copy of the state."""
+        """Return a copy of the state, from which ``branch`` can continue."""
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream at the alert, and at their first decision."""
+        """Return the first ``count`` worlds of the training stream: at the alert, and at the first decision."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -554,9 +644,10 @@ class Engine:
         return alert, new.moment()
 
     def branch(self, state: State) -> Engine:
-        """Return an engine whose rows continue from ``state``, under the same guard; this engine does not change.
+        """Return another engine whose episodes continue from ``state``, under the same guard.
 
-        Raises ``InvalidInput`` for a shaped reward: potentials depend on more than the state.
+        This engine does not change. Raises ``InvalidInput`` for a reward with shaping, whose potentials depend on more
+        than the state.
         """
         if self.reward.shaping > 0.0:
             raise InvalidInput(f"branches: reward: shaping = {self.reward.shaping:g}: must be 0; a branch has an end")
@@ -567,20 +658,20 @@ class Engine:
         return self._unwatched(n, self._now._replace(state=state.copy(), roster=roster, ruling=None, rules=rules))
 
     def _unwatched(self, n: int, now: Now) -> Engine:
-        """Return an engine of the same scenario for ``n`` worlds, without watchers."""
+        """Return an engine of the same scenario for ``n`` worlds, with the contents ``now`` and without watchers."""
         new = self._at(now._replace(watched={}))
         new.n = n
         return new
 
     def _at(self, now: Now) -> Engine:
-        """Return this engine with another state of affairs."""
+        """Return a copy of this engine with the contents ``now``."""
         new = copy.copy(self)
         new._now = now
         return new
 
     @property
     def state(self) -> State:
-        """The running episodes, not a copy: read them, do not change them."""
+        """The running episodes. Not a copy: do not change them."""
         return self._now.state
 
     @property
@@ -590,17 +681,17 @@ class Engine:
 
     @property
     def packed(self) -> Packed:
-        """The running worlds as rows (``physics.columns``), not a copy: kernels read them, nobody changes them."""
+        """The running worlds packed into two arrays (``physics.columns``). Not a copy: do not change them."""
         return self._now.state.packed
 
     @property
     def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle asked for in the last step, [n, N] m/s2; not a copy."""
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2. Not a copy."""
         return self._now.state.wanted
 
     @property
     def ledger(self) -> Ledger:
-        """Harm of the running episodes so far, as a copy."""
+        """Harm and number of impacts of the running episodes so far, by pair of vehicles, as a copy."""
         return self._now.state.ledger
 
     @property
@@ -615,12 +706,12 @@ class Engine:
 
     @property
     def roster(self) -> Roster:
-        """Number of the world in each row, and the worlds that the physics could not advance."""
+        """The number of the world in each row, and the worlds that the physics could not advance."""
         return self._now.roster
 
     @property
     def seed(self) -> int:
-        """Seed of the training stream."""
+        """Seed of the training stream: the endless list of worlds from which new episodes come."""
         return self._now.stream.seed
 
     @property
@@ -630,7 +721,7 @@ class Engine:
 
     @property
     def memories(self) -> dict[int, Memory]:
-        """Memories of the scripts, by vehicle."""
+        """Vehicle index -> memory of its script, for the scripts that have a memory."""
         return self._now.state.memories
 
     @property
@@ -640,10 +731,10 @@ class Engine:
 
     @property
     def ruling(self) -> Ruling | None:
-        """The guard's ruling in the last step; None without one."""
+        """The guard's answer in the last step; None without a guard or before the first step."""
         return self._now.ruling
 
     @property
     def in_pieces(self) -> bool:
-        """Whether a script follows a braking profile of several pieces."""
+        """Whether a script follows a braking profile, a list of intervals of constant command."""
         return bool(self._now.rules.pieces.shape[1] > 0)

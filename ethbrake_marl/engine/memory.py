@@ -15,7 +15,7 @@ from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, count_of, describe_error
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-Memory = Any  # None, an array [n, ...], or a tuple or mapping of memories, one row per world
+Memory = Any  # of a script, for n worlds: None, an array [n, ...], or a tuple or mapping of memories
 
 _SHAPES = (
     "one that remembers has begin(alert, vehicle, scripts) -> memory and act(worlds, memory, vehicle) -> (command,"
@@ -24,7 +24,10 @@ _SHAPES = (
 
 
 def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) -> Memory:
-    """Apply ``function`` to every array of a memory, together with the corresponding arrays of ``others``."""
+    """Return a memory in which every array is replaced by ``function(array, ...)``.
+
+    ``others`` are memories of the same form; their corresponding arrays are passed as further arguments.
+    """
     if memory is None:
         return None
     if isinstance(memory, Mapping):
@@ -35,14 +38,15 @@ def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) ->
 
 
 def take_memory(memory: Memory, rows: Ints) -> Memory:
-    """Return the memory restricted to ``rows``, in new arrays."""
+    """Return the memory of the worlds with the indices ``rows``, in new arrays."""
     return map_memory(lambda array: array[rows], memory)
 
 
 def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
-    """Return ``memory`` with ``rows`` replaced by those of ``part``; what ``part`` lacks or has as None is kept.
+    """Return a copy of ``memory`` in which the worlds ``rows`` have the memory ``part``.
 
-    Raises ``InvalidInput`` if ``part`` has keys that ``memory`` lacks.
+    Parts that ``part`` lacks or has as None keep their old values. Raises ``InvalidInput`` if ``part`` has keys that
+    ``memory`` lacks.
     """
     if part is None:
         return memory
@@ -58,10 +62,11 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
 
 
 def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
-    """Return ``memory``; raise ``InvalidInput``, naming ``what`` it is, unless every array has ``n`` rows.
+    """Return ``memory`` if it is valid; otherwise raise ``InvalidInput``.
 
-    Arrays of objects are also refused, because a copy still holds the same objects. Keys of mappings must be
-    identifiers, because a snapshot joins them with dots.
+    Every array must have ``n`` rows. Arrays of objects are also refused, because a copy still holds the same objects.
+    Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` names the memory in the
+    message.
     """
 
     def check(array: Any) -> Any:
@@ -90,7 +95,10 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def flat(memory: Memory) -> Arrays:
-    """Return the arrays of a memory by their path in it; an empty array stands for None."""
+    """Return the arrays of a memory as one mapping from path to array.
+
+    For ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. An empty array stands for None.
+    """
     if isinstance(memory, Mapping | tuple):
         parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
         return {f"{key}.{name}" if name else str(key): array for key, of in parts for name, array in flat(of).items()}
@@ -98,7 +106,10 @@ def flat(memory: Memory) -> Arrays:
 
 
 def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
-    """Return a copy of the memory at path ``place`` of ``arrays``: the inverse of ``flat``. Numbers index tuples."""
+    """Return a copy of the memory that ``flat`` wrote to ``arrays`` under the path ``place``, such as ``script.2``.
+
+    Raises ``InvalidInput`` if there is nothing under this path.
+    """
     if place in arrays:
         return np.array(arrays[place]) if arrays[place].shape != (0,) else None
     inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
@@ -109,7 +120,11 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 
 
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
-    """Raise ``InvalidInput`` if a memory's keys, shapes or dtypes changed; restarted rows would not fit then."""
+    """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
+
+    Such a change would make it impossible to restart single rows. ``before`` and ``after`` are the memory before and
+    after the call. ``who`` begins the message.
+    """
     began, told = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != told:
         raise InvalidInput(
@@ -119,19 +134,29 @@ def _check_kept(before: Memory, after: Memory, who: str) -> None:
 
 
 def is_state_free(script: Script) -> bool:
-    """Return whether the script's command never changes during an episode."""
+    """Return whether the script's command never changes during an episode (its attribute ``state_free``)."""
     return bool(getattr(script, "state_free", False))
 
 
 def is_ours(script: Script) -> bool:
-    """Return whether the script belongs to this package. Other scripts get read-only worlds, because all share them."""
+    """Return whether the script's class belongs to this package.
+
+    Scripts of others get read-only worlds and copies of their memory.
+    """
     return type(script).__module__.startswith("ethbrake_marl.")
 
 
 def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-    """Return the memory of a script after episodes start in these worlds; None for a script without memory.
+    """Return the memory of a script after episodes have started; None for a script without a memory.
+
+    Args:
+        script: the script.
+        alert: worlds of these episodes, at t = 0.
+        vehicle: index of its vehicle (0 = front).
+        scripts: index of each scripted vehicle -> its script.
 
     Raises ``InvalidInput`` naming the script for whatever a user's script raises, and for an invalid memory.
+
     """
     begin = getattr(script, "begin", None)
     if begin is None:
@@ -150,10 +175,11 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
 
 
 def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """Return the command of a script, [n] m/s2, and its new memory.
+    """Return a script's command for ``vehicle`` (index, 0 = front), [n] m/s2, and its new memory.
 
-    Raises ``AgentFailed`` naming script, world, moment and shape for a command that is not one number per world, and
-    ``InvalidInput`` naming the script for whatever a user's script raises, or if it changes its own attributes.
+    ``memory`` is its memory for these worlds; None for a script without. Raises ``AgentFailed`` naming script, world,
+    moment and shape for a command that is not one number per world, and ``InvalidInput`` naming the script for whatever
+    a user's script raises, or if it changes its own attributes.
     """
     remembers = hasattr(script, "begin")
     try:
@@ -186,7 +212,10 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
 
 @contextmanager
 def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
-    """Raise ``InvalidInput`` if a script changes its own attributes in the block, since all episodes share them."""
+    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share, in the block.
+
+    For use in a ``with`` statement.
+    """
     before = dict(getattr(script, "__dict__", {}))
     yield
     for name in {**before, **getattr(script, "__dict__", {})}:
@@ -200,7 +229,19 @@ def _who(script: Script, vehicle: int) -> str:
 
 
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
-    """Return the error to raise for a script's error: one that names the script, unless it is the package's own."""
+    """Return the exception to raise in place of ``error``, which a script raised.
+
+    It is an ``InvalidInput`` that names the script; ``error`` itself if it is a package's error or from a package's
+    script.
+
+    Args:
+        error: the exception.
+        script: the script.
+        what: name of the method that raised it.
+        worlds: the worlds that the method was given.
+        vehicle: index of the script's vehicle.
+
+    """
     if isinstance(error, EthBrakeError) or is_ours(script):
         return error
     who = _who(script, vehicle)
@@ -211,7 +252,16 @@ def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle:
 def within_capacity(
     command_mps2: Floats, worlds: Worlds, vehicle: int, script: Script, due: Bools | None = None
 ) -> Floats:
-    """Return a script's command [n]; raise ``AgentFailed`` where it is ``due`` and beyond the vehicle's capacities."""
+    """Return a script's command if it is within the vehicle's capacities; otherwise raise ``AgentFailed``.
+
+    Args:
+        command_mps2: commanded accelerations, [n] m/s2.
+        worlds: n worlds.
+        vehicle: index of the vehicle (0 = front).
+        script: the script, for the message.
+        due: [n] worlds in which the command is checked; None: all.
+
+    """
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]
     good = (command_mps2 >= low) & (command_mps2 <= high)
     if due is not None:

@@ -1,4 +1,8 @@
-"""Scripts that decide on a grid of their own, between the decisions that set the engine's steps."""
+"""Scripts that decide on a time grid of their own, at moments between the engine's steps.
+
+A script's own grid begins when the latency of its vehicle has elapsed; the engine's steps begin with the first decision
+of its *deciders*, the learners or the evaluated agents.
+"""
 
 from __future__ import annotations
 
@@ -29,22 +33,30 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 ROUNDING = 1e-9  # of a time step: two moments that are closer than this are the same
 
-Stop = tuple[Floats, Floats]  # the motion of all worlds at a decision, and the commands [n, N] that led there
+Stop = tuple[Floats, Floats]  # state [n, S] of all worlds at a script's decision, and the commands [n, N] until then
 
 
 class Way(NamedTuple):
-    """What happened in a step up to the last decision of a script on its own grid."""
+    """The first part of a step, up to the last decision of a script that decides at times of its own in between."""
 
-    reward: Floats  # [n, N] the reward terms that all vehicles share
-    harm: Floats  # [2, n] harm of the line, first impacts and total
-    stopped: Bools  # [n] worlds that were moved to such a decision
-    failed: Ints  # [n] status of the kernel where a world could not be advanced, else 0
-    in_force: Floats  # [n, N] commands in force when the step began
-    memories: dict[int, Memory]  # what the scripts remember now, by vehicle
-    stops: tuple[Stop, ...]  # the decisions, in order
+    reward: Floats  # [n, N] reward of this part
+    harm: Floats  # [2, n] harm of the line in this part: first-impact harm, total harm (m2/s2)
+    stopped: Bools  # [n] whether the world was moved to such a decision
+    failed: Ints  # [n] status of the physics if the world could not be advanced, else 0
+    in_force: Floats  # [n, N] accelerations in force when the step began (m/s2)
+    memories: dict[int, Memory]  # vehicle index -> new memory of its script
+    stops: tuple[Stop, ...]  # the worlds at each of the decisions, in order
 
     def add_to(self, motion: Floats, column: Columns, reward: Floats, outcome: Floats) -> None:
-        """Add this first part of a step to the ``motion``, ``reward`` and ``outcome`` of the rest, in place."""
+        """Add this first part of a step to the results of the rest of the step, in place.
+
+        Args:
+            motion: [n, S] state of the worlds after the step.
+            column: columns of ``motion``.
+            reward: [n, N] reward of the rest.
+            outcome: [OUTCOME_ROWS, n] outcome of the rest.
+
+        """
         reward += self.reward
         outcome[: len(self.harm)] += self.harm
         motion[self.stopped, column.previous : column.gap] = self.in_force[self.stopped]
@@ -53,15 +65,16 @@ class Way(NamedTuple):
 
 
 class OwnGrid:
-    """The scripts of an engine that remember something and are not among its deciders.
+    """Scripts with a memory that decide within an engine's steps.
 
     Each decides when the latency of its vehicle has elapsed, and every time step from then on. An engine's step goes
-    from one decision of the deciders to the next, so such a script decides within it.
+    from one decision of its deciders (the learners or the evaluated agents) to the next, so a script of another vehicle
+    decides within the step.
 
     Args:
-        scripts: by vehicle.
-        time_step_s: time between two decisions of a script.
-        horizon_s: at which an episode is truncated.
+        scripts: vehicle index -> its script.
+        time_step_s: time between two decisions of a script, s.
+        horizon_s: time at which an episode is truncated, s.
 
     """
 
@@ -70,9 +83,10 @@ class OwnGrid:
         self._time_step_s, self._horizon_s = time_step_s, horizon_s
 
     def drive_step(self, state: State, rules: Rules, actions: Floats) -> Way:
-        """Let the scripts decide within the step that begins, under the learners' ``actions`` [n, L].
+        """Let the scripts decide within the step that begins, and return this first part of the step.
 
-        ``state`` is changed in place: worlds are moved to the last decision that changed a command.
+        ``state`` is changed in place: each world is moved to its last decision that changed a command. ``rules``
+        advance the worlds, under the learners' ``actions`` [n, L].
         """
         column = state.packed.column
         in_force = state.motion[:, column.command : column.previous].copy()
@@ -84,10 +98,18 @@ class OwnGrid:
         return way._replace(in_force=in_force)
 
     def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
-        """Let the scripts decide from the alert to the first step, which begins at ``start_s`` [len(rows)].
+        """Let the scripts decide from the alert to the first step of new episodes, and return this part.
 
-        ``state`` holds these rows at the alert, and is changed in place. Learners and deciders coast until then, and
-        others see them coast. Raises ``PhysicsError`` naming the worlds that could not be advanced.
+        Learners and deciders coast until then, and others see them coast.
+
+        Args:
+            state: all running episodes, with the new ones at the alert; these are moved to their first step, in place.
+            rules: how worlds are advanced.
+            rows: rows of the new episodes.
+            start_s: times at which their first steps begin, [len(rows)] s.
+
+        Raises ``PhysicsError`` naming the worlds that could not be advanced.
+
         """
         n, time_s = len(state.motion), state.time_s
         running, until_s, no_actions = np.zeros(n, np.bool_), time_s.copy(), np.empty((n, 0))
@@ -101,9 +123,11 @@ class OwnGrid:
         return way
 
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
-        """Make all decisions before ``until_s`` [n] in the ``running`` worlds.
+        """Make all decisions of the scripts before ``until_s`` [n], and return this part of the step.
 
-        A world is moved to a decision only where that changes a command: the bits depend on where motion changes.
+        Only the ``running`` [n] worlds of ``state`` are advanced, in place. A world is moved to a decision only if that
+        changes a command, because the rounding of the motion depends on where it is interrupted. ``rules`` advance the
+        worlds; ``actions`` [n, L] are the learners'.
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column
@@ -147,10 +171,15 @@ class OwnGrid:
     def _look_ahead(
         self, state: State, rules: Rules, until_s: Floats, decision_s: Floats, actions: Floats
     ) -> tuple[Packed, Floats, Floats]:
-        """The worlds at ``until_s`` [n], with the reward [n, N] and the outcome up to then.
+        """Return copies of the worlds at ``until_s``, their reward [n, N] and outcome [OUTCOME_ROWS, n] up to then.
 
-        ``decision_s`` [n] is the next decision of the deciders. Only the learners' commands in ``state.wanted`` are
-        changed, by ``actions`` [n, L]; none without any.
+        Args:
+            state: the worlds; only the learners' commands in ``wanted`` are changed.
+            rules: how worlds are advanced.
+            until_s: [n] times, s; a world that is not before its time stays.
+            decision_s: [n] time of the deciders' next decision, which periodic messages need, s.
+            actions: [n, L] actions of the learners; L may be 0.
+
         """
         n, wanted = len(state.motion), state.wanted
         clock, settings = np.zeros(state.clock.shape), rules.settings.copy()

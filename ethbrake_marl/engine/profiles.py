@@ -1,6 +1,7 @@
-"""Command profiles of whole episodes, and the harm that they lead to: the problem that search and shield solve.
+"""Command profiles of whole episodes and their harm: the optimisation problem that searches and shields solve.
 
-A *profile* holds the commands of the controlled vehicles from the first decision to the horizon, in at most K phases.
+A *profile* holds the commands of the controlled vehicles from the first decision to the horizon, in at most K phases. A
+*phase* is an interval of constant command that ends at a decision.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ MOST_PHASES = 12
 class SearchWorld(NamedTuple):
     """One world of a ``ProfileProblem``, prepared for running candidate profiles."""
 
-    episode: Episode
-    bounds: Floats  # [C, 2] smallest and largest command (m/s2)
+    episode: Episode  # working memory in which the world is simulated (``physics.episode``)
+    bounds: Floats  # [C, 2] smallest and largest command of each controlled vehicle (m/s2)
     random: UInt64s  # [1] state of the world's random generator
 
 
 @compiled
 def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
-    """Copy the first ``n`` rows, element by element.
+    """Copy the first ``n`` rows of ``rows`` [>= n, c] to those of ``to_rows``, element by element.
 
     An assignment of slices would take ten times longer to compile, because of its error message.
     """
@@ -47,22 +48,22 @@ TIME_STEP_S = 0.1  # default time between two decisions
 
 
 class ProfileProblem(NamedTuple):
-    """The controlled vehicles, the worlds and the times of the decisions for command profiles. Use ``profile_problem``.
+    """The problem of choosing command profiles of the controlled vehicles in n worlds. Made by ``profile_problem``.
 
-    Lines with an obstacle have it as vehicle 0 of every column, so that the vehicles' indices start from 1.
+    If a line has an obstacle, it is vehicle 0 of every column, and the vehicles' indices start from 1.
     """
 
     vehicles: Ints  # [C] indices of the controlled vehicles
     start: Floats  # [n, S] state at the first decision, as ``physics.episode.save`` stores it
-    clock: Floats  # [n, CLOCK.WIDTH] clock of each episode, see ``physics.episode``
+    clock: Floats  # [n, CLOCK.WIDTH] times and numbers of the decisions, and settings; see ``physics.episode``
     bounds: Floats  # [n, C, 2] smallest and largest command of the controlled vehicles (m/s2)
-    command: Floats  # [n, N] commands of the other vehicles (m/s2)
+    command: Floats  # [n, N] commands of the other vehicles, 0 for the controlled ones (m/s2)
     latency: Floats  # [n, N] latencies (s)
     mass: Floats  # [n, N] masses (t)
     limit: Floats  # [n, N] speed limits (m/s)
     brake_rate: Floats  # [n, N] rates at which brakes build up (m/s3)
     release_rate: Floats  # [n, N] rates at which brakes are released (m/s3)
-    pieces: Floats  # [n, N, 2 K] braking profiles of the vehicles that brake in pieces
+    pieces: Floats  # [n, N, 2 K] braking profiles of scripts with K intervals of constant command, as in ``Vehicles``
     identity: UInt64s  # [n] hash of each world's problem, see ``identities``
 
     @property
@@ -71,12 +72,12 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """Return the problem restricted to these worlds."""
+        """Return the problem of the worlds with the indices ``rows`` only."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
     def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
-        """Return a copy in which these rows are replaced by the worlds of ``new``."""
+        """Return a copy in which the worlds with the indices ``rows`` are replaced by those of ``new``, in order."""
         arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
         for name, array in arrays.items():
             array[rows] = getattr(new, name)
@@ -84,11 +85,16 @@ class ProfileProblem(NamedTuple):
 
     @property
     def last_step(self) -> Ints:
-        """Number of decisions up to the horizon, [n]."""
+        """Number of decisions before the horizon, [n]."""
         return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Return profiles [n * Q] that hold the commands [n, Q, C], divided into phases that a search can change."""
+        """Return profiles that hold constant commands.
+
+        ``commands_mps2`` [n, Q, C] are Q constant commands for each world and controlled vehicle. The result has n * Q
+        profiles, in the order of the first two axes. Each is divided into ``MOST_PHASES`` phases, all with the same
+        command, so that a search can change them later.
+        """
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
         ends = np.minimum(borders, self.last_step[:, np.newaxis])
@@ -110,10 +116,10 @@ class ProfileProblem(NamedTuple):
         return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
 
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return first-impact and total harm [n] of one profile per world, equal to the engine's to the bit.
+        """Return first-impact and total harm of one profile per world, each [n] m2/s2.
 
-        Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a capacity, ``PhysicsError`` naming
-        the worlds in which a check of the kernel failed.
+        They equal the engine's to the bit. Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a
+        capacity, ``PhysicsError`` naming the worlds in which a check of the physics failed.
         """
         self.check(profiles)
         n = self.n
@@ -125,7 +131,11 @@ class ProfileProblem(NamedTuple):
         return first, total
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` unless there is one profile per world, within the capacities, with ordered phases."""
+        """Raise ``InvalidInput`` for profiles that do not fit this problem.
+
+        There must be one profile per world, with commands within the capacities, and phases that end in order, the last
+        one at the last decision.
+        """
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]
         if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
@@ -157,16 +167,24 @@ def profile_problem(
     deciders: Sequence[int] | None = None,
     written_out: bool = False,
 ) -> ProfileProblem:
-    """Return the problem of choosing whole command profiles of ``vehicles`` (indices from 0) with the least harm.
+    """Return the problem of choosing whole command profiles of some vehicles with the least harm.
 
-    The first decision is at the smallest latency of the ``deciders`` (default: ``vehicles``), or at the worlds' time if
-    that is later; decisions follow every ``time_step_s``. The other vehicles follow ``others_mps2`` [n, N] (default:
-    full braking; the columns of ``vehicles`` are ignored).
+    Args:
+        worlds: n worlds.
+        vehicles: indices of the controlled vehicles (0 = front).
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+        horizon_s: end of the episodes, s.
+        time_step_s: time between two decisions, s.
+        others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
+            full braking.
+        deciders: indices of vehicles; the first decision is at their smallest latency, or at the worlds' time if that
+            is later. None: ``vehicles``.
+        written_out: describe an obstacle ahead as a vehicle in front (``Worlds.with_obstacle``) even if no world has
+            one; worlds without one get one out of reach. If any world has one, this is always done.
 
-    If any world has an obstacle ahead, or with ``written_out``, the obstacle becomes a vehicle in front
-    (``Worlds.with_obstacle``; worlds without one get one out of reach), and all columns of the problem describe that
-    longer line. Raises ``InvalidInput`` for no vehicle, a repeated or unknown one, an unknown harm count, a command
-    beyond capacity, or a horizon before the first decision.
+    Raises ``InvalidInput`` for no vehicle, a repeated or unknown one, an unknown harm count, a command beyond capacity,
+    or a horizon before the first decision.
+
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
     check_harm_count(harm_count)
@@ -221,8 +239,9 @@ def profile_problem(
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
     """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
 
-    The input is the state and parameters of the world, the other vehicles' commands, the decisions (first, step,
-    number), the horizon and the controlled vehicles, but not the harm count.
+    That is the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions and the
+    horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles; but not the harm
+    count.
     """
     packed = Packed.of(worlds)
     (state, params), column = packed, packed.column
@@ -268,19 +287,22 @@ class Profiles(NamedTuple):
     commands_mps2: Floats  # [n, K, C] commands in each phase
 
     def at(self, step: Ints) -> Floats:
-        """Return the commands in force in these steps [n], [n, C] m/s2. The last command continues afterwards."""
+        """Return the commands in force after decision number ``step`` [n] of each world, [n, C] m/s2.
+
+        Decisions are numbered from 0. The last command continues after the last phase.
+        """
         phase = np.minimum((self.ends <= step[:, np.newaxis]).sum(axis=1), self.ends.shape[1] - 1)
         return np.asarray(self.commands_mps2[np.arange(len(phase)), phase], np.float64)
 
     def take(self, rows: Ints | slice) -> Profiles:
-        """Return the profiles of these worlds."""
+        """Return the profiles of the worlds with the indices ``rows``."""
         return Profiles(self.ends[rows], self.commands_mps2[rows])
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """Return copies in which all profiles have the same number of phases, at least ``least``.
+        """Return copies of several sets of profiles, all with the same number of phases, at least ``least``.
 
-        The added phases are empty.
+        The added phases are empty: they end where the last one does.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
@@ -292,14 +314,17 @@ class Profiles(NamedTuple):
         ]
 
     def grown(self, n: int) -> Profiles:
-        """Return a copy with ``n`` rows, in which the added rows are meaningless."""
+        """Return a copy with ``n`` rows, at least as many as now; the contents of the added rows are meaningless."""
         more = n - len(self.ends)
         return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
 
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
-    """Return world ``k`` of a problem with working memory; ``random`` [n] holds the random states of all worlds."""
+    """Return world number ``k`` of a problem, with working memory of its own.
+
+    ``random`` [n] holds the states of all worlds' random generators; the result refers to entry ``k``.
+    """
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))
     for i in range(N):
@@ -313,9 +338,10 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
 def follow_worlds(
     problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
 ) -> None:
-    """Fill ``first`` and ``total`` [n] with the harm of one profile per world.
+    """Simulate one profile in each world; write the harm to ``first`` and ``total`` [n] m2/s2.
 
-    Sets ``failed`` [n] where the physics fails.
+    ``ends`` [n, K] and ``commands`` [n, K, C] are the fields of ``Profiles``. ``failed`` [n] is set to True for a world
+    in which a check of the physics failed.
     """
     start, no_random = problem.start, np.zeros(problem.start.shape[0], np.uint64)
     for k in range(start.shape[0]):

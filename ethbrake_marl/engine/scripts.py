@@ -16,8 +16,7 @@ class Script(Protocol):
     (index from 0) in every world, [n] m/s2. A script with memory has two methods, and stores nothing in its attributes:
 
     - ``begin(alert, vehicle, scripts) -> memory``: episodes start in the worlds ``alert``, at t = 0. ``scripts`` maps
-      the
-      index of each scripted vehicle to its script; all other vehicles decide freely.
+      the index of each scripted vehicle to its script; all other vehicles decide freely.
     - ``act(worlds, memory, vehicle) -> (command, memory)``: the command [n] m/s2, and the new memory. Worlds without a
       decision at this moment may be included; their results are ignored.
 
@@ -31,4 +30,7 @@ class Script(Protocol):
     """
 
     def act(self, *args: Any, **kwargs: Any) -> Any:
-        """Return the command [n] m/s2; a script with memory also returns its new memory."""
+        """Return the commanded acceleration in n worlds, [n] m/s2; a script with memory also returns its new memory.
+
+        Arguments are ``(worlds, vehicle)`` without, and ``(worlds, memory, vehicle)`` with memory.
+        """

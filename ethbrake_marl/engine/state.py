@@ -1,4 +1,4 @@
-"""``State``: the running episodes of an engine at one moment, row by row."""
+"""``State``: the running episodes of an engine at one moment, one row per world."""
 
 from __future__ import annotations
 
@@ -19,48 +19,48 @@ class State(NamedTuple):
     """Running episodes at one moment, a row for each of n worlds."""
 
     motion: Floats  # [n, S] time, speeds, gaps and harm so far, in the columns of ``physics.columns``
-    params: Floats  # [n, K] what the vehicles can do, and what periodic messages have reached them
-    clock: Floats  # [n, CLOCK_WIDTH] first decision, steps taken, last step, whether the episode has ended
-    wanted: Floats  # [n, N] acceleration that each vehicle asked for in the last step (m/s2)
-    potential: Floats  # [n, N] of a shaped reward; else 0
-    memories: dict[int, Memory]  # by vehicle, of the scripts that remember; never changed in place
+    params: Floats  # [n, K] parameters of the vehicles, and the periodic messages that have reached them
+    clock: Floats  # [n, CLOCK_WIDTH] time of the first decision, steps taken, last step, whether the episode has ended
+    wanted: Floats  # [n, N] acceleration that each vehicle commanded in the last step (m/s2)
+    potential: Floats  # [n, N] potentials of a shaped reward; 0 without shaping
+    memories: dict[int, Memory]  # vehicle index -> memory of its script, if it has one; never changed in place
     guarded: Any = None  # memory of the engine's guard; None without one
-    impacts: EpisodeImpacts | None = None  # so far, where a measure of them is rewarded; never changed in place
+    impacts: EpisodeImpacts | None = None  # impacts so far, if the reward measures them; never changed in place
 
     @property
     def packed(self) -> Packed:
-        """The worlds as rows."""
+        """The worlds packed into two arrays (``physics.columns``), without copying."""
         return Packed(self.motion, self.params)
 
     @property
     def ended(self) -> Bools:
-        """Episodes that have ended, [n]."""
+        """Whether each episode has ended, [n]."""
         return np.asarray(self.clock[:, ENDED] == 1.0, np.bool_)
 
     @property
     def steps(self) -> Ints:
-        """Steps that the episodes have taken, [n]."""
+        """Number of steps that each episode has taken, [n]."""
         return self.clock[:, STEP].astype(np.int64)
 
     @property
     def time_s(self) -> Floats:
-        """Time of each world, [n]."""
+        """Time of each world since the alert, [n] s."""
         return self.motion[:, self.packed.column.time]
 
     @property
     def ledger(self) -> Ledger:
-        """Harm of the episodes so far, in arrays of its own."""
+        """Harm and number of impacts of the episodes so far, by pair of vehicles, as a copy."""
         packed, column = self.packed, self.packed.column
         of_worlds = packed.params[:, column.mass : column.limit], packed.params[:, column.restitution]
         return Ledger(*packed.ledger(), *(each.copy() for each in of_worlds))
 
     def copy(self) -> State:
-        """The same state in arrays of its own; memories are never changed in place."""
+        """Return the same state in arrays of its own; memories, which nobody changes in place, are shared."""
         motion, params, clock, wanted, potential = (array.copy() for array in self[:5])
         return State(motion, params, clock, wanted, potential, self.memories, self.guarded, self.impacts)
 
     def take(self, rows: Ints) -> State:
-        """Some of the rows, or one of them several times."""
+        """Return a state of the rows with the indices ``rows``, which may be repeated."""
         guarded = None if self.guarded is None else self.guarded.take(rows)
         motion, params, clock, wanted, potential, memories = take_memory(self[:6], rows)
         impacts = None if self.impacts is None else self.impacts.take(rows)
@@ -68,7 +68,10 @@ class State(NamedTuple):
 
     @staticmethod
     def join(states: list[State]) -> State:
-        """The rows of all of them, one after the other; all are of one engine without a guard."""
+        """Return one state with the rows of several states, one after the other.
+
+        All must come from one engine. Raises ``InvalidInput`` if it has a guard, whose memory cannot be joined.
+        """
         if states[0].guarded is not None:
             raise InvalidInput("moments: a shield stands in their engine; what it remembers is not joined")
         joined = State(*map_memory(lambda *parts: np.concatenate(parts), *(state[:6] for state in states)))

@@ -24,17 +24,17 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 
 class Start(NamedTuple):
-    """Worlds at their first decision."""
+    """Worlds of new episodes, advanced from the alert to their first decision."""
 
-    origin: Worlds  # worlds at the alert, t = 0; may contain more than these
-    first: int  # row of the first of these worlds in ``origin``
-    packed: Packed  # worlds at the first decision
-    clock: Floats  # [n, CLOCK_WIDTH] see ``compiled_step``
-    wanted: Floats  # [n, N] commands of the state-free scripts, 0 for all others
+    origin: Worlds  # worlds at the alert, t = 0; these n worlds and possibly others
+    first: int  # row in ``origin`` of the first of these worlds; the others follow it
+    packed: Packed  # the n worlds at the first decision
+    clock: Floats  # [n, CLOCK_WIDTH] times and steps of the episodes, see ``compiled_step``
+    wanted: Floats  # [n, N] commands of the scripts whose command never changes, 0 for all other vehicles (m/s2)
 
     @property
     def alert(self) -> Worlds:
-        """These worlds at the alert, t = 0."""
+        """These n worlds at the alert, t = 0."""
         return self.origin.take(np.arange(self.first, self.first + len(self.clock)))
 
     def part(self, first: int, count: int) -> Start:
@@ -49,10 +49,15 @@ class FailedWorld(UserWarning):
 
 
 class Roster:
-    """The world that runs in each row of a batch, and the rows whose worlds could not be advanced.
+    """Record of which world runs in each row of a batch, and of the rows whose worlds could not be advanced.
 
-    ``first`` is the number in the stream of row 0's world; the other rows follow. None: the caller passed the worlds,
-    which have no numbers.
+    Args:
+        n: number of rows.
+        seed: seed of the stream of worlds.
+        first: number in the stream of row 0's world; the other rows follow. None: the caller passed the worlds, which
+            have no numbers.
+        given: the worlds that the caller passed, at the alert; None: none.
+
     """
 
     def __init__(self, n: int, seed: int, first: int | None, given: Worlds | None = None) -> None:
@@ -69,13 +74,23 @@ class Roster:
         return new
 
     def renew(self, rows: Ints, first: int) -> None:
-        """Record that world ``first`` of the stream and the worlds after it now run in these rows."""
+        """Record that new worlds run in the rows with the indices ``rows``.
+
+        They are the worlds ``first``, ``first + 1``, ... of the stream.
+        """
         self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Record worlds that a step from ``from_s`` to ``until_s`` [n] failed to advance: ``status`` is not 0."""
+        """Record the worlds that a step could not advance, and warn of them with ``FailedWorld``.
+
+        Args:
+            status: [n] status of the physics; 0 for a world without failure.
+            from_s: [n] times at which the step began, s.
+            until_s: [n] times at which it would have ended, s.
+
+        """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
         self.failed |= new
         for row, reason in new.items() if self.warns else ():
@@ -87,8 +102,15 @@ class Roster:
 class Stream:
     """The training worlds of a seed, one after the other, each advanced to its first decision.
 
-    Until then, learners and scripts with memory coast here. The caller advances such worlds again, with the scripts'
-    commands (``moved``).
+    Until the first decision, learners and scripts with a memory coast. An engine whose scripts decide earlier advances
+    the worlds again from the alert.
+
+    Args:
+        scenario: the scenario from which worlds are drawn.
+        deciders: indices of the vehicles (0 = front); the first decision is when the first of them may act.
+        scripts: index of each scripted vehicle -> its script.
+        seed: seed of the stream.
+
     """
 
     def __init__(self, scenario: Game, deciders: Sequence[int], scripts: Mapping[int, Script], seed: int) -> None:
@@ -101,7 +123,7 @@ class Stream:
         self.restart(seed)
 
     def restart(self, seed: int, position: int = 0) -> None:
-        """Go to world ``position`` of the stream of ``seed``."""
+        """Continue with world number ``position`` of the stream of ``seed``."""
         self.seed, self._drawn = seed, position
         self._pool: Start | None = None
         self._next = 0
@@ -112,7 +134,7 @@ class Stream:
         return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
 
     def take(self, count: int) -> Start:
-        """Return the next ``count`` worlds."""
+        """Return the next ``count`` worlds at their first decision, and move on in the stream."""
         if self._pool is None or self._next + count > len(self._pool.clock):
             self._fill(count)
         assert self._pool is not None
@@ -121,7 +143,7 @@ class Stream:
         return taken
 
     def _fill(self, count: int) -> None:
-        """Draw and prepare more worlds, behind the remaining ones.
+        """Draw and prepare at least ``count`` more worlds; worlds that were not taken yet come first.
 
         A world that cannot be advanced to its first decision is replaced by the next one that can, with a
         ``FailedWorld`` warning. So the other worlds keep their positions in the stream, and a training continues.
@@ -142,7 +164,10 @@ class Stream:
         self._drawn += size
 
     def prepare(self, alert: Worlds) -> Start:
-        """Return worlds at t = 0 advanced to their first decision; raise ``InvalidInput`` if the horizon is earlier."""
+        """Return the worlds ``alert`` (at t = 0) advanced to their first decision.
+
+        Raises ``InvalidInput`` if the first decision of a world is not before the horizon.
+        """
         alert = alert.play_pieces(self._pieces)
         clock = np.zeros((alert.n, CLOCK_WIDTH))
         clock[:, START] = alert.first_decision_s(self._deciders)
@@ -160,7 +185,7 @@ class Stream:
 
 
 def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
-    """Raise ``InvalidInput`` unless ``worlds`` are ``n`` lines of ``vehicles`` at the alert: t = 0, no impact."""
+    """Raise ``InvalidInput`` unless there are ``n`` lines of ``vehicles`` vehicles, at t = 0 and without any impact."""
     if (worlds.n, worlds.N) != (n, vehicles):
         raise InvalidInput(
             f"reset: {count_of(worlds.n, 'world')} of {worlds.N} vehicles are given; {n} of {vehicles} vehicles needed"
@@ -173,13 +198,20 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
 
 
 def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
-    """Return worlds advanced from the alert to their first decision, packed together with the harm up to then."""
+    """Return worlds advanced from the alert to their first decision, packed together with the harm up to then.
+
+    Args:
+        alert: n worlds at t = 0.
+        wanted: constant commands, [n, N] m/s2.
+        start_s: times of the first decisions, [n] s.
+
+    """
     after, impacts = advance(alert, wanted, until_s=start_s)
     return packed_with(after, impacts)
 
 
 def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
-    """Return worlds packed into rows, with the harm so far."""
+    """Return worlds packed into two arrays (``physics.columns``), with ``harm`` as their harm so far."""
     packed = Packed.of(worlds)
     column, pairs = packed.column, worlds.N - 1
     for group, values in enumerate((harm.first_impact_harm, harm.total_harm, harm.count)):

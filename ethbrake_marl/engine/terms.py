@@ -1,4 +1,4 @@
-"""``Terms``: reward terms that the compiled step does not know, such as measures, shaping and harm by an objective."""
+"""``Terms``: reward terms that the compiled step does not know, such as measures, shaping and objectives."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Terms:
-    """The reward of a batch, resolved: what is added to every step beside the terms that all vehicles share.
+    """The reward of a batch: adds to every step the terms that the compiled step does not know.
+
+    An *objective* says whose harm a vehicle's reward counts; without one, it is the harm of the whole line. *Shaping*
+    adds differences of a potential.
 
     Args:
-        reward: a name, a mapping of settings, or ``RewardParams``.
-        scenario: whose objective holds where the reward names none.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        scenario: scenario whose objective holds if the reward names none.
         learners: indices of the vehicles (0 = front) that learn, or that an evaluated agent controls.
 
     """
@@ -36,18 +39,22 @@ class Terms:
         registered = [MEASURES[name] for name in self.params.terms]
         self._by_step = [measure for measure in registered if measure.by == "step"]
         self._by_impacts = [measure for measure in registered if measure.by == "impacts"]
-        self.count_impacts = bool(self._by_impacts)  # a measure of them has a weight
-        self.by_objective = bool(self._objectives)  # each vehicle's harm by an objective
-        self.are_foreign = bool(registered)  # one is code that somebody registered, and so may fail
+        self.impact_names = [measure.name for measure in self._by_impacts]
+        self.count_impacts = bool(self._by_impacts)  # whether a measure of single impacts has a weight
+        self.by_objective = bool(self._objectives)  # whether each vehicle has an objective of its own
+        self.are_foreign = bool(registered)  # whether some measure was registered by a user, and so may fail
         self.add_something = bool(self._built_in or registered) or self.params.shaping > 0.0 or self.by_objective
 
     @property
     def shared_harm(self) -> float:
-        """Weight of the harm of the whole line, which the compiled step counts: 0 where each has its objective."""
+        """Weight of the whole line's harm, which the compiled step counts; 0 if each vehicle has its own objective."""
         return 0.0 if self._objectives else self.params.harm
 
     def objective_harm(self, state: State) -> Floats:
-        """What the objective of each vehicle makes of the harm so far, [n, N]; only where there are objectives."""
+        """Return the harm so far that each vehicle's objective counts, [n, N] m2/s2.
+
+        Only for a reward with objectives of vehicles (``by_objective`` is True).
+        """
         return objective_harm(state.ledger, self.params.harm_count, self._objectives)
 
     def add(
@@ -59,10 +66,18 @@ class Terms:
         impacts_before: EpisodeImpacts | None,
         worlds: Worlds | None,
     ) -> State:
-        """Add what a step has brought to its reward; nothing for rows that stood still. Returns the state after it.
+        """Add the further terms to the reward of a step, in place, and return the state with its new potentials.
 
-        ``before`` is ``objective_harm`` before the step, None without objectives; ``impacts_before`` are the state's
-        before the step; ``worlds`` are those of the state where the reward is shaped, else None.
+        Episodes that had ended before the step get nothing.
+
+        Args:
+            step: results of the compiled step; ``further`` and ``reward`` are changed.
+            state: state after the step.
+            scenario: the scenario.
+            before: ``objective_harm`` before the step, [n, N]; None without objectives.
+            impacts_before: impacts of the episodes before the step; None if no measure needs them.
+            worlds: worlds after the step if the reward is shaped; else None.
+
         """
         if before is not None and self.params.harm > 0.0:
             step.further["harm"] = before - self.objective_harm(state)
@@ -86,7 +101,7 @@ class Terms:
         return state
 
     def _outcome(self, step: Step, state: State, time_step_s: float) -> StepOutcome:
-        """What measures by step are computed from."""
+        """Return the facts of a step from which measures are computed; ``state`` is the state after it."""
         motion, params, column = state.motion, state.params, state.packed.column
         return StepOutcome(
             step.first_impact_harm,
@@ -106,7 +121,7 @@ class Terms:
         )
 
     def potentials(self, worlds: Worlds, scenario: Game) -> Floats:
-        """Potential of every learner, 0 for other vehicles, [n, N]."""
+        """Return the shaping potential of every learner, 0 for other vehicles, [n, N]."""
         potentials = np.zeros(worlds.speeds_mps.shape)
         shared = self.params.potential(worlds, self._learners, scenario.horizon_s)
         potentials[:, self._learner_index] = shared[:, np.newaxis]

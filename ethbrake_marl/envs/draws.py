@@ -1,4 +1,4 @@
-"""The draws behind the worlds of an environment: every quantity at the alert, type and scenario, as flat columns.
+"""The random draws behind the worlds of an environment: initial states, vehicle types and scenarios, as columns.
 
 Worlds are pure functions of scenario, seed and number. So nothing is stored while episodes run; the worlds are drawn
 again on request.
@@ -24,15 +24,14 @@ Columns = dict[str, NDArray[Any]]
 
 
 def describe_worlds(engine: Engine) -> Columns:
-    """Return the draw of each running world: column -> values [n].
+    """Return the random draw of each running world, as columns: ``{"gap_1_m": [n], "mass_2_t": [n], ...}``.
 
-    The columns are: the quantities of the world at the alert, named as in a table of initial states (``gap_1_m``,
-    ``mass_2_t``); ``scenario`` in a mixture, and ``vehicle_2_type`` with vehicle types; and ``world_seed`` and
-    ``world`` as in the infos. If some of the worlds were passed by the caller and others were drawn, only the drawn
-    ones have types.
+    There is a column for each quantity of the world at the alert (the moment at which the episode begins), named as in
+    a table of initial states. A mixture adds ``scenario``, vehicle types add ``vehicle_2_type`` for worlds that were
+    drawn. ``world_seed`` and ``world`` are as in the infos.
 
-    Raises ``InvalidInput`` for worlds whose draw is unknown: passed worlds after a snapshot was restored, and a world
-    that could not be advanced to its first decision, so that another one replaced it.
+    Raises ``InvalidInput`` for worlds whose draw is unknown. These are worlds that the caller passed, after a snapshot
+    was restored, and a world that could not be advanced to its first decision, so that another world replaced it.
     """
     numbers, given = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
@@ -56,9 +55,10 @@ def describe_worlds(engine: Engine) -> Columns:
 
 
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
-    """Draw these worlds of the training stream again, in the order of ``numbers``.
+    """Draw the worlds with the numbers ``numbers`` in the training stream again, and return them in this order.
 
-    Raises ``InvalidInput`` if the running worlds are different ones.
+    Raises ``InvalidInput`` if the running worlds of the engine differ from them: a world that could not be advanced to
+    its first decision was replaced by another world.
     """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1

@@ -25,15 +25,21 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Specified:
-    """Mixin for environments that Gymnasium makes by an id: their ``spec`` holds settings that JSON can store."""
+    """Mixin for environments that ``gymnasium.make`` makes: its ``spec`` stores settings only as plain data for JSON.
 
-    engine: Engine
-    max_episode_steps: int | None = None
-    _spec: EnvSpec | None = None
+    A scenario object, for instance, becomes a mapping, and a path becomes a text.
+    """
+
+    engine: Engine  # the engine that moves the worlds, set by the environment
+    max_episode_steps: int | None = None  # largest number of steps of an episode; None: the horizon limits it alone
+    _spec: EnvSpec | None = None  # the value of ``spec``
 
     @property
     def spec(self) -> EnvSpec | None:
-        """How the environment was made; None without an id. No episode is longer than its ``max_episode_steps``."""
+        """Gymnasium's record of how the environment was made; None if it was not made by an id.
+
+        No episode is longer than its ``max_episode_steps``.
+        """
         return self._spec
 
     @spec.setter
@@ -49,7 +55,7 @@ class Specified:
 
 
 def _plain(setting: Any) -> Any:
-    """Return a setting of an environment as plain data for JSON."""
+    """Return a setting of an environment as plain data for JSON: a ``Scenario`` as a mapping, a path as a text."""
     if isinstance(setting, Scenario):
         return setting.declared()
     if isinstance(setting, RewardParams):
@@ -118,14 +124,24 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; see docs/episodes.md."""
+        """Start an episode; return the observation and the info.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
+                docs/episodes.md.
+
+        """
         self._restart(seed, options)
         self._running = True
         self.viewer.began()
         return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
-        """Advance by one time step."""
+        """Advance by one time step; return observation, reward, terminated, truncated and info.
+
+        ``action`` is [1] in [-1, 1]: -1 full braking capacity, 0 coasts, +1 full driving capacity.
+        """
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")
         step = self.engine.step(learner_actions(self.engine, {self._name: action}))

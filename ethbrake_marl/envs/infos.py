@@ -49,7 +49,10 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
-    """Return the infos of the engine's shield as ``shield_NAME`` -> [n, N], of all worlds or of ``rows`` only."""
+    """Return the infos of the engine's shield, each [n, N] with the name ``shield_NAME``; empty without a shield.
+
+    ``rows`` are the indices of the worlds to include; None: all.
+    """
     if engine.guard is None or engine.guarded is None:
         return {}
     every = slice(None) if rows is None else rows
@@ -57,29 +60,44 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 
 
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
-    """Return columns [n, N] as one dictionary of plain values for each of these vehicles, world by world.
+    """Return one dictionary of plain values for each world and vehicle: ``[{"time_s": 0.5, "collided": 0.0}, ...]``.
 
-    ``count`` is the number of dictionaries, which are empty without columns.
+    The list begins with the vehicles of the first world.
+
+    Args:
+        columns: name -> values [n, N].
+        vehicles: indices of the vehicles to include.
+        count: length of the list if ``columns`` is empty; its dictionaries are then empty.
+
     """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
     return [dict(zip(columns, row, strict=True)) for row in zip(*values, strict=True)] or [{} for _ in range(count)]
 
 
 class Report(NamedTuple):
-    """Everything that the infos contain, for n worlds of N vehicles."""
+    """Everything that the infos contain at one moment, for n worlds of N vehicles."""
 
-    values: Floats  # [n, N, len(COLUMNS)] values of COLUMNS
-    cost: Floats  # [n] harm of the step (m2/s2); 0 without a step
-    terms: dict[str, Floats]  # reward terms of the step, each [n] (same for all vehicles) or [n, N]; 0 without a step
+    values: Floats  # [n, N, len(COLUMNS)] the infos named in COLUMNS, in this order
+    cost: Floats  # [n] harm that the step added to the line (m2/s2); 0 after a reset
+    terms: dict[str, Floats]  # name of a reward term -> its value in the step, [n] or [n, N]; 0 after a reset
     world_seed: int  # seed of the stream of worlds
     world: Ints  # [n] number of each world in the stream of that seed
-    known_from_s: Floats | None  # [n, N, N] with a channel, else None
-    age_s: Floats | None  # [n, N, N] with periodic messages, else None
-    shield: Columns  # infos of the shield, each [n, N]; empty without a shield
+    known_from_s: Floats | None  # [n, N, N] time from which vehicle i may use messages about j (s); None: no channel
+    age_s: Floats | None  # [n, N, N] age of vehicle i's newest sample of vehicle j (s); None: no periodic messages
+    shield: Columns  # name -> info of the shield, [n, N]; empty without a shield
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-        """Return the report of an engine's current worlds, or of ``rows`` only, before any of them is renewed."""
+        """Return the report of an engine's worlds as they are now.
+
+        Call it after a step before ended episodes are replaced by new ones.
+
+        Args:
+            engine: the engine.
+            step: results of the last step; None after a reset.
+            rows: indices of the worlds to include; None: all.
+
+        """
         now, world = engine.state, engine.roster.numbers
         motion, params, wanted = now.motion, now.params, now.wanted
         if rows is not None:
@@ -103,11 +121,15 @@ class Report(NamedTuple):
         return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
     def columns(self) -> dict[str, Floats]:
-        """Return the values of all vehicles by name, each [n, N]."""
+        """Return the infos named in ``COLUMNS``: name -> values of all vehicles [n, N]."""
         return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
 
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
-        """Return the infos of these vehicles, world by world, as plain numbers; ``chosen_action`` is an array [1]."""
+        """Return one dictionary of infos for each vehicle in ``vehicles`` (indices), world by world.
+
+        The values are plain numbers, except ``chosen_action``, an array [1], and ``known_from_s`` and ``age_s``, arrays
+        [N].
+        """
         worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
         numbers, costs = self.world.tolist(), self.cost.tolist()
         terms = {
@@ -146,10 +168,16 @@ class Report(NamedTuple):
         return infos
 
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Return one vehicle's infos in all worlds in Gymnasium's vector format: ``name`` [n] and its mask ``_name``.
+        """Return one vehicle's infos in all worlds in Gymnasium's vector format.
 
-        Only the worlds marked by ``rows`` have infos. Values about the last step are 0 except in the worlds marked by
-        ``stepped``.
+        This is ``{"time_s": [n], "_time_s": [n], ...}``; the entry with an underscore marks the worlds that have the
+        info.
+
+        Args:
+            vehicle: index of the vehicle (0 = front).
+            rows: [n] worlds that have infos.
+            stepped: [n] worlds in which values about the last step are given; they are 0 in the others.
+
         """
         columns: dict[str, NDArray[Any]] = {name: told[:, vehicle] for name, told in self.columns().items()}
         columns["collided"] = columns["collided"] == 1.0
@@ -173,7 +201,10 @@ class Report(NamedTuple):
 
 @compiled
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
-    """Fill ``out`` [n, N, ...] with the values of COLUMNS."""
+    """Write the infos named in ``COLUMNS`` to ``out`` [n, N, len(COLUMNS)].
+
+    ``state`` and ``params`` are packed worlds (``physics.columns``), ``wanted`` [n, N] the commands of the vehicles.
+    """
     n, N = wanted.shape
     column = columns(state)
     P, harm, mass, obstacle = N - 1, column.harm, column.mass, column.obstacle
@@ -208,21 +239,22 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """Base class of all interfaces: an engine, whether episodes have begun in it, and the seed of its worlds.
+    """Base class of all environments: it holds an engine, and starts episodes by a seed and options.
 
-    ``np_random`` and ``np_random_seed`` have the same meaning as in ``gymnasium.Env``.
+    A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. ``np_random`` and
+    ``np_random_seed`` have the same meaning as in ``gymnasium.Env``.
     """
 
-    engine: Engine
-    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)
-    _started = False
+    engine: Engine  # the engine that moves the worlds
+    _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)  # keys that ``options`` of ``reset`` may have
+    _started = False  # whether an episode has begun
     _goes_on = False  # whether a reset without a seed continues the running stream
     _np_random: np.random.Generator | None = None
     _np_random_seed: int | None = None  # -1: unknown, because the user set the generator
 
     @property
     def np_random(self) -> np.random.Generator:
-        """Random generator for wrappers; the worlds depend on ``np_random_seed`` only.
+        """Random generator for wrappers. The worlds do not depend on it, only on ``np_random_seed``.
 
         After you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
         ``reset`` with a seed.
@@ -240,7 +272,7 @@ class Begun:
 
     @property
     def np_random_seed(self) -> int:
-        """Seed of the stream of worlds, from fresh entropy unless a seed was passed; -1 after ``np_random`` was set."""
+        """Seed of the stream of worlds, chosen at random unless a seed was passed; -1 after ``np_random`` was set."""
         if self._np_random_seed is None:
             self._set_seed(chosen_seed(None))
             assert self._np_random_seed is not None
@@ -250,14 +282,20 @@ class Begun:
         self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
 
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
-        """Start new episodes in all worlds, from the start of the stream of ``seed``, or from where the stream is.
+        """Start new episodes in all worlds, as ``reset`` does.
 
         With ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) every world starts in that state.
         With ``options["listed_world"] = {"seed": 7, "number": 3}`` the episode starts in that world of the evaluation
         list; a batch starts in that world and those after it. With autoreset, later episodes come from the stream.
-        Other options cause the warning ``UnknownResetOption`` and are ignored. Raises ``InvalidInput``, without
-        changing anything, for a seed that is not a whole number >= 0, an invalid initial state or listed world, or both
-        of them.
+        Other options cause the warning ``UnknownResetOption`` and are ignored.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: the options; None: none.
+
+        Raises ``InvalidInput``, without changing anything, for a seed that is not a whole number >= 0, an invalid
+        initial state or listed world, or both of them.
+
         """
         named = None if seed is None else chosen_seed(seed)
         if not (options is None or isinstance(options, Mapping)):
@@ -268,9 +306,10 @@ class Begun:
         self._begin(named, wanted_worlds(self.engine, options or {}))
 
     def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
-        """Start episodes in these worlds or, without ``worlds``, in worlds of a stream.
+        """Start episodes in ``worlds`` (at the alert), or, if None, in the next worlds of a stream.
 
-        The stream is that of ``seed``, of a seed drawn from the user's generator, or the current one.
+        With a ``seed`` the stream starts anew from its first world. Without a seed the current stream continues; but if
+        the user has set ``np_random``, a new seed is drawn from it.
         """
         drawn, used = seed is None and self._np_random_seed == -1, seed
         if drawn:
@@ -289,23 +328,33 @@ class Begun:
             raise InvalidInput(f"{what}: no episode was started; call reset first")
 
     def describe_worlds(self) -> Columns:
-        """Return the draw of each running world: columns by name, [worlds]; see ``envs.draws.describe_worlds``."""
+        """Return the random draw of each running world: column name -> values [worlds].
+
+        See ``envs.draws.describe_worlds``.
+        """
         self._check_started("describe_worlds")
         return describe_worlds(self.engine)
 
 
 class OneWorld(Begun):
-    """Base class of the interfaces with a single world, which a viewer can show."""
+    """Base class of the environments with a single world: adds ``describe_world``, ``render`` and ``close``.
 
-    viewer: Viewer
+    A subclass sets ``viewer`` in its constructor.
+    """
+
+    viewer: Viewer  # draws the pictures of the running episode
 
     def describe_world(self) -> dict[str, Any]:
-        """Return the draw of the running world: numbers and texts by name; see ``envs.draws.describe_worlds``."""
+        """Return the random draw of the running world: name -> number or text; see ``envs.draws.describe_worlds``."""
         self._check_started("describe_world")
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """Return a frame [H, W, 3] uint8, a list of new frames, a text, or None for ``human``, by render mode."""
+        """Return the picture of the present moment, in the form of the render mode.
+
+        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of frames since the last call. ``ansi``: a
+        text. ``human``: None, because the window shows every step anyway.
+        """
         return self.viewer.render()
 
     def close(self) -> None:

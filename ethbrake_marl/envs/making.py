@@ -1,4 +1,4 @@
-"""Build the engine of an interface: spaces, learners, actions, seeds and reset options."""
+"""Build the parts that all interfaces share: spaces, engine, actions, seeds and reset options."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping holds the c
 
 
 def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
-    """Return the observation space: a float32 box [F] with the features' bounds, which are finite."""
+    """Return the observation space of the features: a float32 box [F] with their bounds, which are finite."""
     low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
     return Box(low, high, dtype=np.float32)
 
@@ -85,7 +85,7 @@ def make_engine(
 
 
 def only_learner(engine: Engine) -> int:
-    """Return the index of the only learner; raise ``InvalidInput`` unless there is exactly one."""
+    """Return the index of the engine's only learner (0 = front); raise ``InvalidInput`` unless there is exactly one."""
     check_one_learner(
         engine.scenario.name,
         [engine.scenario.vehicle_names[i] for i in engine.learners],
@@ -95,10 +95,11 @@ def only_learner(engine: Engine) -> int:
 
 
 def learner_actions(engine: Engine, actions: Mapping[str, Any]) -> Floats | dict[int, Floats]:
-    """Return the learners' actions of one world as [1, L], from a mapping of vehicle name to action [1].
+    """Return the learners' actions of an engine with one world, as ``Engine.step`` takes them: [1, L].
 
-    Raises ``InvalidInput`` naming the vehicle whose action is missing or has the wrong shape; the engine checks the
-    range. Behind a shield, actions may be missing; then the result is a mapping from vehicle index to action.
+    ``actions`` maps vehicle names to actions [1]. Raises ``InvalidInput`` naming the vehicle whose action is missing or
+    has the wrong shape; the engine checks the range. Behind a shield, actions may be missing; then the result is a
+    mapping from vehicle index to action [1].
     """
     names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
     for c, vehicle in enumerate(engine.learners):
@@ -145,7 +146,12 @@ def chosen_seed(seed: int | None) -> int:
 
 
 def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
-    """Return the worlds that the options request, one for each row; None for worlds of the stream."""
+    """Return the worlds that the ``options`` of a reset choose, one for each of the engine's worlds.
+
+    ``initial_state`` puts all of them in one state; ``listed_world`` chooses consecutive worlds of an evaluation list.
+    Without either key the result is None: the worlds come from the stream. Raises ``InvalidInput`` if both keys are
+    present, or if one is invalid.
+    """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:
             return None
@@ -165,7 +171,7 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
 
 
 def warn_of_unknown(options: Iterable[str], known: Sequence[str]) -> None:
-    """Warn once about all option names that are not in ``known``."""
+    """Warn with ``UnknownResetOption``, once, about all names in ``options`` that are not in ``known``."""
     unknown = sorted({str(name) for name in options} - set(known))
     if unknown:
         names, right = ", ".join(unknown), ", ".join(known)

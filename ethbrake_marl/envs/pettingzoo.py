@@ -25,13 +25,13 @@ from ethbrake_marl.physics.state import Ints
 
 
 class SeededInside:
-    """Mixin for wrappers of PettingZoo and SB3: ``np_random`` is read from and set on the wrapped environment."""
+    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are read from, and set on, the innermost environment."""
 
-    unwrapped: Any
+    unwrapped: Any  # the innermost environment
 
     @property
     def np_random(self) -> np.random.Generator:
-        """See ``EthBrakeParallelEnv.np_random``."""
+        """Random generator of the environment inside; see ``EthBrakeParallelEnv.np_random``."""
         generator: np.random.Generator = self.unwrapped.np_random
         return generator
 
@@ -41,7 +41,7 @@ class SeededInside:
 
     @property
     def np_random_seed(self) -> int:
-        """See ``EthBrakeParallelEnv.np_random_seed``."""
+        """Seed of the environment inside; see ``EthBrakeParallelEnv.np_random_seed``."""
         seed: int = self.unwrapped.np_random_seed
         return seed
 
@@ -54,21 +54,24 @@ class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # Pet
 
 
 class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's wrapper from parallel to AEC, except that an invalid action is refused in its agent's own turn.
+    """PettingZoo's wrapper from parallel to AEC, but an invalid action is refused at once, in its agent's own turn.
 
     The turn stays with that agent, so that it can act again.
     """
 
     @classmethod
     def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
-        """Return the AEC environment of a parallel environment of this package, possibly wrapped; order is enforced."""
+        """Return the AEC environment of a parallel environment of this package, possibly wrapped.
+
+        PettingZoo's order enforcement is included: methods called before ``reset`` raise an error.
+        """
         return Ordered(cls(env))
 
     def step(self, action: Any) -> None:
-        """Take the action of ``agent_selection``; after the last agent's action, advance all by one step.
+        """Take the action [1] of the agent whose turn it is (``agent_selection``).
 
-        Raises ``InvalidInput`` for an invalid action of a learner, and for any action but None after its episode has
-        ended.
+        After the last agent's action, all vehicles advance by one time step. Raises ``InvalidInput`` for an invalid
+        action of a learner, and for any action but None after the agent's episode has ended.
         """
         agent, engine = self.agent_selection, self.env.unwrapped.engine
         assert isinstance(engine, Engine)
@@ -144,17 +147,24 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         self.state_space = feature_box(state_features(self.engine.scenario))
 
     def observation_space(self, agent: str) -> Any:
-        """Return an agent's observation space, float32 box [F]; the same object on each call."""
+        """Return the observation space of the agent with this name, a float32 box [F]; the same object on each call."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Return an agent's action space, float32 box [1]; the same object on each call."""
+        """Return the action space of the agent with this name, a float32 box [1]; the same object on each call."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode; see docs/episodes.md."""
+        """Start an episode; return observations and infos by agent name.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
+                docs/episodes.md.
+
+        """
         self._restart(seed, options)
         self.agents = self.possible_agents[:]
         self.viewer.began()
@@ -163,7 +173,11 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
-        """Advance by one time step. Raise ``InvalidInput`` naming the agent whose action is missing or invalid."""
+        """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent name.
+
+        ``actions`` maps agent names to actions [1] in [-1, 1]. Raises ``InvalidInput`` naming the learner whose action
+        is missing or invalid.
+        """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
         if not isinstance(actions, (dict, Mapping)):  # dict first, because that check is faster
@@ -223,7 +237,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
 
 def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
-    """Return the indices of the vehicles that are agents."""
+    """Return the indices of the vehicles that are agents; raise ``InvalidInput`` unless ``agents`` is a known word."""
     if agents not in get_args(WhoIsAgent):
         raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
     if agents == "all":
@@ -239,7 +253,9 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the environment with agents acting in turn (AEC), front to rear; arguments as ``parallel_env``.
+    """Return the environment with agents acting in turn (AEC), front to rear.
+
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.raw_env("paper-random")
@@ -252,9 +268,9 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 
 
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the AEC environment with PettingZoo's order enforcement, the same as ``raw_env``.
+    """Return the environment with agents acting in turn (AEC), the same as ``raw_env``.
 
-    Actions are not clipped, and nothing ends an episode early: an invalid action raises ``InvalidInput`` in its agent's
-    turn, and the turn stays with that agent.
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. Actions are not clipped, and nothing ends an
+    episode early: an invalid action raises ``InvalidInput`` in its agent's turn, and the turn stays with that agent.
     """
     return raw_env(scenario, **settings)

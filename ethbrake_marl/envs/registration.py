@@ -8,7 +8,7 @@ PETTINGZOO_ID = "ethbrake/ethbrake-v0"
 
 
 def register_environments() -> None:
-    """Register every id that is not registered yet; a second call changes nothing."""
+    """Register the environment's ids in Gymnasium and PettingZoo. A second call changes nothing."""
     import gymnasium  # imported here because it would slow down --help
     import pettingzoo
 

@@ -34,27 +34,27 @@ LATE_S = 3.0  # longest latency that the view makes room for
 
 
 class View(NamedTuple):
-    """Ends of the road in view (m from Vehicle 1's front at the alert); constant during an episode if possible."""
+    """The stretch of road in a picture, as positions relative to Vehicle 1's front at the alert."""
 
-    left_m: float
-    right_m: float
+    left_m: float  # position of the left end (m)
+    right_m: float  # position of the right end (m)
 
 
 class Struck(NamedTuple):
-    """An impact that is being shown."""
+    """An impact that a picture shows."""
 
-    pair: int  # index of the pair; -1: Vehicle 1 and the obstacle
-    closing_mps: float
-    time_s: float
+    pair: int  # index of the pair, 0 for Vehicles 1 and 2; -1: Vehicle 1 and the obstacle
+    closing_mps: float  # closing speed (m/s)
+    time_s: float  # time since the alert (s)
 
     @property
     def who(self) -> str:
-        """The two parties of the impact, in words."""
+        """The two parties of the impact in words, such as "Vehicles 1 and 2"."""
         return "Vehicle 1 and the obstacle" if self.pair < 0 else f"Vehicles {self.pair + 1} and {self.pair + 2}"
 
     @property
     def speed(self) -> str:
-        """The closing speed in words; never 0.0."""
+        """The closing speed in words, such as "3.2 m/s" or "< 0.1 m/s"."""
         return f"{self.closing_mps:.1f} m/s" if self.closing_mps >= 0.05 else "< 0.1 m/s"
 
 
@@ -62,32 +62,33 @@ class Scene(NamedTuple):
     """One world at one moment, with everything that a picture shows."""
 
     title: str  # name of the scenario
-    time_s: float  # since the alert
-    view: View
-    # [N] drawn positions of the front bumpers, relative to Vehicle 1's at the alert: bodies of length BODY_M, true gaps
+    time_s: float  # time since the alert (s)
+    view: View  # the stretch of road that is shown
+    # [N] positions at which the front bumpers are drawn (m from Vehicle 1's at the alert). Vehicles have no length in
+    # the physics, but are drawn BODY_M long; the drawn gaps are the true ones.
     front_m: Floats
-    gaps_m: Floats  # [P]
-    speeds_mps: Floats  # [N]
-    command_mps2: Floats  # [N] command in force; 0 before the latency has elapsed
-    braking_mps2: Floats  # [N] braking capacities
-    driving_mps2: Floats  # [N] driving capacities
-    latency_s: Floats  # [N]
+    gaps_m: Floats  # [P] gap of each pair of neighbours (m)
+    speeds_mps: Floats  # [N] speed of each vehicle (m/s)
+    command_mps2: Floats  # [N] command in force (m/s2); 0 before the latency has elapsed
+    braking_mps2: Floats  # [N] braking capacities (m/s2)
+    driving_mps2: Floats  # [N] driving capacities (m/s2)
+    latency_s: Floats  # [N] time since the alert at which each vehicle may act (s)
     hit: Bools  # [P] whether the pair has had an impact
     struck: tuple[Struck, ...]  # impacts within the last FLASH_S seconds
     first_harm: float  # first-impact harm of the line so far (m2/s2)
     total_harm: float  # total harm of the line so far (m2/s2)
-    obstacle_m: float  # position of the obstacle; infinite: none
-    learners: tuple[int, ...]  # indices of the learners
+    obstacle_m: float  # position of the obstacle (m from Vehicle 1's front at the alert); infinite: none
+    learners: tuple[int, ...]  # indices of the learners (0 = front)
     shield: bool | None  # whether a shield replaced the action; None: no shield
     ended: bool  # whether the episode is over
 
     @property
     def shield_words(self) -> str:
-        """The shield's decision in this step, in words."""
+        """The shield's decision in this step in words, such as "shield: stepped in"."""
         return "shield: stepped in" if self.shield else "shield: let it pass"
 
     def command_words(self, i: int) -> str:
-        """Return the command in force of vehicle ``i``, in words."""
+        """Return the command in force of the vehicle with index ``i`` in words, such as "brakes 3.0 m/s2"."""
         command = float(self.command_mps2[i])
         if self.latency_s[i] > self.time_s:
             return f"acts from {self.latency_s[i]:.2f} s" if math.isfinite(self.latency_s[i]) else "never acts"
@@ -96,7 +97,7 @@ class Scene(NamedTuple):
         return f"{'brakes' if command < 0.0 else 'drives'} {abs(command):.1f} m/s2"
 
     def text(self) -> str:
-        """Return the moment as text without control characters: the road to scale, then a line for each vehicle."""
+        """Return the scene as text without control characters: the road to scale, then one line for each vehicle."""
         left, right = self.view
 
         def column(place_m: float) -> int:
@@ -125,7 +126,7 @@ class Scene(NamedTuple):
         return "\n".join([*told, self.shield_words] if self.shield is not None else told) + "\n"
 
     def frame(self) -> Frame:
-        """Return the moment as a picture [H, W, 3]; the same moment gives the same bytes."""
+        """Return the scene as a picture [H, W, 3] uint8; the same scene gives the same bytes."""
         from PIL import Image, ImageDraw
 
         image = Image.new("RGB", (WIDTH * _FINE, HEIGHT * _FINE), _PAPER)
@@ -143,19 +144,25 @@ class Scene(NamedTuple):
 
 
 def vehicle_colour(i: int) -> str:
-    """Return the colour of Vehicle ``i + 1`` in every picture."""
+    """Return the colour of the vehicle with index ``i`` in every picture, such as ``#0072B2``."""
     return COLOURS[(i + 1) % len(COLOURS)]
 
 
 def follow(view: View, front_m: Floats) -> View:
-    """Return the view, moved forward and widened as far as needed to contain the whole line."""
+    """Return the view moved forward and widened as far as needed to contain the whole line.
+
+    ``front_m`` [N] are the drawn positions of the front bumpers, m.
+    """
     on = max(float(front_m[0]) + AHEAD_M - view.right_m, 0.0)
     left = min(view.left_m + on, float(front_m[-1]) - BODY_M - BEHIND_M)
     return View(left if on else min(left, view.left_m), view.right_m + on)
 
 
 def star(x: float, y: float, far: float, near: float) -> list[tuple[float, float]]:
-    """Return the corners of a star with eight points around (x, y); ``far`` and ``near`` are its radii."""
+    """Return the 16 corners (x, y) of a star with eight points around (x, y).
+
+    ``far`` is the radius of the points, ``near`` the radius of the corners between them.
+    """
     return [
         (x + r * math.cos(k * math.pi / 8), y + r * math.sin(k * math.pi / 8)) for k, r in enumerate([far, near] * 8)
     ]
@@ -185,22 +192,22 @@ _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
 
 
 class _Pen:
-    """Draws shapes at the larger scale, from coordinates in pixels of the final picture."""
+    """Draws shapes from coordinates in pixels of the final picture, ``_FINE`` times as large for smooth edges."""
 
     def __init__(self, draw: ImageDraw.ImageDraw) -> None:
         self._draw = draw
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        """Draw a box with slightly round corners."""
+        """Draw a box with slightly round corners; ``fill`` is its colour, ``edge`` the colour of its edge, or None."""
         corners = [value * _FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
         self._draw.rounded_rectangle(corners, 2 * _FINE, fill=fill, outline=edge, width=_FINE * 2)
 
     def line(self, x1: float, y1: float, x2: float, y2: float, colour: str, width: float = 1.0) -> None:
-        """Draw a straight line."""
+        """Draw a straight line from (x1, y1) to (x2, y2), ``width`` pixels wide."""
         self._draw.line([x1 * _FINE, y1 * _FINE, x2 * _FINE, y2 * _FINE], fill=colour, width=round(width * _FINE))
 
     def shape(self, points: list[tuple[float, float]], fill: str, edge: str | None = None) -> None:
-        """Draw a polygon."""
+        """Draw a polygon with these corners (x, y); ``fill`` and ``edge`` are colours, ``edge`` may be None."""
         self._draw.polygon([(x * _FINE, y * _FINE) for x, y in points], fill=fill, outline=edge, width=_FINE)
 
 
@@ -239,7 +246,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw a vehicle's command as a share of its capacity: braking to the left, driving to the right."""
+    """Draw the command of vehicle ``i`` as a share of its capacity: braking to the left, driving to the right."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62
@@ -310,19 +317,19 @@ def _write_panel(text: ImageDraw.ImageDraw, scene: Scene, i: int) -> None:
 
 
 def _fitting(words: list[str], width: float, size: int) -> str:
-    """Return the first of ``words`` that is not wider than ``width``, else the last."""
+    """Return the first of ``words`` that is at most ``width`` pixels wide in a font of this size; else the last."""
     return next((each for each in words if _font(size).getlength(each) <= width), words[-1])
 
 
 def _share(scene: Scene, i: int) -> float:
-    """Return the command in force as a share of the vehicle's capacity; negative for braking."""
+    """Return the command in force of vehicle ``i`` as a share of its capacity, -1 to 1; negative for braking."""
     command = float(scene.command_mps2[i])
     capacity = float((scene.braking_mps2 if command < 0.0 else scene.driving_mps2)[i])
     return command / capacity if command != 0.0 else 0.0
 
 
 def _panel(scene: Scene, i: int) -> tuple[float, float]:
-    """Return left edge and width (pixels) of a vehicle's panel; panels are ordered with Vehicle 1 on the right."""
+    """Return left edge and width (pixels) of the panel of vehicle ``i``; Vehicle 1's panel is on the right."""
     count = len(scene.front_m)
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * _MARGIN - gap * (count - 1)) / count, 240.0)
@@ -330,14 +337,15 @@ def _panel(scene: Scene, i: int) -> tuple[float, float]:
 
 
 def _x(scene: Scene, place_m: float) -> float:
-    """Return the horizontal position in pixels of a place on the road."""
+    """Return the horizontal position (pixels) of the place ``place_m`` on the road (m)."""
     return (float(place_m) - scene.view.left_m) / (scene.view.right_m - scene.view.left_m) * WIDTH
 
 
 def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
     """Return the free stretches of road, from the front backwards: to an obstacle, and between the vehicles.
 
-    Each has its left and right end (pixels), its length (m), and whether the two beside it have had an impact.
+    Each is a tuple: left and right end (pixels), length (m), and whether the bodies at its two ends have hit each
+    other.
     """
     front, obstacle = float(scene.front_m[0]), scene.obstacle_m
     spaces = [(_x(scene, front), _x(scene, obstacle), obstacle - front, any(s.pair < 0 for s in scene.struck))]
@@ -348,19 +356,19 @@ def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
 
 
 def _marks(scene: Scene, every_m: float) -> list[float]:
-    """Return the places in view that are multiples of ``every_m``."""
+    """Return the places on the road (m) that are in view and multiples of ``every_m``."""
     first, last = math.ceil(scene.view.left_m / every_m), math.floor(scene.view.right_m / every_m)
     return [k * every_m for k in range(first, last + 1)]
 
 
 def _spacing(scene: Scene) -> float:
-    """Return the distance (m) between two labelled marks, such that at most a dozen fit."""
+    """Return the distance (m) between two labelled marks on the road, such that at most a dozen fit."""
     width = scene.view.right_m - scene.view.left_m
     return next((every for every in (5.0, 10.0, 20.0, 50.0, 100.0, 200.0) if width <= 12 * every), 500.0)
 
 
 def _contact(scene: Scene, struck: Struck) -> float:
-    """Return the horizontal position (pixels) at which an impact is shown: between the two bodies."""
+    """Return the horizontal position (pixels) at which the impact ``struck`` is shown: between the two bodies."""
     if struck.pair < 0:
         return _x(scene, scene.front_m[0])
     return (_x(scene, scene.front_m[struck.pair + 1]) + _x(scene, scene.front_m[struck.pair] - BODY_M)) / 2
@@ -368,7 +376,7 @@ def _contact(scene: Scene, struck: Struck) -> float:
 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Return Pillow's built-in font, which is the same on every machine with this version of Pillow."""
+    """Return Pillow's built-in font in this size; it is the same on every machine with this version of Pillow."""
     from PIL import ImageFont
 
     font = ImageFont.load_default(size)

@@ -92,10 +92,11 @@ class EthBrakeVecEnv(Begun, VecEnv):
     Args:
         engine: the engine of the worlds; ``make_sb3_vec_env`` builds it.
         seed: seed of the stream of worlds.
-        horizon_is_end: as in ``make_sb3_vec_env``.
-        appended: as in ``make_sb3_vec_env``.
-        step_infos: as in ``make_sb3_vec_env``.
-        render_mode: as in ``make_sb3_vec_env``.
+        horizon_is_end: report no truncation at the horizon in the infos, as explained in ``make_sb3_vec_env``.
+        appended: numbers appended to each observation: ``number``, the learner's index among the learners; ``state``,
+            the full state of the line. None: nothing.
+        step_infos: fill the infos of every step, not only at the end of an episode.
+        render_mode: ``rgb_array`` or None.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -141,15 +142,19 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Start the stream of ``seed`` at the next reset (None: fresh entropy); all rows share one stream."""
+        """Start the stream of ``seed`` at the next reset (None: a random seed); return the seed, once per row.
+
+        All rows share one stream.
+        """
         self._set_seed(chosen_seed(seed))
         self._goes_on = False
         return [self.np_random_seed] * self.num_envs
 
     def reset(self) -> Observations:
-        """Start an episode in every world, with the seed and options set before (``seed``, ``set_options``).
+        """Start an episode in every world; return the observations, [rows, F] float32.
 
-        Options hold for one reset. Invalid options raise ``InvalidInput`` at that reset, and are then forgotten.
+        Seed and options are those set before (``seed``, ``set_options``). Options hold for one reset. Invalid options
+        raise ``InvalidInput`` at that reset, and are then forgotten.
         """
         try:
             worlds = self._read_options()
@@ -162,11 +167,15 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions [rows, 1] for ``step_wait``."""
+        """Store the actions [rows, 1] in [-1, 1] for ``step_wait``."""
         self._actions = own_actions(actions, "the learners")
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
-        """Advance every world by one time step; worlds that end start their next episode at once."""
+        """Advance every world by one time step with the stored actions.
+
+        Worlds that end start their next episode at once. Returns observations [rows, F], rewards [rows], whether each
+        row's episode ended [rows], and one dictionary of infos per row.
+        """
         if not self._started or self._actions is None:
             raise InvalidInput("step: no episode is running; call reset first")
         actions, self._actions = self._actions, None
@@ -195,19 +204,22 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return a frame [H, W, 3] of each world."""
+        """Return the picture of each world, a list of frames [H, W, 3] uint8."""
         return list(self.viewer.render())
 
     def close(self) -> None:
         """Do nothing: there is nothing to release."""
 
     def snapshot(self) -> Arrays:
-        """Return copies of everything that changes while the environment runs, between two steps."""
+        """Return copies of everything that changes while the environment runs, by name, for ``restore``.
+
+        Call it between two steps.
+        """
         arrays = {f"engine.{name}": array for name, array in self.engine.snapshot().items()}
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from a ``snapshot`` of the same scenario and size, without a reset.
+        """Continue from ``arrays``, a ``snapshot`` of the same scenario and size, without a reset.
 
         Raises ``InvalidInput`` for a snapshot that does not fit.
         """
@@ -224,28 +236,31 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._started = self._goes_on = True
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the batch, once per requested row."""
+        """Return the attribute ``attr_name`` of the batch, once per requested row."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the batch; raise ``InvalidInput`` if only some rows are named."""
+        """Set the attribute ``attr_name`` of the batch; raise ``InvalidInput`` if ``indices`` names only some rows."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the batch once, and return its result once per row.
+        """Call the method ``method_name`` of the batch once, and return its result once per row.
 
-        Raises ``InvalidInput`` if only some rows are named.
+        ``args`` and ``kwargs`` are its arguments. Raises ``InvalidInput`` if ``indices`` names only some rows.
         """
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return False for every row: there are no inner wrappers."""
+        """Return False once per requested row: there are no inner wrappers."""
         return [False for _ in self._get_indices(indices)]
 
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
-        """Fill in the infos of the rows whose worlds have ended, before the next episodes start."""
+        """Fill in the final infos of the rows of the worlds ``ended``, before their next episodes start.
+
+        ``step`` is the last step; ``infos``, one dictionary per row, is changed in place.
+        """
         rows, final = self._rows(ended), self._observe(ended)
         told = Report.of(self.engine, step, ended).plain_infos(self._learners)
         truncated = self._by_row(step.truncated[ended]).tolist()
@@ -258,13 +273,13 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self._return[rows], self._steps[rows] = 0.0, 0
 
     def _rows(self, worlds: Ints) -> Ints:
-        """Return the rows of all learners of these worlds, in order."""
+        """Return the rows of all learners of the worlds with the indices ``worlds``, in order."""
         width = len(self.engine.learners)
         return (worlds[:, np.newaxis] * width + np.arange(width)).reshape(-1)
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
-        """Infos at the start of the running episodes, row by row, computed at each access."""
+        """Infos at the start of the running episodes, one dictionary per row, computed at each access."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
         begun = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
@@ -275,7 +290,10 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """Ignore the empty infos that SB3's constructor assigns."""
 
     def _observe(self, worlds: Ints | None = None) -> Observations:
-        """Return new arrays with the observations of all learners, row by row, in all worlds or in ``worlds``."""
+        """Return the observations of all learners, [rows, F] float32, in new arrays.
+
+        ``worlds`` are the indices of the worlds to include; None: all.
+        """
         every = self.engine.observe_all(self._learners, worlds)
         rows = every.reshape(-1, every.shape[2])
         if self.appended is None:
@@ -293,7 +311,10 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return worlds.repeat(len(self._learners))
 
     def _read_options(self) -> Worlds | None:
-        """Return the worlds that the options of the rows request; None for worlds of the stream."""
+        """Return the worlds that the options set for the rows request; None: worlds of the stream.
+
+        Raises ``InvalidInput`` if only some rows have an initial state, or the rows of one world differ.
+        """
 
         def bytes_of(start: Worlds) -> list[bytes]:
             return [part.tobytes() for part in Packed.of(start)]

@@ -32,29 +32,41 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One step of every world, or the time from its alert to its first decision."""
+    """Recorded motion of n worlds during one step, or from the alert to the first decision.
+
+    A motion is *open* while it is the latest one: its end is the engine's current state. ``closed`` returns it with a
+    fixed end, and with its ``parts``, which ``scenes`` needs.
+    """
 
     start: Worlds  # the n worlds at the start
-    command_mps2: Floats  # [n, N] commands; where ``fresh``, set to the commands in force at the end
-    until_s: Floats  # [n] end; NaN: the engine's current time
-    fresh: Bools  # [n] whether the motion begins at the alert
-    front_m: Floats  # [n] position of Vehicle 1 at the start, relative to the alert
+    command_mps2: Floats  # [n, N] commands (m/s2); where ``fresh``, 0 until ``closed`` sets the commands at the end
+    until_s: Floats  # [n] time at the end since the alert (s); NaN while the motion is open
+    fresh: Bools  # [n] whether the motion begins at the alert, not at a decision
+    front_m: Floats  # [n] position of Vehicle 1 at the start, relative to the alert (m)
     harm: Floats  # [n, 2] first-impact harm and total harm at the start (m2/s2)
-    left_m: Floats  # [n] left end of the view of the episode
-    right_m: Floats  # [n] right end
-    struck: Floats  # [k, 4] impacts shortly before the start: world, pair, time, closing speed
+    left_m: Floats  # [n] left end of the road that pictures of the episode show (m from Vehicle 1 at the alert)
+    right_m: Floats  # [n] right end of that road (m)
+    struck: Floats  # [k, 4] impacts shortly before the start: row of the world, pair, time (s), closing speed (m/s)
     stepped_in: Bools | None  # [n] whether a shield replaced an action; None: no shield
-    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()  # parts from ``Engine.segments``, once the motion is closed
+    # Parts of the motion with constant commands, set by ``closed``: worlds at the start, commands, time at the end.
+    parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()
 
     def closed(self, engine: Engine) -> Motion:
-        """Return this motion with its end set to the engine's current state."""
+        """Return this motion with its end fixed at the current state of ``engine``."""
         worlds = engine.worlds
         command = np.where(self.fresh[:, np.newaxis], worlds.command_mps2, self.command_mps2)
         parts = tuple(engine.segments(self.start, command))
         return replace(self, command_mps2=command, until_s=worlds.time_s, parts=parts)
 
     def scenes(self, engine: Engine, row: int, times_s: Floats | None = None) -> list[Scene]:
-        """Return the scenes of world ``row`` at these times [k] of a closed motion, or the scene at its end."""
+        """Return the scenes (all that a picture shows) of one world, one for each time.
+
+        Args:
+            engine: the engine that was recorded.
+            row: row of the world.
+            times_s: [k] times within this motion, which must be closed; None: its end only.
+
+        """
         times = self.until_s[[row]] if times_s is None else times_s
         alert_view = View(float(self.left_m[row]), float(self.right_m[row]))
         obstacle = self.start.obstacle_gap_m[row] + self.front_m[row]
@@ -108,12 +120,13 @@ Memory = tuple[Motion, ...]  # recorded motions, the running one last
 
 
 class Trace:
-    """Record the motion of an engine's worlds; a ``Watcher`` of ``engine.engine``.
+    """Recorder of the motion of an engine's worlds; a ``Watcher`` of ``engine.engine``.
 
     Args:
         engine: engine to watch, from its next reset on.
-        whole: keep every step since the episode began (one world); else the last step only.
+        whole: keep every step since the episode began (for engines with one world); if False, the last step only.
         alert: the worlds at the alert of an engine that is still at its first decision; recording starts there at once.
+            None: at the next reset.
 
     """
 
@@ -122,7 +135,14 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Return the memory after the worlds in these rows were replaced by new ones at their alert."""
+        """Return the recorded motions (``Motion``) after episodes have started in the rows with the indices ``rows``.
+
+        Args:
+            memory: the motions recorded before.
+            alert: the worlds of these rows only, at t = 0.
+            rows: indices of the worlds whose episodes have started.
+
+        """
         v, n = alert.vehicles, alert.n
         # The view contains each line from the alert to rest if all brake fully as soon as they can. A rear vehicle that
         # would stop further on is assumed to push the vehicles ahead that far.
@@ -149,7 +169,11 @@ class Trace:
         return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
 
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
-        """Close the motion that led to this step, and begin the motion of the step."""
+        """Return the recorded motions after a step: those of ``memory``, and the motion of the step.
+
+        The last motion of ``memory`` is closed first. Unless the trace was made with ``whole``, only the motion of the
+        step is kept. ``before`` and ``after`` are the engine before and after the step.
+        """
         last = memory[-1].closed(before)
         front_m, met = last.front_m, [last.struck]
         for start, command, until_s in last.parts:
@@ -174,7 +198,10 @@ class Trace:
         return (*memory[:-1], last, new) if self._whole else (new,)
 
     def motions(self, engine: Engine) -> Memory:
-        """Return all recorded motions, closed. Raise ``InvalidInput`` before the first reset."""
+        """Return all recorded motions in order, the last one up to the engine's current state.
+
+        Raises ``InvalidInput`` before the first reset.
+        """
         memory: Memory = engine.memory(self)
         if not memory:
             raise InvalidInput("render: no episode was started; call reset first")

@@ -37,7 +37,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     """Wrapper with a separate cost: ``step`` returns observation, reward, cost, terminated, truncated, info.
 
     This is the format of Safety-Gymnasium, which OmniSafe expects. The cost is the harm that the step added to the line
-    (m2/s2), as the reward counts impacts, independent of the reward's other terms.
+    (m2/s2). It counts first impacts only, or all impacts, as the reward does; other terms of the reward do not enter.
 
     Args:
         env: ``EthBrakeEnv``, or a wrapper of one that passes its infos on.
@@ -64,7 +64,10 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     def step(  # type: ignore[override]  # six values, as safe-RL libraries have it
         self, action: NDArray[Any]
     ) -> tuple[Observations, float, float, bool, bool, dict[str, Any]]:
-        """Advance by one time step, and also return the cost; see ``EthBrakeEnv.step``."""
+        """Advance by one time step; return observation, reward, cost, terminated, truncated and info.
+
+        ``action`` is [1] in [-1, 1]. The cost is the harm that the step added to the line (m2/s2).
+        """
         observation, reward, terminated, truncated, info = self.env.step(action)
         if "cost" not in info:
             raise InvalidInput(f"CostEnv: {self.env!r:.80} hands on no info['cost']; put CostEnv inside it")
@@ -131,7 +134,14 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world, or in those marked by ``options["reset_mask"]``; see docs/episodes.md."""
+        """Start an episode in every world; return observations [n, F] and infos.
+
+        Args:
+            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
+            options: ``initial_state`` or ``listed_world`` choose the worlds; ``reset_mask`` [n] restricts the reset to
+                the worlds that it marks. See docs/episodes.md.
+
+        """
         rows = self._rows_to_reset(options)
         if rows.all():
             self._restart(seed, options)
@@ -141,7 +151,11 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return self.engine.observe(self.learner), told
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
-        """Advance every world by one time step, and start new episodes according to the autoreset mode."""
+        """Advance every world by one time step with the actions [n, 1] in [-1, 1].
+
+        Ended worlds start new episodes according to the autoreset mode. Returns observations [n, F], rewards,
+        terminated, truncated (each [n]) and infos in Gymnasium's vector format.
+        """
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
         engine, before = self.engine, self.engine.ended
@@ -165,11 +179,17 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
 
     def render(self) -> tuple[Any, ...]:
-        """Return a frame [H, W, 3] uint8, or a text, of every world; a world that was just renewed shows its start."""
+        """Return a tuple with the picture of every world: a frame [H, W, 3] uint8, or a text.
+
+        A world whose episode has just been renewed shows the start of the new one.
+        """
         return tuple(self.viewer.render())
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
-        """Return the actions, with 0 for the worlds that had ended ``before`` and whose actions are ignored."""
+        """Return the actions with 0 for the worlds whose actions are ignored.
+
+        In mode ``NextStep`` these are the worlds whose episodes had ended ``before`` [n] the step.
+        """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions
         heeded = own_actions(actions, "the learners")
@@ -193,7 +213,11 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return np.array(mask)
 
     def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
-        """Start the next episodes of the stream in these rows, as an automatic reset does; the other rows continue."""
+        """Start the next episodes of the stream in the worlds that ``rows`` [n] marks; the other worlds continue.
+
+        Raises ``InvalidInput`` for a ``seed`` or an option that would choose the worlds, because these apply to all
+        rows.
+        """
         warn_of_unknown(options, self._known_options)
         starts = [name for name in (INITIAL_STATE, LISTED_WORLD) if name in options]
         starts += ["seed"] * (seed is not None)
@@ -203,7 +227,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
-        """Return the last observation and infos of the episodes that ended with this step."""
+        """Return the infos ``final_obs`` and ``final_info``, with masks, of the episodes that ended with this step."""
         ended = step.ended
         observations = self.engine.observe(self.learner)
         final = np.full(self.num_envs, None, dtype=object)

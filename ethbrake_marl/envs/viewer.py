@@ -1,4 +1,4 @@
-"""``Viewer``: what ``render()`` of an environment does in each render mode."""
+"""``Viewer``: the implementation of ``render()`` for each render mode."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ SMOOTH_FPS = 50  # frames per second in the window and from ``step_frames``
 
 
 class Viewer:
-    """Show the running episodes of an engine. The window's library is imported only for mode ``human``.
+    """Pictures of the running episodes of an engine. The window's library is imported only for mode ``human``.
 
     Args:
         engine: the engine to show, from its next reset on.
-        mode: a render mode of the interface, or None: nothing is recorded, and nothing can be shown.
-        batch: whether the interface has many worlds, and shows each of them.
+        mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: nothing is recorded, and nothing can be
+            shown.
+        batch: whether the environment has many worlds, and shows each of them; then only ``rgb_array`` and ``ansi``.
 
     Raises ``InvalidInput`` for another mode, ``MissingExtra`` for ``human`` if pygame is missing.
 
@@ -46,12 +47,15 @@ class Viewer:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """``render_modes``, and the ``render_fps`` at which one frame per step plays in real time."""
+        """Gymnasium's metadata: the render modes, and the frames per second.
+
+        With one frame per step, ``render_fps`` plays in real time.
+        """
         fps = 1.0 / self._engine.scenario.time_step_s
         return {"render_modes": list(self.modes), "render_fps": round(fps) if abs(fps - round(fps)) < 1e-9 else fps}
 
     def began(self) -> None:
-        """Handle the start of an episode: begin a new list of frames, and show the time up to the first decision."""
+        """Start a new list of frames, and show the time up to the first decision. Call it when an episode starts."""
         self._shown = 0
         if self._window is not None:
             self._window.closed_by_user = False
@@ -64,9 +68,10 @@ class Viewer:
                 self._window.show(frame, SMOOTH_FPS)
 
     def render(self) -> Any:
-        """Return the frame, list of frames or text of the mode, for each world of a batch.
+        """Return the picture of the present moment, in the form of the mode; for a batch, a tuple with one per world.
 
-        Returns None for ``human``, where every step is shown in the window anyway.
+        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of frames since the last call. ``ansi``: a
+        text. ``human``: None, because every step is shown in the window anyway.
         """
         motions = self._motions(f"render: made with render_mode=None; give one of {', '.join(self.modes)}")
         if self.mode == "human":
@@ -79,7 +84,7 @@ class Viewer:
         return shown if self._batch else shown[0]
 
     def step_frames(self, fps: float = SMOOTH_FPS) -> list[Frame]:
-        """Return the frames [H, W, 3] from the last decision, or the alert, up to now, at ``fps`` per second.
+        """Return the frames [H, W, 3] of the last step, or from the alert to the first decision, at ``fps`` per second.
 
         Raises ``InvalidInput`` before the first reset, with render_mode=None, and for an ``fps`` below 1.
         """

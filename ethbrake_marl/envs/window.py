@@ -29,7 +29,7 @@ class Window:
         return Window, ()
 
     def show(self, frame: Frame, fps: float) -> None:
-        """Show a frame [H, W, 3] for 1/fps seconds. Raise ``InvalidInput`` if there is no display."""
+        """Show a frame [H, W, 3] uint8 for 1/fps seconds. Raise ``InvalidInput`` if there is no display."""
         if self.closed_by_user:
             return
         pygame = self._pygame

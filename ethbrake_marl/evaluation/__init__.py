@@ -30,7 +30,7 @@ if TYPE_CHECKING:
         make_agents as make_agents,
         make_lineup as make_lineup,
     )
-    from ethbrake_marl.evaluation.measures import (
+    from ethbrake_marl.evaluation.measure_sets import (
         MEASURE_SETS as MEASURE_SETS,
         Measure as Measure,
         MeasureSet as MeasureSet,

@@ -21,7 +21,12 @@ class ShovedFront:
 
     ``shoved = distance driven - distance driven alone up to the horizon``. For a line at rest, this is the distance
     from Vehicle 1's own stopping point. Negative where Vehicle 1 ends short of that point, for instance after an
-    obstacle threw it back. ``of`` creates a watcher where the measure is defined.
+    obstacle threw it back. Create it with ``of``; the engine calls ``see`` after each step.
+
+    Args:
+        worlds: the n worlds at the alert.
+        own_way_m: [n] distance that Vehicle 1 drives undisturbed until the horizon.
+
     """
 
     def __init__(self, worlds: Worlds, own_way_m: Floats) -> None:
@@ -30,9 +35,9 @@ class ShovedFront:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """Return the watcher of these worlds at the alert.
+        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
 
-        None where Vehicle 1 is controlled, where its script depends on the state, or where brakes build up.
+        It is not defined if Vehicle 1 is controlled, if its script depends on the state, or if brakes build up.
         """
         script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
         vehicles = worlds.vehicles
@@ -45,7 +50,16 @@ class ShovedFront:
         return cls(worlds, way[:, 0])
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Add Vehicle 1's distance in one step: the change of its gap to an obstacle, real or out of reach."""
+        """Add the distance that Vehicle 1 drives in one step.
+
+        It is measured as the change of Vehicle 1's gap to an obstacle, the world's own or one placed out of reach.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends.
+
+        """
         post = before.with_post_ahead(until_s - before.time_s)
         after, _ = advance(post, command_mps2, until_s=until_s)
         self._way_m += post.obstacle_gap_m - after.obstacle_gap_m
@@ -61,10 +75,16 @@ VEHICLE_2 = 1  # index of the vehicle whose latency sets the time of the map's f
 
 
 class SampledHarm:
-    """Watcher that replays the commands of the episodes through the paper's fixed-step map, ``advance_sampled``.
+    """Watcher that computes the harm of the episodes as the paper does, which samples the motion at fixed steps.
 
-    Every world runs to the horizon; after its exact episode has ended, the last commands are held. The agents saw the
-    exact motion and do not decide again. ``of`` creates a watcher where the measure is defined.
+    It replays the commands through ``advance_sampled``, the paper's equations of motion. Every world runs to the
+    horizon; after its exact episode has ended, the last commands are held. The agents saw the exact motion and do not
+    decide again. Create it with ``of``; the engine calls ``see`` after each step, and ``finish`` returns the harm.
+
+    Args:
+        worlds: the n worlds at the alert; they are copied.
+        scenario: scenario of the worlds, for time step and horizon.
+
     """
 
     def __init__(self, worlds: Worlds, scenario: Scenario) -> None:
@@ -77,10 +97,10 @@ class SampledHarm:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """Return the watcher of these worlds at the alert.
+        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
 
-        None with an obstacle or brakes that build up, which the map does not model, and where another vehicle than
-        Vehicle 2 decides, because the samples of the map are Vehicle 2's decisions.
+        It is not defined with an obstacle or brakes that build up, which the paper's map does not model, nor if another
+        vehicle than Vehicle 2 decides, because the samples of the map are Vehicle 2's decisions.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -90,7 +110,14 @@ class SampledHarm:
         return cls(worlds, task.scenario)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Replay one step. Worlds whose episodes have ended keep their last commands."""
+        """Replay one step. Worlds whose episodes have ended keep their last commands.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends; equal to the beginning if the world's episode has ended.
+
+        """
         running = until_s > before.time_s
         self._command = np.where(running[:, np.newaxis] | (self._samples < 0), command_mps2, self._command)
         self._move()

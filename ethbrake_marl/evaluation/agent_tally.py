@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.evaluation.measures import BASELINE, Measure, MeasureSet, every_set
+from ethbrake_marl.evaluation.measure_sets import BASELINE, Measure, MeasureSet, every_set
 from ethbrake_marl.evaluation.outcome import COLUMN, Outcome, Values
 from ethbrake_marl.evaluation.own_measures import registered_measure
 from ethbrake_marl.evaluation.statistics import Moments, exact_sum, rate
@@ -22,11 +22,13 @@ from ethbrake_marl.game.measures import REPORTED
 
 @dataclass(frozen=True, slots=True)
 class AgentTally:
-    """Sums of one agent's measures over some worlds, by measure."""
+    """Exact sums of one agent's measures over some worlds; tallies of different worlds can be added with ``+``."""
 
-    counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)  # true/false measures: true worlds, all worlds
-    moments: Mapping[str, Moments] = field(default_factory=dict)  # measures that are numbers
-    products: Mapping[str, Fraction] = field(default_factory=dict)  # sums of products with the baseline's values
+    # True/false measures, by name: number of worlds in which it is true, number of worlds with a value.
+    counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    moments: Mapping[str, Moments] = field(default_factory=dict)  # measures that are numbers, by name
+    # Measures that are compared with a baseline, by name: sum over worlds of own value times the baseline's value.
+    products: Mapping[str, Fraction] = field(default_factory=dict)
 
     def __add__(self, other: AgentTally) -> AgentTally:
         counts = dict(self.counts)
@@ -39,16 +41,22 @@ class AgentTally:
         return AgentTally(counts, moments, products)
 
     def count(self, name: str) -> int:
-        """Return the number of worlds in which a true/false measure is true."""
+        """Return the number of worlds in which the true/false measure ``name`` is true; 0 for an unknown name."""
         return self.counts.get(name, (0, 0))[0]
 
     def share(self, name: str, worlds: int) -> float | None:
-        """Return the share of worlds in which a true/false measure is true; None unless all ``worlds`` have a value."""
+        """Return the share, 0 to 1, of worlds in which the true/false measure ``name`` is true.
+
+        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
 
     def sums(self, name: str, worlds: int) -> Moments | None:
-        """Return the moments of a measure that is a number; None unless all ``worlds`` have a value."""
+        """Return count, sum and sum of squares of the measure ``name``, whose values are numbers.
+
+        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
 
@@ -60,13 +68,14 @@ def tally_agents(
     baseline: str = BASELINE,
     objectives: Sequence[str] | None = None,
 ) -> dict[str, AgentTally]:
-    """Return the tally of every agent in the same worlds.
+    """Return the sums of every agent's measures over the same worlds, by the agent's name.
 
     Args:
-        outcomes: outcome of each agent, by name.
-        contexts: context of each set of measures; see ``contexts_of``.
-        baseline: agent to compare with, for sets without a baseline of their own.
-        objectives: also sum the harm that each vehicle bears, and its value under these objectives; None: neither.
+        outcomes: outcome of each agent, by the agent's name.
+        contexts: what each set of measures prepared for these worlds; see ``contexts_of``.
+        baseline: name of the agent to compare with, for sets of measures without a baseline of their own.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
+            the harm that each vehicle bears, and its value under each objective; None: neither.
 
     """
     values: dict[str, dict[str, Values]] = {}
@@ -102,7 +111,15 @@ def tally_agents(
 def estimate_all(
     tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, baseline: str
 ) -> dict[str, Estimate | None]:
-    """Return the estimate of every measure of one agent; None for a measure that some ``worlds`` lack."""
+    """Return the estimate (value and 95 % interval) of every measure of one agent, by the measure's name.
+
+    Args:
+        tallies: sums of every agent, by the agent's name.
+        agent: name of the agent.
+        worlds: number of evaluated worlds. A measure that lacks a value in some of them has the estimate None.
+        baseline: name of the agent to compare with; comparisons are None if it was not evaluated.
+
+    """
     own = tallies[agent]
     columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
     registered = list(REPORTED.values())
@@ -117,7 +134,17 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Return the estimate of one measure; a comparison needs ``whole`` to hold in every world."""
+    """Return the estimate of one measure; None if it lacks a value in some of the ``worlds``, or cannot be compared.
+
+    Args:
+        measure: the measure.
+        own: the agent's sums.
+        baseline: the sums of the agent to compare with; None: there is none.
+        worlds: number of evaluated worlds.
+        whole: name of a true/false measure (``MeasureSet.whole``). The agent is compared with the baseline only if this
+            is true in all worlds; None: no such condition.
+
+    """
     name = measure.name if callable(measure.of) else measure.of
     if own.share(name, worlds) is not None:
         return rate(own.count(name), worlds)
@@ -132,9 +159,11 @@ def _estimate(
 
 
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
-    """Return the measures whose means are only lower bounds.
+    """Return the names of the measures whose means are only lower bounds for one agent.
 
-    These are the measures of a set whose condition (``MeasureSet.whole``) holds in some worlds only.
+    ``tally`` holds the agent's sums over ``worlds`` worlds. A set of measures may name a true/false measure
+    (``MeasureSet.whole``) that says whether a world's values are complete. If this is false in some world, the means of
+    the set are lower bounds.
     """
 
     def is_partial(each: MeasureSet) -> bool:

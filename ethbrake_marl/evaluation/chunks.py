@@ -21,7 +21,7 @@ from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import CHUNK, own_versions, policies_of, result_versions, scenario_sha256
 from ethbrake_marl.evaluation.lineup import make_lineup
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, silent_in_long_lists
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, silent_in_long_lists
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.own_measures import LOADED, load_measures
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk
@@ -45,15 +45,15 @@ _MADE: dict[str, Mapping[str, Driver]] = {}  # agents of this process's last lin
 
 @dataclass(frozen=True, slots=True)
 class Lineup:
-    """The agents of an evaluation as plain data, from which every process builds the same agents.
+    """The agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: specs, as on the command line.
+        agents: specs (texts that name agents, such as ``full_brake``), as on the command line.
         scenario: the scenario whose learners they drive.
-        harm_count: harm that agents minimise.
-        uncertainty: the uncertainty, as text, for shields that take one.
-        measures: measures to load, as ``load_measures`` takes them, including those loaded before.
-        told: names of all measures that the evaluation reports, whatever is registered later.
+        harm_count: harm that agents minimise: each pair's first impact only (``first``) or all impacts (``total``).
+        uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.
+        measures: names or ``FILE:NAME`` of user measures to load, as ``load_measures`` takes them.
+        told: names of all user measures that the evaluation reports; measures registered later are not added.
         sets: names of the sets of measures in the requesting process.
         same: hash of everything that must be equal in every process; see ``Lineup.of``.
         packages: name and version of each package that provided a part in the requesting process; workers must have the
@@ -73,9 +73,17 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """Return a lineup that other processes can build only with the same policies, measures and versions.
+        """Return the lineup of these agents, with a hash that worker processes compare with their own.
+
+        A worker with other policies, measures or versions refuses the lineup (``make``).
+
+        Args:
+            agents: specs, as on the command line.
+            scenario: the scenario whose learners they drive.
+            how: ``harm_count``, ``uncertainty`` and ``measures`` of the class.
 
         Raises what ``make_lineup`` raises.
+
         """
         load_measures(how.pop("measures", ()))
         sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
@@ -87,7 +95,10 @@ class Lineup:
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """Return the agents in this process; raise ``InvalidInput`` if the requesting process has different ones."""
+        """Return the agents by spec, built once per process.
+
+        Raises ``InvalidInput`` if policies, measures or versions differ from those where the lineup was created.
+        """
         if self.same not in _MADE:
             load_measures(self.measures)
             made = self._make_anew()
@@ -111,7 +122,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every file that the specs name: code, and the weights of an agent that is code."""
+        """Return the SHA-256 of every file that specs and measures name: Python files, and weights for such agents."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
@@ -133,7 +144,17 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """Evaluate all worlds of a sample that is held in memory; ``jobs`` and ``ray`` as in ``run_each``."""
+    """Let the agents of a lineup drive every world of a sample, in several processes if requested.
+
+    Args:
+        lineup: the agents.
+        sample: the worlds, all in memory.
+        seed: seed of the worlds, which is recorded in the result; None for worlds of other origin.
+        jobs: number of processes; None: one, or as many as Ray has cores.
+        ray: address of a Ray cluster, or ``local``; None: no Ray.
+        on_done: called with the number of worlds done so far.
+
+    """
     calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
     parts: list[Evaluation] = []
     for part in run_each(calls, jobs, ray):
@@ -148,7 +169,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome with only these registered measures."""
+    """Return the outcome without user measures (``Outcome.metrics``) other than those called ``names``."""
     kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=kept)
 
@@ -165,8 +186,18 @@ def tally_list(
 ) -> Tally:
     """Return the statistics of worlds 0 to ``episodes - 1`` of a list of any length.
 
-    The worlds are not held in memory together. Sets of measures that take longer than driving are omitted. ``jobs`` and
-    ``ray`` as in ``run_each``.
+    The worlds are not held in memory together. Sets of measures that take longer than driving are omitted.
+
+    Args:
+        lineup: the agents.
+        episodes: number of worlds.
+        seed: seed from which the worlds are drawn.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
+            the harm that each vehicle bears, and its value under each objective.
+        jobs: number of processes; None: one, or as many as Ray has cores.
+        ray: address of a Ray cluster, or ``local``; None: no Ray.
+        on_done: called with the number of worlds done so far.
+
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
     check_whole_number("seed", seed, 0)
@@ -191,7 +222,16 @@ def _tell(on_done: OnDone | None, chunks: int, worlds: int) -> None:
 
 
 def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
-    """Return one row per agent, as ``summarise`` does. Raise ``PhysicsError`` if every world was left out."""
+    """Return the results table of a list that ``tally_list`` evaluated, one row per agent, as ``summarise`` does.
+
+    Args:
+        lineup: the evaluated agents.
+        tally: result of ``tally_list``.
+        seed: seed of the list.
+
+    Raises ``PhysicsError`` if every world was left out.
+
+    """
     if not tally.worlds:
         raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in tally.left_out})
     scenario = lineup.scenario

@@ -19,20 +19,20 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Difference of one agent's mean harm per world, second result minus first (m2/s2)."""
+    """Difference between two results in the mean harm per world of one agent: second minus first (m2/s2)."""
 
-    agent: str
-    policy: Literal["same", "other", "none"]  # whether the agent used the same policy in both results
-    harms: Mapping[str, Estimate]  # difference by the name of the harm
-    exploits: tuple[Exploits, Exploits]  # exploits of the agent in the first and in the second result
+    agent: str  # name of the agent, the same in both results
+    policy: Literal["same", "other", "none"]  # trained policies in both results: equal, different, or not any
+    harms: Mapping[str, Estimate]  # harm (``first_impact_harm``, ``total_harm``) -> difference with interval
+    exploits: tuple[Exploits, Exploits]  # behaviour that harm does not count, in the first and in the second result
 
     @property
     def marked(self) -> str:
-        """Name of the agent, with a mark where it exploits what harm does not count in either result."""
+        """Name of the agent, followed by ‡ if in either result its behaviour does damage that harm does not count."""
         return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return the difference as plain data for JSON."""
+        """Return plain data for JSON: ``agent``, ``policy``, ``exploits``, each harm's difference with its interval."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         exploits = [list(each.names) for each in self.exploits]
         return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
@@ -40,18 +40,22 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Comparison of two results on the same worlds: second minus first, agent by agent."""
+    """Comparison of two results files on the same worlds, agent by agent."""
 
-    differences: tuple[Difference, ...]
-    unpaired_because: str | None  # why intervals are not paired by world; None: they are
-    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents only in the first, and only in the second result
-    # values in the first and in the second result, where they differ
-    other_settings: Mapping[str, tuple[str | None, str | None]]  # settings of the agents
-    other_versions: Mapping[str, tuple[str | None, str | None]]  # versions of packages
+    differences: tuple[Difference, ...]  # second result minus first, one entry per agent of both
+    unpaired_because: str | None  # reason why the intervals are not paired by world; None: they are paired
+    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # names of agents in the first result only, in the second only
+    # Settings of the agents that differ, by name: value in the first and in the second result; None: not there.
+    other_settings: Mapping[str, tuple[str | None, str | None]]
+    # Versions of packages that differ, by name: version in the first and in the second result; None: not there.
+    other_versions: Mapping[str, tuple[str | None, str | None]]
 
     @property
     def exploits_line(self) -> str:
-        """Sentence about the agents that exploit what harm does not count, and in which result; empty without any."""
+        """Sentence about agents whose behaviour does damage that harm does not count (``Exploits``).
+
+        It says in which result they do; it is empty if no agent does.
+        """
         found: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
@@ -61,7 +65,7 @@ class Comparison:
         return Exploits.sentence(found)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the comparison as plain data for JSON."""
+        """Return the comparison as plain data for JSON, with one object per agent under ``agents``."""
         return {
             "intervals": "paired" if self.unpaired_because is None else "unpaired",
             "unpaired_because": self.unpaired_because,
@@ -74,7 +78,7 @@ class Comparison:
 
 
 def compare_results(first: Result, second: Result) -> Comparison:
-    """Compare agents of the same name in two results, second minus first.
+    """Compare the mean harms of agents of the same name in two results, as second minus first.
 
     The comparison is paired by world if both results come with a file of every world. Raises ``InvalidInput`` for
     results of different kinds, on different worlds or scenarios, or without a common agent.
@@ -120,7 +124,10 @@ Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of every worl
 
 
 def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
-    """Return the harms of every world for pairing, or the reason why there are none."""
+    """Return the harms of every world in both results, and None; or None, and the reason why they cannot be paired.
+
+    ``common``: names of the agents that both results have.
+    """
     try:
         one, other = first.harms(), second.harms()
     except InvalidInput as error:

@@ -30,19 +30,29 @@ _STAY = "\u00a0"  # a non-breaking space
 
 
 class Conditions(dict[str, Any]):
-    """Conditions of a result as plain data: scenario, controlled vehicles, scripts, and quantities of the worlds."""
+    """Dictionary that describes how a result was obtained: scenario, seed, vehicles, scripts, quantities of the worlds.
+
+    ``of`` and ``of_ranges`` create one with the quantities only, ``of_test`` one with all entries.
+    """
 
     @classmethod
     def of(cls, worlds: Worlds) -> Conditions:
-        """Return every quantity of the worlds: a list by vehicle or pair, or a single entry for the whole world.
+        """Return every quantity of the worlds by key: ``{"gaps_m": [7.0, [5.0, 9.0]], "restitution": 0.1}``.
 
+        The value is a list with an entry for each vehicle or pair, or a single entry for a quantity of the whole world.
         An entry is a number if all worlds agree, else ``[smallest, largest]``.
         """
         return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
-        """Return the conditions of quantities from all their values, or from their smallest and largest values."""
+        """Return the same dictionary as ``of``, from values instead of worlds.
+
+        Args:
+            ranges: for each quantity's key, one array per vehicle or pair. It may hold the values of all worlds, or
+                just the smallest and the largest one.
+
+        """
         found = {
             key: [(float(np.nanmin(each)), float(np.nanmax(each))) for each in entries]
             for key, entries in ranges.items()
@@ -54,14 +64,15 @@ class Conditions(dict[str, Any]):
     def of_test(
         cls, task: Task, seed: int | None, count: int, because: Mapping[str, str | None], quantities: Mapping[str, Any]
     ) -> Conditions:
-        """Return the conditions of a test.
+        """Return all conditions of an evaluation, with the keys that JSON results have under ``parameters``.
 
         Args:
             task: the scenario and the controlled vehicles.
             seed: seed of the list; None for worlds that the caller passed.
             count: number of worlds.
-            because: by key, why sets of measures do not apply to these worlds; None where they do.
-            quantities: quantities of the worlds.
+            because: key of a set of measures (``MeasureSet.because_key``) -> why the set does not apply to these
+                worlds; None if it applies.
+            quantities: quantities of the worlds, as ``of`` returns them.
 
         """
         scenario = task.scenario
@@ -81,7 +92,7 @@ class Conditions(dict[str, Any]):
 
     @property
     def line(self) -> str:
-        """One-line caption: scenario, number of worlds, seed, then ``quantities``."""
+        """Caption in one line: scenario, number of worlds, seed, and the quantities with symbols and units."""
         seed = "" if self["seed"] is None else f", seed {self['seed']}"
         return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}"
 
@@ -89,7 +100,7 @@ class Conditions(dict[str, Any]):
     def quantities(self) -> str:
         """The quantities in one line, each with symbol and unit: ``d = 7 m; v = (20, 18, 20) m/s; ...``.
 
-        Entries that look the same are written once.
+        If all vehicles or pairs have the same value, it is written once.
         """
         parts = []
         for key, (symbol, unit) in _SYMBOLS.items():

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, unknown_name
 from ethbrake_marl.evaluation.conditions import Conditions
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, Silent, contexts_of, silent_because
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Silent, contexts_of, silent_because
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome, none_for_nan
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
 from ethbrake_marl.evaluation.statistics import mean, rate
@@ -37,7 +37,6 @@ _ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in thes
 
 _LIBRARIES = ("pandas", "polars", "columns")  # kinds of frame, in order of preference
 
-
 T = TypeVar("T")
 
 
@@ -55,15 +54,17 @@ class Evaluation:
     """
 
     scenario: Scenario  # scenario of the worlds
-    vehicles: tuple[int, ...]  # indices (0 = front) of the controlled vehicles; the others followed scripts
+    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that the agents controlled; the others ran scripts
     worlds: Worlds  # the n worlds at the alert
-    index: Ints  # [n] number of each world in its list
-    seed: int | None  # seed of the list; None for worlds that the caller passed
-    outcomes: dict[str, Outcome]  # outcome of each agent, by name
-    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that are in none of the arrays, the same for all agents
-    kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)  # ``scenario``, ``vehicle_2_type``: each [n]
+    index: Ints  # [n] number of each world in the evaluation list of ``seed``, from 0
+    seed: int | None  # seed from which the worlds were drawn; None for worlds that the caller passed
+    outcomes: dict[str, Outcome]  # results of each agent in these worlds, by the agent's name
+    left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; they are in none of the arrays
+    # Groups of the worlds: ``{"scenario": [n names], "vehicle_2_type": [n names]}``. Only a mixture has ``scenario``,
+    # and only a scenario with vehicle types has the types; else it is empty.
+    kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
     host: str = ""  # name of the simulator that moved the worlds; "": the physics of this package
-    _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # see ``once``
+    _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache of ``once``
 
     def __repr__(self) -> str:
         drivers = [f"{agent!r:.42}" for agent in list(self.outcomes)[:_SHOWN_AGENTS]]
@@ -77,16 +78,16 @@ class Evaluation:
 
     @property
     def vehicle(self) -> int:
-        """The controlled vehicle; raises ``InvalidInput`` unless there is exactly one."""
+        """Index (0 = front) of the only controlled vehicle; raises ``InvalidInput`` if there are several or none."""
         return self.task.vehicle
 
     @property
     def task(self) -> Task:
-        """The task of the agents: the scenario and the controlled vehicles."""
+        """The scenario and the controlled vehicles, as a ``Task``."""
         return Task(self.scenario, self.vehicles)
 
     def once(self, compute: Callable[[Evaluation], T]) -> T:
-        """Return ``compute(self)``, computed at most once for this evaluation."""
+        """Return ``compute(self)``. A later call with the same function returns the stored result."""
         if compute not in self._computed:
             self._computed[compute] = compute(self)
         found: T = self._computed[compute]
@@ -94,7 +95,14 @@ class Evaluation:
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """Join evaluations of consecutive parts of a list; raise ``PhysicsError`` if every world was left out."""
+        """Join the evaluations of the parts of a list of worlds into the evaluation of the whole list.
+
+        Args:
+            parts: evaluations of the same agents, in the order of their worlds in the list.
+
+        Raises ``PhysicsError`` if every world was left out.
+
+        """
         left_out = tuple(left for part in parts for left in part.left_out)
         some = [part for part in parts if part.worlds.n]
         if not some:
@@ -111,7 +119,12 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the evaluation restricted to ``rows``; its list of left-out worlds is empty."""
+        """Return the same evaluation with some of its worlds only, and an empty ``left_out``.
+
+        Args:
+            rows: row numbers of the worlds to keep, or a mask [n] that is true for them.
+
+        """
         outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
         kinds = {name: column[rows] for name, column in self.kinds.items()}
         return replace(
@@ -120,7 +133,10 @@ class Evaluation:
 
     @property
     def hidden(self) -> Bools:
-        """Worlds in which the channel hides something about the line from a controlled vehicle, [n]; see ``v2x``."""
+        """Whether the V2X channel hides something about the line from a controlled vehicle, for each world: [n] bool.
+
+        It does where messages arrive late, only from time to time, or not at all.
+        """
         messages, hides = Messages.of(self.worlds), self.worlds.vehicles.hide_from
         from_each = [hides(i) | messages.periodic | messages.withhold_from(i) for i in self.vehicles]
         hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
@@ -128,15 +144,16 @@ class Evaluation:
 
     @property
     def conditions(self) -> Conditions:
-        """Conditions of these results: scenario, list, controlled vehicles, and every quantity of the worlds."""
+        """Scenario, seed, controlled vehicles and every quantity of the worlds, as plain data for captions and JSON."""
         because = silent_because(contexts_of(self))
         return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
 
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as columns; None stands for a missing value.
 
-        docs/per-world.md lists the columns. Initial quantities are named as in a table of initial states: ``gap_1_m``,
-        ``speed_1_mps``, ``latency_2_s``, ``restitution``.
+        The result maps the name of a column to its values; docs/per-world.md lists the columns. Initial quantities are
+        named ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``. Each of ``objectives`` (``total``,
+        ``social:45``) adds columns with its value for each vehicle.
         """
         n, contexts = self.worlds.n, contexts_of(self)
         initial: Columns = {"world": self.index.tolist()}
@@ -167,7 +184,10 @@ class Evaluation:
         return found
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
-        """Return ``per_world`` as arrays: NaN for a missing number, the empty text for a missing text."""
+        """Return the columns of ``per_world`` as arrays, by name.
+
+        NaN stands for a missing number, the empty text for a missing text. Each of ``objectives`` adds columns.
+        """
         found, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
             texts = name in _TEXTS.union(*of_sets) or (name.startswith("vehicle_") and name.endswith("_type"))
@@ -192,7 +212,13 @@ class Evaluation:
         return import_module(chosen).DataFrame(self.arrays())
 
     def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
-        """Return the mean harm of every agent under every objective and both counts."""
+        """Return the mean harm of every agent, by vehicle, under several objectives and both counts of harm.
+
+        Args:
+            declared: the objectives, such as ``"total"`` or ``"social:45"``; None: the standard ones
+                (``standard_objectives``).
+
+        """
         return Rescores(
             [
                 Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
@@ -203,7 +229,7 @@ class Evaluation:
         )
 
     def _repr_html_(self) -> str:
-        """Return a summary table of the agents, for a notebook."""
+        """Return HTML of a table with collisions and harm of each agent, for a notebook."""
         share = Column("Collisions", digits=1, scale=100.0, unit=" %")
         rows = [
             (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
@@ -213,13 +239,13 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return the evaluation unchanged; raise ``PhysicsError`` if some worlds were left out."""
+        """Return this evaluation; raise ``PhysicsError``, naming the worlds, if some worlds were left out."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self
 
     def outcome(self, agent: str) -> Outcome:
-        """Return the outcome of one agent; raise ``InvalidInput``, naming the evaluated agents, for any other."""
+        """Return the results of the agent with this name; raise ``InvalidInput`` if it was not evaluated."""
         if agent not in self.outcomes:
             raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
         return self.outcomes[agent]

@@ -20,10 +20,17 @@ _TRAINED = 2_000  # number of worlds drawn from the training's scenario to find 
 
 
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
-    """Warn (``Unfamiliar``) where a trained policy drives in worlds outside the range of its training.
+    """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds outside the range of its training.
 
     The training's worlds are drawn from the scenario in the policy's manifest. If that scenario cannot be drawn here,
     there is no warning. Of the V2X channel, only the latencies are compared.
+
+    Args:
+        agents: agents by name; those that are not trained policies are ignored.
+        worlds: worlds at the alert in which they are to drive.
+        scenario: scenario of these worlds.
+        vehicles: indices (0 = front) of the vehicles that each agent drives.
+
     """
     drives: dict[str, tuple[str, Manifest, dict[str, None]]] = {}  # by hash: the first agent, vehicles in order
     for name, agent in agents.items():
@@ -49,7 +56,10 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
 
 
 def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
-    """Describe the quantities of ``worlds`` that lie outside the range of the worlds ``before``."""
+    """Return descriptions of quantities of ``worlds`` that lie outside the range of the training's worlds ``before``.
+
+    Example: ``["latency_s in 40 % of the worlds", "no friction"]``.
+    """
     found, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():
         if key not in known:

@@ -1,4 +1,4 @@
-"""Evaluation by group: the worlds of each scenario of a mixture, or of each type of a vehicle."""
+"""Results tables by group of worlds: one table for each scenario of a mixture, or for each type of a vehicle."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.measure_sets import BASELINE
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 
 NO_TYPE = "no type"  # group of worlds in which the vehicle has no type
 
 
 def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
-    """Return a ``summarise`` table for each group of worlds, by the group's name, sorted.
+    """Return one results table (``summarise``) for each group of worlds, by the group's name, in alphabetical order.
 
     Args:
         evaluation: evaluation on a mixture, or on a scenario with types of vehicles.
-        by: ``scenario``, or a vehicle's type such as ``vehicle_2_type``.
-        baseline: agent to compare with, as in ``summarise``.
+        by: kind of group: ``scenario``, or a vehicle's type such as ``vehicle_2_type``.
+        baseline: name of the agent to compare with.
 
     Raises ``InvalidInput`` for worlds without groups, ``UnknownName`` for an unknown ``by``.
 

@@ -41,9 +41,15 @@ HASHES = 1 << 256  # modulus of sums of hashes
 
 
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
-    """Return the SHA-256 of a list of worlds: every array (little-endian, by name) and the worlds' numbers in the list.
+    """Return a hash of a list of worlds, as 64 hexadecimal digits: equal lists have equal hashes on every machine.
 
-    For more than ``HELD`` worlds, return ``hash_of_chunks``, which processes one chunk at a time.
+    It is the SHA-256 of every array (little-endian, by name) and of the numbers of the worlds. For more than 100,000
+    worlds it is ``hash_of_chunks``, which needs less memory.
+
+    Args:
+        worlds: the n worlds at the alert.
+        index: [n] number of each world in its list.
+
     """
     if worlds.n > HELD:
         return f"{hash_of_chunks(worlds, index):064x}"
@@ -55,7 +61,10 @@ def _hash_at_once(worlds: Worlds, index: Ints) -> str:
 
 
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
-    """Return the sum modulo 2^256 of the SHA-256 of each chunk of worlds: numbers 0 to 2,499, 2,500 to 4,999, ..."""
+    """Return the sum modulo 2^256 of the SHA-256 of each chunk of 2,500 worlds.
+
+    ``index`` [n] is the number of each world in its list; chunks are numbers 0 to 2,499, 2,500 to 4,999, and so on.
+    """
     chunks = [np.flatnonzero(index // CHUNK == number) for number in np.unique(index // CHUNK)]
     return sum(int(_hash_at_once(worlds.take(chunk), index[chunk]), 16) for chunk in chunks) % HASHES
 
@@ -71,9 +80,10 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """Return the arrays of a dataclass and of the dataclasses inside it, by name, except those without information.
+    """Return the arrays of the dataclass ``value`` and of the dataclasses inside it, by name.
 
-    These are empty arrays of messages and braking pieces, and infinite build-up rates of brakes.
+    Arrays that say nothing are omitted: those of messages and braking profiles if the worlds have none, and build-up
+    rates of brakes that are all infinite.
     """
     found: dict[str, np.ndarray] = {}
     for field in fields(value):
@@ -86,7 +96,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 
 def scenario_sha256(scenario: Scenario) -> str:
-    """Return the SHA-256 of everything in a scenario that affects an episode, including defaults.
+    """Return the SHA-256 of everything in a scenario that affects an episode, including defaults, in hexadecimal.
 
     Name, title and other texts are excluded.
     """
@@ -95,12 +105,15 @@ def scenario_sha256(scenario: Scenario) -> str:
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return the SHA-256 of each vehicle's policy, by the vehicle's name; vehicles without a policy are omitted."""
+    """Return the SHA-256 of each vehicle's trained policy: ``{"vehicle_2": "3f..."}``.
+
+    ``drivers`` maps the index of a vehicle (0 = front) to its agent. Vehicles with an untrained agent are omitted.
+    """
     return {f"vehicle_{i + 1}": sha for i, agent in drivers.items() if (sha := policy_sha256(agent)) is not None}
 
 
 def result_versions() -> dict[str, str]:
-    """Return the versions of Python and of every package on which a result's numbers depend, by name.
+    """Return name -> version of Python and of every package on which a result's numbers depend.
 
     This includes packages that provided a part in this process, and the SHA-256 of the user's own Python files that it
     ran.
@@ -109,17 +122,23 @@ def result_versions() -> dict[str, str]:
 
 
 def own_versions() -> dict[str, str]:
-    """Return the versions that are the same whatever else is loaded: Python, this package, numba and numpy."""
+    """Return name -> version of Python, this package, numba and numpy, without other loaded packages."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 
 def result_identity(
     kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """Return the identity that a results file of this kind contains: ``kind``, hashes and ``versions``.
+    """Return the entries that identify a result, for its JSON file: ``kind``, hashes and ``versions``.
 
-    The hashes are those of the worlds and of the scenario. ``left_out`` are rows of the sample that no figure counts.
-    Without a sample there is no hash of the worlds, because different parts of the file have different worlds.
+    The hashes are ``scenario_sha256`` and ``worlds_sha256``.
+
+    Args:
+        kind: kind of results, such as ``evaluate`` or ``shield``.
+        scenario: scenario of the worlds.
+        sample: the worlds; None if parts of the file have different worlds: then there is no ``worlds_sha256``.
+        left_out: rows of the sample that the results do not count; they are not hashed.
+
     """
     found: dict[str, Any] = {"kind": kind, "scenario_sha256": scenario_sha256(scenario), "versions": result_versions()}
     if sample is not None:

@@ -18,10 +18,16 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
-    """Try every agent before a long evaluation, so that errors show at once; raises what the evaluation would raise.
+    """Let every agent decide once, so that its errors show before a long evaluation; raise what it would raise.
 
-    Scripts that do not depend on the state are tried on all worlds, others on the first world. With ``warn``, also call
-    ``warn_unfamiliar``.
+    An agent that does not depend on the state decides in all worlds, any other only in the first.
+
+    Args:
+        agents: agents or teams by name.
+        worlds: worlds at the alert.
+        scenario: scenario whose learners the agents drive.
+        warn: also warn about policies in worlds unlike those of their training (``warn_unfamiliar``).
+
     """
     if warn:
         warn_unfamiliar(agents, worlds, scenario, scenario.learners)
@@ -47,16 +53,16 @@ def make_lineup(
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
-    """Return one fresh agent per spec of ``make_agent``, by spec, to drive the scenario's learners.
+    """Make one agent for each spec, to drive the scenario's learners, and return spec -> agent.
 
     Args:
-        specs: a list of specs, or a text with commas between them. ``ladder`` and other names of groups stand for
-            several agents.
+        specs: texts that name agents, as ``make_agent`` takes them (``"full_brake"``, ``"ppo@shipped+step"``): a list,
+            or one text with commas between them. A name of a group, such as ``ladder``, stands for several agents.
         scenario: the scenario whose learners they drive.
-        harm_count: harm that optimising and choosing agents minimise.
-        uncertainty: uncertainty for shields that need one.
-        alone: require that each agent drives a single vehicle.
-        bare: require agents without a shield, because the caller adds one.
+        harm_count: harm that agents minimise, if they optimise: ``first`` or ``total``.
+        uncertainty: uncertainty for the shields that need one, as ``make_agent`` takes it.
+        alone: refuse teams, which drive several vehicles.
+        bare: refuse agents with a shield, because the caller adds one; with one learner, also refuse teams.
 
     Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, a team or a shield where none is
     allowed, and whatever ``make_agent`` raises.
@@ -87,5 +93,9 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """Return ``make_lineup`` for a single controlled vehicle, so without teams."""
+    """Make one agent for each spec, to drive a single vehicle, and return spec -> agent; see ``make_lineup``.
+
+    ``specs`` are texts that name agents, such as ``full_brake``. ``harm_count`` is the harm that agents minimise, if
+    they optimise. Raises ``InvalidInput`` for a team.
+    """
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

@@ -1,4 +1,4 @@
-"""The exact motion of whole episodes, at every moment."""
+"""Exact motion of whole episodes: pieces of cubic polynomials from which the state at any time follows."""
 
 from __future__ import annotations
 
@@ -24,32 +24,35 @@ _SHORT_S = 1e-4  # time (s) within which the pieces of a cascade of tiny bounces
 
 @dataclass(frozen=True, slots=True)
 class EpisodeMotion:
-    """Motion of one world from the alert to the end of its episode, driven by one agent."""
+    """Exact motion of one world from the alert to the end of its episode, with its impacts and harm."""
 
     world: Worlds  # the world at the alert, n = 1
-    # k pieces of cubic motion, [k, 1 + 4 N]: at the beginning of each, time (s), position of Vehicle 1 (m), gaps,
-    # speeds, accelerations and jerks
+    # Motion as k pieces in order of time, [k, 1 + 4 N], during each of which all jerks are constant. A row holds the
+    # state at the beginning of a piece: time (s), position of Vehicle 1 (m), gaps (N - 1, m), speeds (N, m/s),
+    # accelerations (N, m/s2) and jerks (N, m/s3). ``state_at`` returns the state at any time within a piece.
     pieces: Floats
-    end_s: float  # time at which the episode ends
-    impacts: ImpactRows  # impacts in order of time; world is 0
-    stepped_in_s: Floats  # times of the decisions in which a shield replaced the proposed action
-    ledger: Ledger  # harm of the episode, n = 1
+    end_s: float  # time since the alert at which the episode ends (s)
+    impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
+    stepped_in_s: Floats  # times (s) of the decisions in which a shield replaced the policy's action, ascending
+    ledger: Ledger  # harm of all impacts of the episode, n = 1
     final: Worlds  # the world at the end of the episode, n = 1
     at_rest: bool  # whether the line came to rest before the horizon
 
     @property
     def harm(self) -> tuple[float, float]:
-        """Harm of the line (m2/s2): first-impact harm and total harm."""
+        """First-impact harm and total harm of the whole line (m2/s2), as a pair."""
         first, total = (float(self.ledger.world_harm(count)[0]) for count in HARM_COUNTS)
         return first, total
 
 
 def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[EpisodeMotion]:
-    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does, and return every motion.
+    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does.
+
+    Returns one ``EpisodeMotion`` per world, in their order.
 
     Args:
         worlds: worlds at the alert.
-        agent: agent for each learner, or a team; it is not changed.
+        agent: an agent, of which each learner gets a copy, or a team; it is not changed.
         scenario: scenario of the worlds, whose scripts drive the other vehicles.
 
     Raises ``PhysicsError`` naming the worlds that could not be advanced.
@@ -63,7 +66,14 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
 
 class _Follower(Tape):
-    """Watcher that records the steps, and the decisions in which a shield replaced an action."""
+    """Recorder of every step, and of the decisions in which a shield replaced the policy's action.
+
+    Args:
+        worlds: the worlds at the alert.
+        team: agents that drive.
+        engine: engine that runs the episodes, from which the shield's decisions are read.
+
+    """
 
     def __init__(self, worlds: Worlds, team: Team, engine: Engine) -> None:
         super().__init__(worlds)
@@ -73,7 +83,14 @@ class _Follower(Tape):
         self._engine, self._ruling = engine, engine.ruling
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Record one step."""
+        """Record one step.
+
+        Args:
+            before: the worlds at the beginning of the step.
+            command_mps2: [n, N] commanded accelerations during the step.
+            until_s: [n] time at which the step ends.
+
+        """
         super().see(before, command_mps2, until_s)
         ruling = self._engine.ruling
         if ruling is not None and ruling is not self._ruling:  # ``see`` may be called several times in a step
@@ -82,7 +99,7 @@ class _Follower(Tape):
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """Return the recorded motion of each world."""
+        """Return the recorded motion of each world; ``episodes`` is the result of the finished run."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.episodes(), self._pieces()
         found = []
@@ -107,7 +124,10 @@ class _Follower(Tape):
         return found
 
     def _pieces(self) -> list[Floats]:
-        """Return the pieces of each world's motion in order of time; a single piece where the episode ends at once."""
+        """Return the motion of each world as pieces, [k, 1 + 4 N] as in ``EpisodeMotion``.
+
+        A world whose episode ends at once has a single piece.
+        """
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
         for before, command, until_s in self.steps:
@@ -126,7 +146,16 @@ class _Follower(Tape):
 
 
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
-    """Join pieces that continue the piece before; of several pieces within ``_SHORT_S``, keep the last."""
+    """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
+
+    A piece is dropped if the piece before it, continued, gives its state within rounding. Of several pieces that begin
+    within the same 0.1 ms, only the last is kept.
+
+    Args:
+        pieces: [k, 1 + 4 N] time and state at the beginning of each piece, as in ``EpisodeMotion``.
+        vehicles: number of vehicles, N.
+
+    """
     last_of_many = np.append(np.diff(np.floor(pieces[:, 0] / _SHORT_S)) > 0.0, True)
     last_of_many[0] = True
     kept: list[Floats] = []
@@ -137,9 +166,15 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Return the state [4 N] at a time within a piece [1 + 4 N].
+    """Return the state [4 N] at a time within a piece of constant jerks.
 
-    The state is the position of Vehicle 1, gaps, speeds, accelerations and jerks.
+    The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
+
+    Args:
+        piece: [1 + 4 N] time and state at the beginning of the piece.
+        time_s: time since the alert (s).
+        vehicles: number of vehicles, N.
+
     """
     t, N = time_s - piece[0], vehicles
     speeds, rates, jerks = (piece[1 + part * N : 1 + (part + 1) * N] for part in (1, 2, 3))

@@ -1,4 +1,4 @@
-"""The notes below a table of results: warnings and explanations, each only where it applies."""
+"""Notes below a results table: warnings and explanations, each only if it applies to the rows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.exploits import Exploits
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, MeasureSet
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, MeasureSet
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 
@@ -18,7 +18,7 @@ SEES_THROUGH = "† "  # mark of an agent whose knowledge did not come through t
 
 
 def notes_of(rows: Sequence[SummaryRow]) -> list[Note]:
-    """Return all notes about these rows, in the order in which they are printed."""
+    """Return the notes to print below a results table with these rows, in the order in which they are printed."""
     if not rows:
         return []
     notes: list[Note] = [
@@ -34,12 +34,12 @@ def notes_of(rows: Sequence[SummaryRow]) -> list[Note]:
 
 
 def warnings_of(rows: Sequence[SummaryRow]) -> list[str]:
-    """Return the warnings of all sets of measures, as sentences."""
+    """Return the warnings of all sets of measures about the rows of a results table, as sentences."""
     return [f"WARNING: {warning}." for each in _sets_in(rows) for warning in each.warnings(rows)]
 
 
 def identity_line(rows: Sequence[SummaryRow]) -> str:
-    """Return the hashes that identify this result, as a sentence; empty without rows."""
+    """Return a sentence with the hashes of worlds, scenario and policies of a results table; empty without rows."""
     if not rows:
         return ""
     policies = [f"{row.agent} ({', '.join(row.policy_sha256.values())})" for row in rows if row.policy_sha256]
@@ -48,19 +48,19 @@ def identity_line(rows: Sequence[SummaryRow]) -> str:
 
 
 def _sets_in(rows: Sequence[SummaryRow]) -> list[MeasureSet]:
-    """Return the sets of measures that these rows contain."""
+    """Return the registered sets of measures that added fields to these rows (``SummaryRow.more``)."""
     return [each for name, each in MEASURE_SETS.items() if rows and name in rows[0].more]
 
 
 def _left_out(row: SummaryRow) -> str:
-    """Return the note about worlds that no row counts."""
+    """Return the note about worlds that were left out for every agent; empty if there are none."""
     if not row.left_out:
         return ""
     return LeftOut.line([str(left) for left in row.left_out], row.episodes + len(row.left_out))
 
 
 def _cut_off(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about worlds in which something still moved at the horizon."""
+    """Return the note about worlds in which a vehicle still moved at the horizon; empty if there are none."""
     moving = ", ".join(f"{row.agent} {row.horizon_ends:,}" for row in rows if row.horizon_ends)
     if not moving:
         return ""
@@ -71,7 +71,7 @@ def _cut_off(rows: Sequence[SummaryRow]) -> str:
 
 
 def _no_impact(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about agents that had no impact in any world."""
+    """Return the note about agents that had no impact in any world; empty if there are none."""
     unhurt = [row for row in rows if not row.collisions]
     if not unhurt:
         return ""
@@ -83,7 +83,10 @@ def _no_impact(rows: Sequence[SummaryRow]) -> str:
 
 
 def _knowledge(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about agents that know what the channel hides, and agents that do not state their knowledge."""
+    """Return the note about what the V2X channel hides, and about agents that know it nevertheless.
+
+    It also lists agents that do not state their knowledge. It is empty if the channel hides nothing in these worlds.
+    """
     hidden = rows[0].hidden_share
     if not hidden:
         return ""

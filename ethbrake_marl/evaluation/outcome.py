@@ -19,7 +19,7 @@ _NAMED = 10  # number of left-out worlds that a note lists; JSON lists all of th
 
 COLUMN = "metric_"  # prefix of a registered measure's name, in JSON and in files with every world
 
-Values = NDArray[Any]  # [n]
+Values = NDArray[Any]  # values of a measure in n worlds, [n]
 
 # Knowledge of an agent that does not state what it knows.
 UNSTATED = Knowledge((Source.UNSTATED,))
@@ -29,7 +29,7 @@ _COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_h
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Results of one agent, world by world.
+    """Results of one agent in n worlds: harm, final state and what was measured, world by world.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -40,16 +40,20 @@ class Outcome:
 
     """
 
-    ledger: Ledger  # harm of all impacts
+    ledger: Ledger  # harm of all impacts in each world, by pair and vehicle
     final: Worlds  # each world at the end of its episode
     at_rest: Bools  # [n] whether the line came to rest before the horizon
-    predicted_harm: Floats | None  # [n] harm that the agent predicted at the alert; None if it predicts none
-    chosen_policy: Bools | None  # [n] whether a hybrid drove by its policy (else by its backup); None: no hybrid
-    knows: Knowledge = UNSTATED  # the agent's stated knowledge of the line
-    shoved_m: Floats | None = None  # [n] distance by which Vehicle 1 was shoved beyond its own stopping point
-    sampled_harm: Floats | None = None  # [n] the paper's sum over samples, for the same commands (m2/s2)
+    predicted_harm: Floats | None  # [n] harm that the agent predicted at the alert (m2/s2); None if it predicts none
+    # [n] whether the policy behind a shield drove to the end: episode mode chose it at the alert, or step mode replaced
+    # none of its actions. None without a shield.
+    chosen_policy: Bools | None
+    knows: Knowledge = UNSTATED  # the agent's statement of what it knows about the line
+    # [n] distance by which Vehicle 1 was shoved beyond its own stopping point; None: not measured.
+    shoved_m: Floats | None = None
+    # [n] harm by the paper's sum over samples of the motion, for the same commands (m2/s2); None: not measured.
+    sampled_harm: Floats | None = None
     policies: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy's manifest
-    metrics: Mapping[str, Floats] = field(default_factory=dict)  # registered measures by column, [n]
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # measures that the user registered, [n], by column
 
     def __repr__(self) -> str:
         n, means = len(self.collided), "no harm"
@@ -58,7 +62,7 @@ class Outcome:
         return f"Outcome({count_of(n, 'world')}, {int(self.collided.sum()):,} collided, {means})"
 
     def take(self, rows: Ints | Bools) -> Outcome:
-        """Return the outcome restricted to ``rows``."""
+        """Return the same outcome with only the worlds ``rows``: row numbers, or a mask [n]."""
         found = {name: getattr(self, name) for name in _COLUMNS}
         columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in found.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
@@ -66,7 +70,10 @@ class Outcome:
 
     @classmethod
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
-        """Join the outcomes of consecutive parts of a list."""
+        """Join one agent's outcomes on the parts of a list, in order, into the outcome on the whole list.
+
+        A column that is None in one part is None in the result.
+        """
         first, columns = parts[0], dict[str, Any]()
         for name in _COLUMNS:  # None in one part makes the whole column None
             told = [getattr(part, name) for part in parts]
@@ -78,7 +85,7 @@ class Outcome:
 
     @property
     def collided(self) -> Bools:
-        """Worlds with at least one impact, [n]."""
+        """Whether at least one impact happened, for each world: [n] bool."""
         return self.ledger.collided
 
     @property
@@ -87,7 +94,10 @@ class Outcome:
         return self.ledger.impacts
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of all vehicles under one count, [n] m2/s2."""
+        """Return the harm of the whole line in each world, [n] m2/s2.
+
+        ``harm_count`` says which impacts count: each pair's first one (``first``) or all (``total``).
+        """
         return self.ledger.world_harm(harm_count)
 
     @property
@@ -101,7 +111,10 @@ class Outcome:
         return self.ledger.world_harm("total")
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of each vehicle under one count, [n, N] m2/s2."""
+        """Return the harm that each vehicle bears in each world, [n, N] m2/s2.
+
+        ``harm_count`` says which impacts count: each pair's first one (``first``) or all (``total``).
+        """
         return self.ledger.vehicle_harm(harm_count)
 
     @property
@@ -110,9 +123,10 @@ class Outcome:
         return np.where(self.at_rest, "at_rest", "horizon")
 
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:
-        """Return the harm that each vehicle bears, and its value under each objective, as columns [n] (m2/s2).
+        """Return the harm that each vehicle bears, and its value under each objective, as columns [n] by name (m2/s2).
 
-        Both counts are included. Examples of names: ``total_harm_2``, ``social:45_first_2``.
+        First-impact and total harm are both included. The columns of Vehicle 2 are ``first_impact_harm_2``,
+        ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and ``social:45_total_2``.
         """
         told = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
         for objective in objectives:
@@ -122,7 +136,7 @@ class Outcome:
         return {f"{name}_{i + 1}": each[:, i] for name, each in told.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """Return the results of each world as columns, named as in ``--per-world``; None for a missing column."""
+        """Return the results of each world as columns [n], by the names in docs/per-world.md; None: not measured."""
         final, obstacle = self.final, {}
         if (ahead := final.obstacle_ahead).any():  # part of the harm that comes from impacts with the obstacle
             obstacle = {
@@ -150,17 +164,17 @@ class Outcome:
 
 
 def none_for_nan(column: Values) -> list[Any]:
-    """Return the values of a column as a list, with None in place of NaN."""
+    """Return the values of ``column`` [n] as a list, in which None replaces NaN."""
     return [None if value != value else value for value in column.tolist()]
 
 
 class LeftOut(NamedTuple):
-    """A world that no outcome contains, because the physics could not advance it with one of the agents."""
+    """A world that no agent's outcome contains, because the physics could not advance it with one of the agents."""
 
-    world: int  # number of the world in its list
+    world: int  # number of the world in its list, from 0
     seed: int | None  # seed of the list; None for worlds that the caller passed
-    agent: str  # first agent with which it failed
-    reason: str
+    agent: str  # name of the first agent with which it failed
+    reason: str  # message of the error
 
     def __str__(self) -> str:
         of = "" if self.seed is None else f" of seed {self.seed}"
@@ -168,7 +182,13 @@ class LeftOut(NamedTuple):
 
     @staticmethod
     def line(worlds: Sequence[str], whole: int) -> str:
-        """Return the note that these of ``whole`` worlds are left out; each text names a world and the reason."""
+        """Return the note for users that some worlds were left out, with up to ten of them.
+
+        Args:
+            worlds: one text per left-out world, which names it and the reason.
+            whole: number of all worlds, including those.
+
+        """
         named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
         return (
             f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, which the physics could not advance"

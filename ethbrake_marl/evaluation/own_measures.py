@@ -1,4 +1,4 @@
-"""Registered measures as evaluations show them: which ones, their columns, and the headings of these."""
+"""Measures that the user registered, as evaluations show them: loading, columns and headings."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.measures import MEASURES, REPORTED, NamedMeasure, register_measure
 from ethbrake_marl.registry import Part
 
-LOADED: dict[str, None] = {}  # names that ``load_measures`` was given, in order
+LOADED: dict[str, None] = {}  # arguments of ``load_measures`` so far, in order
 
 
 def load_measures(names: Iterable[str]) -> None:
-    """Make every evaluation from now on show these measures: ``risk``, ``injury``, those of installed packages.
+    """Load measures by name, and show them in every evaluation from now on.
 
-    ``my_file.py:measure`` runs that file, which can do whatever you can: it names a function or a ``Part``. Raises
-    ``UnknownName`` with a suggestion, ``InvalidInput`` for what cannot be loaded.
+    A name is ``risk``, ``injury``, or the name of a measure of an installed package. ``my_file.py:measure`` runs that
+    Python file, with your permissions, and takes ``measure`` from it: a function, or a ``Part``, which holds a function
+    with the settings of ``register_measure``. Raises ``UnknownName`` with a suggestion, and ``InvalidInput`` for a
+    measure that cannot be loaded.
     """
     for name in names:
         file, colon, own = name.rpartition(":")
@@ -43,9 +45,14 @@ def registered_measure(column: str) -> NamedMeasure | None:
 
 
 def measure_columns(terms: Mapping[str, Any], episodes: EpisodeImpacts | None) -> dict[str, Any]:
-    """Every reported measure of these episodes by column, [n]: ``NAME``, or ``NAME_1``, ``NAME_2``, ... by vehicle.
+    """Return every reported measure of some episodes as columns [n], by name.
 
-    ``terms``: sums of the measures by step; ``episodes``: None where no measure is computed from impacts.
+    A measure with one value per vehicle has the columns ``NAME_1``, ``NAME_2`` and so on.
+
+    Args:
+        terms: measures that are computed at each step, summed over the episodes, [n] or [n, N], by name.
+        episodes: impacts of the episodes, from which the other measures are computed; None if there are none.
+
     """
     columns: dict[str, Any] = {}
     for name, measure in REPORTED.items():

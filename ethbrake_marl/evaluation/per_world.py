@@ -32,10 +32,19 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world: Parquet if the name ends in ``.parquet``, else CSV.
 
-    docs/per-world.md lists the columns; ``objectives`` adds columns. The row of a left-out world holds only its number
-    and the reason, in ``ended``. The file is written completely or not at all. Raises ``AlreadyExists`` for an existing
-    file unless ``force``, ``InvalidInput`` for a missing folder or another ending, ``MissingExtra`` for Parquet without
-    pyarrow.
+    docs/per-world.md lists the columns. The row of a left-out world holds only its number and the reason, in ``ended``.
+    The file is written completely or not at all.
+
+    Args:
+        path: the file to write.
+        evaluation: results of the agents.
+        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Each adds
+            columns with its value for every vehicle.
+        force: replace an existing file.
+
+    Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` for a missing folder or another
+    ending, ``MissingExtra`` for Parquet without pyarrow.
+
     """
     ending = Path(path).suffix.lower()
     if ending not in (CSV, PARQUET):
@@ -56,10 +65,16 @@ def write_per_world(
 
 
 def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]]]:
-    """Read the harms from ``data``, the content of a file of ``write_per_world``.
+    """Return the harms in a file of ``write_per_world``: agent -> world -> (first-impact harm, total harm) in m2/s2.
 
-    Returns agent -> world -> (first-impact harm, total harm) in m2/s2; left-out worlds are omitted. ``path`` decides
-    the format. Raises ``InvalidInput`` for a file without these columns.
+    Left-out worlds are omitted.
+
+    Args:
+        path: name of the file, whose ending decides the format; it is not opened.
+        data: content of the file.
+
+    Raises ``InvalidInput`` for a file without these columns.
+
     """
     try:
         if path.suffix.lower() == PARQUET:
@@ -126,11 +141,11 @@ def results_to_json(
     """Return the content of a results file: one object per row.
 
     Args:
-        rows: rows of the table.
-        told: values under other objectives, added to each agent's object.
-        groups: by name, rows of the same agents on parts of the worlds (``summarise_by``).
-        per_world: the file with one row per world, written before; its name and hash go into every object.
-        settings: settings of all agents, such as the harm that they minimise.
+        rows: rows of the results table, one per agent.
+        told: mean harms under other objectives (``Evaluation.rescore``), added to each agent's object.
+        groups: name of a group of worlds -> rows of the same agents on that group (``summarise_by``).
+        per_world: existing file with one row per world; its name and hash go into every object.
+        settings: settings of all agents by name: ``{"harm_count": "first"}`` is the harm that they minimise.
 
     """
     found = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
@@ -148,24 +163,35 @@ def results_to_json(
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Content of one results file."""
+    """Content of one results file (JSON) that was read and checked."""
 
-    path: Path
-    rows: Mapping[str, Mapping[str, Any]]  # object of each agent; for ``ethbrake shield``, of each agent and mode
+    path: Path  # the file
+    # JSON object of each agent, by its name; for results of ``ethbrake shield``, by ``AGENT (MODE)``.
+    rows: Mapping[str, Mapping[str, Any]]
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """First row of the file, for entries about the worlds, which are the same in all rows."""
+        """JSON object of the first agent, from which to read entries that are the same for all, such as the hashes."""
         return next(iter(self.rows.values()))
 
     def estimate(self, agent: str, harm: str) -> Estimate:
-        """Return an agent's mean of a harm, with its interval."""
+        """Return the mean harm of an agent with its interval.
+
+        Args:
+            agent: key of ``rows``.
+            harm: key of the harm in the JSON object: ``first_impact_harm``, ``total_harm`` or ``harm``.
+
+        """
         row = self.rows[agent]
         mean, interval = row[harm], row.get(f"{harm}_interval")
         return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
 
     def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
-        """Return the harms of every world; raise ``InvalidInput`` if the file that holds them is missing or changed."""
+        """Read the harms of every world from the file that was written beside this one with ``--per-world``.
+
+        Returns agent -> world -> (first-impact harm, total harm) in m2/s2. Raises ``InvalidInput`` if that file is
+        missing or was changed.
+        """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
             raise InvalidInput(f"{self.path} has none (--per-world)")
@@ -179,7 +205,7 @@ class Result:
 
 
 def read_result(path: Path) -> Result:
-    """Read a results file: the output of ``evaluate`` or ``shield`` with ``--json``, or a file of ``ethbrake run``.
+    """Read and check a results file (JSON) that ``ethbrake evaluate``, ``shield`` or ``run`` wrote or printed.
 
     Raises ``InvalidInput`` for any other file, including kinds of results that cannot be compared, and results without
     hashes.
@@ -218,14 +244,20 @@ def read_result(path: Path) -> Result:
 
 
 def told_of(row: Mapping[str, Any], key: str) -> str | None:
-    """Return the value of ``key`` in a row, or in its parameters, as text; None if it is in neither."""
+    """Return the value of ``key`` in ``row`` (an agent's JSON object), or else in its ``parameters``, as text.
+
+    None if it is in neither.
+    """
     parameters = row.get("parameters")
     told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
     return None if told is None else str(told)
 
 
 def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
-    """Return whether these are a mean harm and an interval around it; a single episode must have no interval."""
+    """Return whether these JSON values are a mean harm and an interval ``[low, high]`` around it.
+
+    ``interval`` may be None; for ``episodes`` = 1 it must be.
+    """
     ends = [mean, mean] if interval is None else interval
     if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):
         return False
@@ -235,7 +267,10 @@ def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
 
 
 def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
-    """Return the objects of a results file, one for each agent; raise ``InvalidInput`` for other content."""
+    """Return the objects of a results file, one for each agent; raise ``InvalidInput`` for other content.
+
+    ``content`` is the parsed JSON; ``path`` is named in errors.
+    """
     several = [content] if isinstance(content, dict) else content
     if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
         raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")

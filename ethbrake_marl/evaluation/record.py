@@ -23,7 +23,7 @@ from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-SAMPLE_S = 0.02
+SAMPLE_S = 0.02  # default time between two samples (s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +48,8 @@ class EpisodeRecord:
     speeds_mps: Floats  # [k, N] speed of each vehicle
     positions_m: Floats  # [k, N] position of each vehicle along the road; vehicles have no length here
     command_mps2: Floats  # [k, N] commanded signed acceleration from this time on; 0 before the latency has elapsed
-    impacts: ImpactRows  # impacts in order of time; world is 0
-    ledger: Ledger  # harm of the episode, n = 1
+    impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
+    ledger: Ledger  # harm of all impacts of the episode, n = 1
     at_rest: bool  # whether the line came to rest before the horizon
 
     def __repr__(self) -> str:
@@ -95,10 +95,12 @@ def record_episode(
 
 
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
-    """Yield arrays of samples (time, gaps, speeds, positions, command), segment by segment.
+    """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Only the last segment includes its end. Worlds hold gaps and speeds, not positions. So Vehicle 1's position is
-    measured as its gap to an obstacle ahead, which is the world's own or one out of reach.
+    ``segments`` are the steps of one world, each with the world before, the commands [1, N], and the end time [1]. Two
+    samples of a step are at most ``sample_s`` apart (s). Only the last step includes its end. Worlds hold gaps and
+    speeds, not positions. So Vehicle 1's position is measured as its gap to an obstacle ahead, which is the world's own
+    or one out of reach.
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, until_s) in enumerate(segments):
@@ -118,5 +120,5 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
 
 
 def line_positions(front: Floats, gaps: Floats) -> Floats:
-    """Return the positions [k, N] of all vehicles from the position of Vehicle 1 [k] and the gaps [k, P]."""
+    """Return the positions [k, N] of all vehicles, ``front`` [k] being that of Vehicle 1, from the gaps [k, P]."""
     return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)

@@ -1,4 +1,4 @@
-"""Harm under several objectives: one row per agent, objective and count."""
+"""Mean harm of agents under several objectives: one row per agent, objective and count of harm."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """Mean harm of one agent under one objective and count, for each vehicle, front to rear (m2/s2); less is better."""
+    """Mean value of one agent's episodes under one objective, for each vehicle; less is better."""
 
-    agent: str
-    objective: str
-    harm_count: HarmCount
-    each: tuple[Estimate, ...]
+    agent: str  # name of the agent
+    objective: str  # objective as in scenarios: ``total``, ``own``, ``social:45``
+    harm_count: HarmCount  # impacts that count: each pair's first one (``first``) or all (``total``)
+    each: tuple[Estimate, ...]  # mean per world (m2/s2) of each vehicle, front to rear
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON: objective, harm count, and each vehicle's mean with its interval."""
+        """Return plain data for JSON: ``objective``, ``harm_count``, and each vehicle's mean and interval."""
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
 
 class Rescores(list[Rescored]):
-    """List of ``Rescored`` rows that ``print`` and a notebook show as two tables, one per count."""
+    """List of ``Rescored`` rows that ``print`` and a notebook show as two tables: first-impact and total harm."""
 
     def __str__(self) -> str:
         return terminal_text(self.sheet("first"), "", self.sheet("total"))
@@ -34,7 +34,10 @@ class Rescores(list[Rescored]):
         return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
 
     def sheet(self, harm_count: HarmCount) -> Sheet:
-        """Return the table of one count: one line per agent and objective, one column per vehicle."""
+        """Return the table of first-impact harm (``first``) or total harm (``total``).
+
+        It has one line per agent and objective, and one column per vehicle.
+        """
         shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)
         columns = [Column(f"Vehicle {i + 1}", interval="below") for i in vehicles]

@@ -59,10 +59,11 @@ def evaluate(
     """Let each agent drive every world once, from the alert to the episode's end.
 
     The other vehicles follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor on the other
-    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` names it.
+    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` lists it.
 
     Args:
-        worlds: worlds at the alert, or a sample of the scenario's list; None: draw the first ``episodes`` of ``seed``.
+        worlds: worlds at the alert, or a sample that ``scenario.sample`` drew; None: draw ``episodes`` worlds from
+            ``seed``.
         agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), which minimise first-impact
             harm; or a mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the
             originals do not change.
@@ -72,8 +73,8 @@ def evaluate(
         seed: seed of the list; None: 7. With ``worlds``, it is only recorded in the result.
         chunk: number of worlds advanced together; None: 2,500.
         on_progress: called after each chunk with an agent's name and the number of its worlds done.
-        aftermath: also measure how far Vehicle 1 is shoved, the paper's sampled harm, and registered measures;
-            takes longer.
+        aftermath: also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the user
+            registered; takes longer.
 
     Warns (``Unfamiliar``) about policies in worlds unlike those of their training. Raises ``PhysicsError`` if no world
     is left; ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
@@ -104,7 +105,7 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """Iterate over parts of this size, each with the row of its first world."""
+    """Yield consecutive parts of at most ``size`` worlds, each as (row of its first world in the sample, part)."""
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -118,9 +119,19 @@ def drive_chunk(
     first: int = 0,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive all of these worlds together, from the alert on.
+    """Let each agent drive all of these worlds together, from the alert to the end of their episodes.
 
-    ``first`` is the row of the first world, for messages. If every world fails, the evaluation is empty.
+    If every world fails, the evaluation is empty.
+
+    Args:
+        sample: the worlds, a part of a list.
+        agents: agents or teams by name.
+        scenario: scenario of the worlds.
+        seed: seed of the list, which is recorded in the result.
+        vehicles: indices (0 = front) of the controlled vehicles.
+        first: row of the part's first world in the list, for error messages.
+        aftermath: also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user registered.
+
     """
     n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
     outcomes: dict[str, Outcome] = {}
@@ -144,7 +155,7 @@ def drive_chunk(
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:
-    """Raise ``InvalidInput`` for arguments of ``evaluate`` of the wrong kind."""
+    """Raise ``InvalidInput`` if one of these arguments of ``evaluate`` has a wrong type or value."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
             f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
@@ -163,9 +174,10 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 
 
 def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
-    """Return the indices of the controlled vehicles: ``vehicle``, or else all learners.
+    """Return the indices (0 = front) of the vehicles that the agents are to control.
 
-    Without learners the result is empty if all agents are teams; otherwise raises ``InvalidInput``.
+    This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. Without learners the
+    result is empty if all agents are teams; otherwise raises ``InvalidInput``.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
@@ -173,9 +185,10 @@ def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mappi
 
 
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
-    """Return the index of the controlled vehicle: ``vehicle``, or else the scenario's only learner.
+    """Return the index (0 = front) of the single controlled vehicle.
 
-    Raises ``InvalidInput`` unless exactly one vehicle is controlled.
+    This is ``vehicle`` (name or index), or the scenario's only learner if ``vehicle`` is None. Raises ``InvalidInput``
+    if there is not exactly one learner, or another learner than ``vehicle``.
     """
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]
@@ -199,7 +212,11 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let a fresh team drive the worlds of these rows, and return its outcome."""
+    """Let a new team of copies of ``agent`` drive the worlds with the row numbers ``rows`` of ``whole``.
+
+    ``vehicles`` are the indices of the controlled vehicles. With ``aftermath``, also measure how far Vehicle 1 is
+    shoved, sampled harm, and measures that the user registered.
+    """
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
@@ -219,8 +236,9 @@ def _roll_out(
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """Return the outcome of a team's episodes, without the measures of ``aftermath``.
+    """Return the ``Outcome`` of the episodes that a team has driven.
 
+    It lacks what watchers measure during the episodes: ``shoved_m``, ``sampled_harm`` and ``metrics``. The fields
     ``predicted_harm`` and ``chosen_policy`` come from the memory of an agent that drives alone, or from a shield.
     """
     memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
@@ -241,7 +259,10 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """Return a column of an agent's memory, one number per world; None if the memory has no such column."""
+    """Return the entry ``what`` of an agent's memory, one number per world [n]; None if there is no such entry.
+
+    ``team`` is named in errors.
+    """
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

@@ -29,9 +29,15 @@ _AT_ONCE = 1 << 20  # resampled worlds in memory at once: 8 MB
 def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
     """Return the mean of the middle half of all values, with its stratified bootstrap interval (percentiles).
 
-    ``tasks`` holds one list of values, one per seed, for each task (scenario). Of all n values, floor(n / 4) are
-    omitted at either end. The interval is None if no task has two seeds. Raises ``InvalidInput`` for a task without
-    values, or for a value that is not finite.
+    Of all n values, floor(n / 4) are omitted at either end. The interval is None if no task has two seeds.
+
+    Args:
+        tasks: for each task (scenario), the results of its trainings, one number per seed.
+        resamples: number of bootstrap resamples.
+        seed: seed of the bootstrap.
+
+    Raises ``InvalidInput`` for a task without values, or for a value that is not finite.
+
     """
     from scipy.stats import bootstrap, trim_mean  # imported here because it takes a second to load
 
@@ -61,14 +67,20 @@ def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES
 
 
 def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
-    """Return the mean of ``values``, or of ``values - baseline`` on the same worlds, [seeds, worlds] each.
+    """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, with a bootstrap interval.
 
-    The two sides may have different numbers of seeds. The bootstrap resamples the seeds of each side, and the worlds,
-    which both sides share. So an interval of differences that excludes 0 holds for other seeds *and* other worlds.
-    There is no interval for a single world, or where all values are 0 without a baseline. For true/false values that
-    are nearly always or never true, resamples hardly differ; therefore, without a baseline, their interval also covers
-    Wilson's interval of their share over the worlds. Raises ``InvalidInput`` for arrays that cannot be paired or are
-    not finite.
+    The bootstrap resamples the seeds of each side, and the worlds, which both sides share. So an interval of
+    differences that excludes 0 holds for other seeds *and* other worlds. There is no interval for a single world, nor
+    without a baseline if all values are 0. The interval of true/false values without a baseline also covers Wilson's
+    interval, because resamples of values that hardly ever differ are too narrow.
+
+    Args:
+        values: [seeds, worlds] result of the training with each seed in each world.
+        baseline: [seeds, worlds] results to subtract, in the same worlds; the number of seeds may differ.
+        seed: seed of the bootstrap.
+
+    Raises ``InvalidInput`` for arrays that cannot be paired or are not finite.
+
     """
     given = np.atleast_2d(np.asarray(values))
     sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
@@ -85,10 +97,17 @@ def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, see
 
 
 def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, seed: int = 0) -> Estimate | None:
-    """Return ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))`` on the same worlds, [seeds, worlds] each.
+    """Return the share of the possible reduction that ``values`` reaches: 0 like ``worst``, 1 like ``best``.
 
-    This is the share of the possible reduction that ``values`` reaches: 0 like ``worst``, 1 like ``best``. The interval
-    is as in ``mean_over_seeds``. Returns None unless ``best`` has a lower mean than ``worst``.
+    It is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with the bootstrap interval of
+    ``mean_over_seeds``. Returns None unless ``best`` has a lower mean than ``worst``.
+
+    Args:
+        values: [seeds, worlds] harms to judge.
+        worst: [seeds, worlds] harms that count as share 0, in the same worlds.
+        best: [seeds, worlds] harms that count as share 1, in the same worlds.
+        seed: seed of the bootstrap.
+
     """
     sides = _pair_sides("share_over_seeds", values, worst, best)
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
@@ -104,7 +123,10 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
-    """Return the sides as arrays [seeds, worlds]; raise ``InvalidInput`` unless worlds agree and all are finite."""
+    """Return each of ``sides`` as an array [seeds, worlds].
+
+    Raises ``InvalidInput``, naming the function ``who``, if their numbers of worlds differ or a value is not finite.
+    """
     arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
         shapes = " and ".join(str(side.shape) for side in arrays)
@@ -115,7 +137,11 @@ def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
 
 
 def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], seed: int) -> Estimate:
-    """Return ``value`` with the percentile interval of ``of(resampled means)``; no interval for a single world."""
+    """Return ``value`` with a bootstrap interval, or without one for a single world.
+
+    The interval holds the percentiles of ``of(means)``, where ``means`` [resamples, sides] are the resampled means.
+    ``seed`` is the seed of the bootstrap.
+    """
     if sides[0].shape[1] < 2:
         return Estimate(value, None)
     tail = 50.0 * (1.0 - CONFIDENCE)
@@ -124,7 +150,7 @@ def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Flo
 
 
 def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
-    """Return the mean of each side in each bootstrap resample, [resamples, sides].
+    """Return the mean of each of ``sides`` (arrays [seeds, worlds]) in each bootstrap resample, [resamples, sides].
 
     Seeds are resampled separately for each side; worlds are resampled once for all sides.
     """

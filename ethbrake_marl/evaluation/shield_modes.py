@@ -31,36 +31,40 @@ CHUNK = 500  # worlds advanced together; limits memory, and does not change resu
 
 
 class VehicleRow(NamedTuple):
-    """Results of one vehicle of the line in step mode."""
+    """Results of one vehicle of the line behind a shield in step mode."""
 
-    vehicle: str
-    replaced: float | None  # share of its decisions that were replaced; None: not shielded
+    vehicle: str  # name, such as ``vehicle_2``
+    replaced: float | None  # share, 0 to 1, of its decisions that the shield replaced; None: it is not shielded
     harm: float  # mean harm that it bears per world (m2/s2)
-    baseline: float  # mean harm that it would bear under the baseline plan (m2/s2)
-    above_baseline: float  # share of worlds in which it bears more than under the baseline plan
+    baseline: float  # mean harm that it would bear if the line followed the shield's baseline plan (m2/s2)
+    above_baseline: float  # share, 0 to 1, of worlds in which it bears more than under that plan
 
 
 @dataclass(frozen=True, slots=True)
 class ModeRow:
     """Results of one agent, or one team, behind one mode of the shield."""
 
-    agent: str
-    mode: Mode
+    agent: str  # name of the agent or team, without the shield
+    mode: Mode  # the shield's mode; ``none``: without a shield
     harm: Estimate  # mean harm per world (m2/s2)
-    horizon_ends: int  # number of worlds still moving at the horizon, after which no bound holds
-    against_episode: Estimate | None  # harm minus episode mode's harm, paired by world; None: episode mode, and teams
-    against_none: Estimate | None = None  # harm minus the harm without a shield, paired by world
-    # the fields from here to ``above_bound`` exist only in step mode
-    replaced: float | None = None  # share of the decisions of all shielded vehicles that were replaced
-    bound: Estimate | None = None  # mean bound at the alert (m2/s2)
-    vehicles: tuple[VehicleRow, ...] = ()
-    verdicts: tuple[float, ...] | None = None  # share of each verdict among the interventions, ordered as VERDICTS
+    horizon_ends: int  # number of worlds in which something still moves at the horizon, after which no bound holds
+    # Harm minus the harm in episode mode, paired by world (m2/s2); None in episode mode itself, and for teams.
+    against_episode: Estimate | None
+    # Harm minus the harm without a shield, paired by world (m2/s2); None without a shield.
+    against_none: Estimate | None = None
+    # The fields from here to ``above_bound`` exist only in step mode and its variants.
+    replaced: float | None = None  # share, 0 to 1, of all decisions of shielded vehicles that the shield replaced
+    bound: Estimate | None = None  # mean over worlds of the harm that the shield promises at the alert (m2/s2)
+    vehicles: tuple[VehicleRow, ...] = ()  # results of each vehicle, front to rear
+    # Shares, 0 to 1, of the replaced decisions without which harm would be higher (needed), the same (harmless) and
+    # lower (costly), in this order; None if none was replaced.
+    verdicts: tuple[float, ...] | None = None
     above_bound: int | None = None  # number of worlds whose harm exceeds the bound at the alert
-    left_out: LeftOutRows = ()  # worlds that could not be advanced with some agent and mode; no row counts them
-    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> SHA-256 of its proposing policy
+    left_out: LeftOutRows = ()  # (row, reason) of each world that failed with some agent and mode; no row counts it
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON; missing values are null, intervals are ``[low, high]``."""
+        """Return the row as plain data for JSON; missing values are null, intervals are ``[low, high]``."""
         shares = self.verdicts or (None,) * len(VERDICTS)
         return {
             "agent": self.agent,
@@ -79,22 +83,25 @@ class ModeRow:
 
 
 class ShieldModes(list[ModeRow]):
-    """List of the rows of ``compare_modes``: every agent behind every mode."""
+    """Result of ``compare_modes``: a list with one row for each agent and mode of the shield."""
 
     @property
     def of_teams(self) -> bool:
-        """Whether the rows are about several learners, which have no episode mode."""
+        """Whether several vehicles are controlled; there is no episode mode for them."""
         return all(row.against_episode is None for row in self)
 
     def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
-        """Return the content of a results file of ``ethbrake shield``: one object per row."""
+        """Return the content of a results file of ``ethbrake shield``: one object per row.
+
+        ``sample`` and ``task`` are the worlds and the task that ``compare_modes`` was called with.
+        """
         left_out = [world for world, _ in self[0].left_out]
         about = result_identity("shield", task.scenario, sample, left_out)
         about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}
         return [about | row.to_json() for row in self]
 
     def sheets(self) -> list[Sheet]:
-        """Return the rows as tables, below the name of each agent; for teams, also the harm that each vehicle bears."""
+        """Return the tables for a terminal: harm by agent and mode and, for teams, the harm that each vehicle bears."""
         share, teams = partial(Column, digits=1, scale=100.0, unit=" %"), self.of_teams
         head = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
         head += [Column("minus no shield" if teams else "minus episode mode", sign="+")]
@@ -123,17 +130,23 @@ def compare_modes(
     behind: bool = False,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> ShieldModes:
-    """Let every agent drive through every world without a shield, in episode mode and in step mode; see ``ModeRow``.
+    """Compare every agent without a shield, behind a shield in episode mode, and in step mode, on the same worlds.
 
-    If several vehicles learn, a team (from an agent: a copy for each vehicle) drives without a shield, behind one step
-    shield, and behind one that caps each vehicle's harm; episode mode exists for one vehicle only. Each replaced
-    decision of step mode is simulated again without the shield (``shield.evidence.review``). The agents are not
-    changed. A world that cannot be advanced with one of them is left out for all, and listed in ``left_out``.
+    Step mode is also tried without later rollouts of the policy (``step-alert``). If several vehicles are controlled,
+    episode mode is replaced by a step mode that caps each vehicle's harm (``step-cap``). Each replaced decision of step
+    mode is simulated again without the shield. A world that cannot be advanced with one agent is left out for all, and
+    listed in ``left_out``.
 
-    With ``behind``, compare only the policies behind the shields of these agents; the result is empty if no agent has
-    an episode or step shield. Agents behind other shields are omitted.
+    Args:
+        agents: agents or teams by name, without a shield. They are not changed.
+        worlds: worlds at the alert.
+        task: the scenario, the controlled vehicles, and the harm that the shield bounds.
+        behind: ``agents`` have shields already. Compare the policies inside those that have an episode or step shield,
+            and ignore the others; the result is empty if there is none.
+        on_progress: called with an agent's name and its number of worlds done.
 
     Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where every world is left out.
+
     """
     if behind:
         shields = [agent.shield if isinstance(agent, Team) else agent for agent in agents.values()]
@@ -158,16 +171,19 @@ def compare_modes(
 class _Part(NamedTuple):
     """Results of one chunk of worlds in one mode; the optional fields exist only in step mode."""
 
-    harm: Floats  # [n] harm of each world (m2/s2)
-    moving: int  # number of worlds still moving at the horizon
-    shielded: Shielded | None = None
-    verdicts: Ints | None = None  # number of interventions with each of VERDICTS
+    harm: Floats  # [n] harm of the line in each world (m2/s2)
+    moving: int  # number of worlds in which something still moves at the horizon
+    shielded: Shielded | None = None  # harm, bound and replaced decisions of each vehicle
+    verdicts: Ints | None = None  # [3] number of interventions that were needed, harmless and costly
 
 
 def _compare(
     agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: Callable[[str, int], None] | None
 ) -> list[ModeRow]:
-    """Return the rows of all agents and modes; raise ``PhysicsError`` naming the worlds that cannot be advanced."""
+    """Return the rows of all agents and modes, with arguments as in ``compare_modes``.
+
+    Raises ``PhysicsError`` naming the worlds that cannot be advanced.
+    """
     rows = []
     for name, agent in agents.items():
         parts: list[dict[Mode, _Part]] = []
@@ -183,7 +199,7 @@ def _compare(
 
 
 def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
-    """Return the results of every mode in one chunk of worlds."""
+    """Let an agent or team drive one chunk of worlds in every mode of the shield, and return the results by mode."""
     several, found = len(task.vehicles) > 1, {}
     alone: dict[Mode, Team] = {"none": Team.of(agent, task.vehicles)}
     if not several:
@@ -205,7 +221,16 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
 
 
 def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task) -> ModeRow:
-    """Return the row of one mode of an agent, from the results of its chunks and the harms under every mode."""
+    """Return the row of an agent in one mode.
+
+    Args:
+        agent: name of the agent.
+        mode: the shield's mode.
+        parts: results of the chunks of worlds in this mode.
+        harm: mode -> harm of the agent in every world [n], to compare this mode with the others.
+        task: the scenario, the controlled vehicles, and the harm that the shield bounds.
+
+    """
 
     def minus(other: Mode) -> Estimate | None:
         return None if mode == other or other not in harm else paired_difference(harm[mode], harm[other])

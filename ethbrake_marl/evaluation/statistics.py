@@ -37,7 +37,7 @@ def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
 
 
 def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
-    """Return whole numbers and powers of two, [n] each, with ``values = whole * 2 ** power``."""
+    """Return integers and powers of two, [n] each, such that ``values = integer * 2 ** power`` exactly."""
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or not np.isfinite(data).all():
         raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], are needed")
@@ -52,7 +52,7 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Exact number, sum and sum of squares of some values; moments of parts can be added in any order.
+    """Number, exact sum and exact sum of squares of some values; moments of parts can be added in any order.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -61,14 +61,19 @@ class Moments:
 
     """
 
-    count: int = 0
-    total: Fraction = Fraction()
-    squares: Fraction = Fraction()
-    negative: int = field(default=0, compare=False)  # number of values that may be negative
+    count: int = 0  # number of values
+    total: Fraction = Fraction()  # sum of the values
+    squares: Fraction = Fraction()  # sum of their squares
+    # Number of negative values. If it is 0, intervals do not reach below 0. For differences (``minus``), whose signs
+    # are not known, it is the number of all values.
+    negative: int = field(default=0, compare=False)
 
     @classmethod
     def of(cls, values: Floats) -> Moments:
-        """Return the moments of ``values`` [n]; raise ``InvalidInput`` unless all are finite."""
+        """Return the moments (number, sum and sum of squares) of ``values`` [n].
+
+        Raises ``InvalidInput`` unless all values are finite.
+        """
         return cls(len(values), exact_sum(values), exact_sum(values, values), int(np.count_nonzero(values < 0.0)))
 
     def __add__(self, other: Moments) -> Moments:
@@ -76,12 +81,15 @@ class Moments:
         return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares, negative)
 
     def minus(self, other: Moments, products: Fraction) -> Moments:
-        """Return the moments of the paired differences; ``products`` is the exact sum of the products of the pairs."""
+        """Return the moments of the differences ``value - other``, paired by world.
+
+        ``products`` is the exact sum over all pairs of ``value * other`` (``exact_sum``).
+        """
         return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares, self.count)
 
     @property
     def mean(self) -> float:
-        """Mean of the values, rounded once; raises ``ZeroDivisionError`` without values."""
+        """Mean of the values: exact, then rounded to a float; raises ``ZeroDivisionError`` without values."""
         return float(self.total / self.count)
 
     @property
@@ -95,29 +103,47 @@ class Moments:
 
     @property
     def estimate(self) -> Estimate:
-        """Mean of at least one value, with the interval ``mean -+ t s / sqrt(n)``; see ``mean``."""
+        """Mean with the interval ``mean -+ t s / sqrt(n)``, as the function ``mean`` returns it.
+
+        Raises ``ZeroDivisionError`` without values.
+        """
         found = self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
         return found if self.negative else of_amounts(found, nothing=not self.squares)
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
-        """Return the standard error of the ratio ``r`` of two paired means, by the delta method.
+        """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
-        The residuals ``values - r others`` have mean 0: ``s(residuals) / (sqrt(n) |mean(others)|)``. With sums S and
-        sums of products Q, ``n (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / (n - 1) / Sy^4`` is its square.
+        The residuals ``values - r * others`` have mean 0, so the error is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. With x the values, y the others, sums S and sums of products
+        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``.
+
+        Args:
+            others: moments of the denominator, in the same worlds.
+            products: exact sum over all pairs of ``value * other``.
+
         """
         n, x, y = self.count, self.total, others.total
         residuals = self.squares * y * y - 2 * x * y * products + x * x * others.squares
         return root(n * residuals / ((n - 1) * y**4))
 
     def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
-        """Return ``relative_decrease`` from the moments of both sides and the exact sum of their products."""
+        """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the baseline's mean is 0.
+
+        Args:
+            baseline: moments of the baseline, in the same worlds.
+            products: exact sum over all pairs of ``value * baseline``.
+
+        """
         if baseline.total == 0:
             return None
         error = self.ratio_error(baseline, products) if self.count > 1 else 0.0
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return ``value`` with the half-width ``t error``, where t has n - 1 degrees of freedom."""
+        """Return the estimate ``value`` with the interval ``value -+ t error``; no interval for a single value.
+
+        ``error`` is the standard error; t has n - 1 degrees of freedom.
+        """
         if self.count < 2:
             return Estimate(value, None)
         half = float(stdtrit(self.count - 1, _UPPER)) * error
@@ -125,10 +151,13 @@ class Moments:
 
 
 def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
-    """Return the estimate of a mean of values that cannot be negative: its interval starts at 0 or above.
+    """Return an estimate of a mean of non-negative values, with its interval cut off below 0.
 
-    If all values are 0 (``nothing``), there is no interval: such a sample bounds the share of worlds with other values
-    (see ``rate``), but not their mean.
+    Args:
+        found: the estimate with the usual interval.
+        nothing: whether all values are 0. Then there is no interval, because such a sample bounds the share of worlds
+            with other values (see ``rate``), but not their mean.
+
     """
     if nothing or found.interval is None:
         return Estimate(found.value, None)
@@ -136,7 +165,7 @@ def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
 
 
 def root(number: Fraction) -> float:
-    """Return the square root of a fraction of at least 0 and of any size, without overflow."""
+    """Return the square root of ``number`` >= 0 as a float, even if ``number`` itself is too large for a float."""
     shift = (number.numerator.bit_length() - number.denominator.bit_length()) // 2
     return math.ldexp(math.sqrt(number / Fraction(4) ** shift), shift)
 
@@ -153,7 +182,13 @@ def rate(successes: int, count: int) -> Estimate:
 
 
 def wilson(p: float, count: int) -> tuple[float, float]:
-    """Return Wilson's score interval of a share ``p`` of ``count`` draws; ``p * count`` need not be a whole number."""
+    """Return the ends (low, high) of Wilson's 95 % score interval of a share.
+
+    Args:
+        p: observed share, 0 to 1; ``p * count`` need not be a whole number.
+        count: number of draws.
+
+    """
     z = float(ndtri(_UPPER))
     shrink = 1.0 + z * z / count
     centre = (p + z * z / (2.0 * count)) / shrink
@@ -174,7 +209,11 @@ def mean(values: Floats) -> Estimate:
 
 
 def paired_difference(values: Floats, baseline: Floats) -> Estimate:
-    """Return the mean of ``values - baseline``, paired by world, with its t interval."""
+    """Return the mean of ``values - baseline`` with its t interval.
+
+    ``values`` and ``baseline`` are [n] each, in the same worlds. Raises ``InvalidInput`` if their lengths differ, or if
+    they are empty or not finite.
+    """
     data, reference, products = _check_pair(values, baseline)
     return data.minus(reference, products).estimate
 
@@ -182,8 +221,16 @@ def paired_difference(values: Floats, baseline: Floats) -> Estimate:
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
     """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    With half-widths ``h = t_(n-1) s``, Welch: ``s^2 = s_1^2 + s_2^2``, and degrees of freedom
-    ``s^4 / (s_1^4 / (n - 1) + s_2^4 / (m - 1))``. There is no interval if one of the two means has none.
+    The half-width of each mean's t interval, divided by its t quantile, is its standard error (``s1``, ``s2``). The
+    difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
+    degrees of freedom. There is no interval if one of the two means has none.
+
+    Args:
+        value: first mean with its interval.
+        n: number of its worlds.
+        baseline: second mean with its interval.
+        m: number of its worlds.
+
     """
     difference = value.value - baseline.value
     if value.interval is None or baseline.interval is None:
@@ -202,17 +249,25 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
 
 
 def relative_decrease(values: Floats, baseline: Floats) -> Estimate | None:
-    """Return ``1 - mean(values) / mean(baseline)``, paired by world; None when the baseline's mean is 0.
+    """Return ``1 - mean(values) / mean(baseline)`` of two arrays [n] in the same worlds, with its interval.
 
-    Interval by the delta method: with ``r`` the ratio of the means, the residuals ``values - r baseline`` have mean 0
-    and the standard error of r is ``s_residual / (sqrt(n) mean(baseline))``.
+    Returns None if the baseline's mean is 0. Interval by the delta method: with ``r`` the ratio of the means, the
+    residuals ``values - r baseline`` have mean 0 and the standard error of r is
+    ``s_residual / (sqrt(n) mean(baseline))``.
     """
     data, reference, products = _check_pair(values, baseline)
     return data.decrease(reference, products)
 
 
 def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
-    """Return ``values`` as an array [n]; raise ``InvalidInput`` unless it is one-dimensional, not empty and finite."""
+    """Return ``values`` as a float array [n]; raise ``InvalidInput`` unless it is one-dimensional, not empty, finite.
+
+    Args:
+        values: the numbers.
+        who: name of the caller, for the message.
+        each: what each number belongs to, for the message: ``world`` or ``seed``.
+
+    """
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
         raise InvalidInput(f"{who}: shape {data.shape}; at least one finite number per {each} is needed, as [n]")
@@ -220,7 +275,7 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
 
 
 def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, Fraction]:
-    """Return the moments of both sides, and the exact sum of their products."""
+    """Return the moments of ``values`` and of ``baseline``, and the exact sum of their products."""
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")

@@ -12,7 +12,7 @@ from ethbrake_marl.evaluation.agent_tally import AgentTally, estimate_all, lower
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
-from ethbrake_marl.evaluation.measures import BASELINE, EPISODE, MEASURE_SETS, contexts_of, every_set, measures
+from ethbrake_marl.evaluation.measure_sets import BASELINE, EPISODE, MEASURE_SETS, contexts_of, every_set, measures
 from ethbrake_marl.evaluation.notes import SEES_THROUGH, Note, notes_of, warnings_of
 from ethbrake_marl.evaluation.outcome import COLUMN
 from ethbrake_marl.evaluation.own_measures import heading_of, registered_measure
@@ -38,17 +38,17 @@ _BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # measures whose
 
 @dataclass(frozen=True, slots=True)
 class RowsBeside:
-    """Rows from another source, such as the paper, that are printed below our table, with notes about them.
+    """Rows from another source, such as the paper, to print below the rows of our own agents."""
 
-    A row is a name with texts by measure; a plain text is the heading of a section.
-    """
-
+    # A row is a pair (name, measure's name -> text of the cell); a plain text is the heading of a section.
     rows: Sequence[str | tuple[str, Mapping[str, str]]]
-    notes: Sequence[Note]
+    notes: Sequence[Note]  # notes about these rows, to print below the table
 
 
 class SummaryTable(list[SummaryRow]):
-    """Rows of ``summarise``: a list that ``print`` and a notebook show as a table.
+    """Results table of an evaluation: a list of one row per agent, which ``print`` and a notebook show as a table.
+
+    ``beside``: rows from another source to print below; None: no such rows.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -78,16 +78,20 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
 
     def meanings(self) -> dict[str, str]:
-        """Return the explanation of each column, by the beginning of its heading; registered measures come last."""
+        """Return the explanations of the columns: heading (up to a comma) -> text.
+
+        Columns with the same beginning, such as "Decrease, total" and "Decrease, first-impact", share one. Measures
+        that the user registered come last, by their names.
+        """
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []
         return _HEAD | about | {metric.name: metric.meaning for metric in own if metric is not None}
 
     def sheet(self) -> Sheet:
-        """Return the table: agent, its knowledge, and every measure that has a heading; registered measures come last.
+        """Return the table with all columns: agent, its knowledge, and every measure that has a heading.
 
-        If the condition of a set of measures holds only in some of the worlds, its means are marked as lower bounds.
-        Rows from other sources stand below.
+        Measures that the user registered come last. Means that are only lower bounds (``SummaryRow.bounds``) are marked
+        ``≥``. Rows from other sources stand below.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -111,7 +115,10 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal of 80 columns or more, with rows from other sources and the conditions."""
+        """Return the table to print in a terminal of 80 columns or more.
+
+        Below it stand rows from other sources, and a text about worlds, intervals and other notes.
+        """
         narrow = self._narrow()
         columns = [
             replace(each, wide=each.name not in narrow, interval="below" if each.name in _BELOW else "hidden")
@@ -125,7 +132,10 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Return the columns of a narrow terminal: the usual ones, and those of the last set that has values."""
+        """Return the names of the measures that a narrow terminal shows.
+
+        These are the usual ones, and the ``narrow`` measures of the last set of measures that has values for them.
+        """
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
@@ -133,13 +143,13 @@ class SummaryTable(list[SummaryRow]):
         return (*_ALWAYS_SHOWN, *last)
 
     def tables(self) -> list[Sheet]:
-        """Return ``terminal`` and, if there are registered measures, a second table with one line for each of them."""
+        """Return the tables to print: ``terminal`` and, if the user registered measures, a second one with these."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]
 
     def markdown(self) -> str:
-        """Return the table for a document, with the conditions of all rows below it."""
+        """Return the table as Markdown, with a text about worlds, intervals and other notes below it."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
 
     def _conditions(self) -> str:
@@ -152,16 +162,19 @@ class SummaryTable(list[SummaryRow]):
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 
     def notes(self) -> list[Note]:
-        """Return the notes below the table, first about our rows, then about rows from other sources."""
+        """Return the notes to print below the table: those about the agents, then those about rows of other sources.
+
+        Each is a pair: kind (``note`` or ``quiet``) and text.
+        """
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
 
 def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """Return one row per agent, in the order of the evaluation.
+    """Return the results table of an evaluation: one row per agent, in the order of the evaluation.
 
     Args:
-        evaluation: evaluation of the agents.
-        baseline: agent to compare with, if it was evaluated.
+        evaluation: outcomes of the agents, from ``evaluate``.
+        baseline: name of the agent to compare with; comparisons are missing if it was not evaluated.
 
     """
     contexts = contexts_of(evaluation)
@@ -190,16 +203,16 @@ def summarise_sums(
     baseline: str = BASELINE,
     **shared: Any,
 ) -> SummaryTable:
-    """Return one row per agent, from sums of the measures over the worlds of a list.
+    """Return the results table, one row per agent, from sums of the measures over the worlds of a list.
 
     Args:
-        tallies: sums of each agent.
-        conditions: conditions of the test.
-        contexts: context of each set of measures.
-        knows: stated knowledge of each agent.
-        policies: SHA-256 of policies, by agent and by the vehicle's name.
-        baseline: agent to compare with.
-        shared: fields of ``SummaryRow`` that all rows have in common.
+        tallies: name of the agent -> sums of its measures.
+        conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
+        contexts: name of a set of measures -> what it prepared for these worlds (``contexts_of``).
+        knows: name of the agent -> its statement of what it knows about the line.
+        policies: name of the agent -> vehicle's name -> SHA-256 of its policy.
+        baseline: name of the agent to compare with.
+        shared: fields of ``SummaryRow`` with the same value in all rows, such as ``worlds_sha256``.
 
     """
     worlds = conditions["count"]

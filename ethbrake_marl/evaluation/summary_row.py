@@ -1,4 +1,4 @@
-"""One agent's row of results: the estimate of every measure over a list of worlds, and how it was computed."""
+"""One agent's row of a results table: the estimate of every measure, and how it was computed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from ethbrake_marl.agents.protocol import Knowledge
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.exploits import MARK, Exploits
-from ethbrake_marl.evaluation.measures import EPISODE, MEASURE_SETS, MeasureSet, RegisteredMeasures
+from ethbrake_marl.evaluation.measure_sets import EPISODE, MEASURE_SETS, MeasureSet, RegisteredMeasures
 from ethbrake_marl.evaluation.outcome import COLUMN, UNSTATED, LeftOut
 from ethbrake_marl.evaluation.own_measures import heading_of
 from ethbrake_marl.files.sheet import Estimate
@@ -19,7 +19,7 @@ from ethbrake_marl.files.sheet import Estimate
 class SummaryRow:
     """Results of one agent over a list of worlds; harms are means per world, m2/s2.
 
-    ``row["harm_decrease_total"]`` is the estimate of a measure, by its name in JSON; None where it does not exist.
+    ``row["harm_decrease_total"]`` is the estimate of the measure with this name in JSON; None if it does not exist.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -32,27 +32,29 @@ class SummaryRow:
 
     agent: str  # name of the agent
     episodes: int  # number of worlds
-    estimates: Mapping[str, Estimate | None]  # estimate of every measure, by its name in JSON
+    estimates: Mapping[str, Estimate | None]  # value and 95 % interval of every measure, by its name in JSON
     collisions: int  # number of worlds with at least one impact
-    horizon_ends: int  # number of worlds still moving at the horizon
-    parameters: Conditions  # conditions of the test
-    policy_share: float | None = None  # share of worlds in which a hybrid drove by its policy
-    more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # fields of sets of measures, by set
-    bounds: frozenset[str] = frozenset()  # measures whose means are lower bounds
+    horizon_ends: int  # number of worlds in which something still moves at the horizon
+    parameters: Conditions  # scenario, seed, controlled vehicles and quantities of the worlds
+    # Share of worlds in which the policy behind a shield drove to the end (``Outcome.chosen_policy``); None: no shield.
+    policy_share: float | None = None
+    # Fields that sets of measures add to the JSON object, by name of the set (``MeasureSet.row``).
+    more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    bounds: frozenset[str] = frozenset()  # names of measures whose means are only lower bounds
     left_out: tuple[LeftOut, ...] = ()  # worlds of the list that could not be advanced; no row counts them
-    knows: Knowledge = UNSTATED  # the agent's stated knowledge of the line
+    knows: Knowledge = UNSTATED  # the agent's statement of what it knows about the line
     hidden_share: float = 0.0  # share of worlds in which the channel hides something from a controlled vehicle
-    worlds_sha256: str = ""  # hash of the list; the same for results on the same worlds
+    worlds_sha256: str = ""  # hash of the worlds; the same for results on the same worlds
     scenario_sha256: str = ""  # hash of everything in the scenario that affects an episode
-    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle -> SHA-256 of its policy
-    versions: Mapping[str, str] = field(default_factory=dict)  # versions of the packages that computed the result
+    policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
+    versions: Mapping[str, str] = field(default_factory=dict)  # package -> version that computed the result
 
     def __getitem__(self, measure: str) -> Estimate | None:
         return self.estimates[measure]
 
     @property
     def collision_rate(self) -> Estimate:
-        """Share of worlds with at least one impact."""
+        """Share, 0 to 1, of worlds with at least one impact."""
         return self.estimates["collision_rate"]  # type: ignore[return-value]  # every agent has it in every world
 
     @property
@@ -67,28 +69,28 @@ class SummaryRow:
 
     @property
     def metrics(self) -> dict[str, Estimate]:
-        """Estimates of registered measures, by column."""
+        """Estimates of the measures that the user registered, by column; a measure by vehicle has ``NAME_1``, ..."""
         found = {name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)}
         return {name: each for name, each in found.items() if each is not None}
 
     @property
     def sees_through(self) -> bool:
-        """Whether the agent knows something that the channel hides in these worlds."""
+        """Whether the agent knows something that the V2X channel hides in these worlds."""
         return self.hidden_share > 0.0 and self.knows.sees_through
 
     @property
     def exploits(self) -> Exploits:
-        """Behaviour of the agent that harm does not count."""
+        """How far the agent shoves Vehicle 1, and how often it still moves at the horizon; harm counts neither."""
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 
     @property
     def marked(self) -> str:
-        """Name of the agent, with a mark if it exploits what harm does not count."""
+        """Name of the agent, followed by ‡ if its behaviour does damage that harm does not count (``exploits``)."""
         return f"{self.agent} {MARK}" if self.exploits.names else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON; missing values are null, intervals are ``[low, high]``."""
+        """Return the agent's object in JSON results; missing values are null, intervals are ``[low, high]``."""
         registered = RegisteredMeasures(n.removeprefix(COLUMN) for n in self.estimates if n.startswith(COLUMN))
         more: dict[str, Any] = {}
         for name, each in MEASURE_SETS.items():
@@ -117,7 +119,10 @@ class SummaryRow:
         }
 
     def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
-        """Return the estimates of one set as JSON entries."""
+        """Return the estimates of one set of measures as JSON entries, values and intervals side by side.
+
+        For instance ``{"total_harm": 37.0, "total_harm_interval": [30.1, 43.9]}``.
+        """
         there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
         optional = {measure.name for measure in of.measures if not measure.always}
         return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})

@@ -1,4 +1,4 @@
-"""Sums over some worlds of a list. Sums of chunks can be added in any order, with the same bits."""
+"""Sums of all agents' measures over some worlds of a list; sums of chunks can be added in any order, bit for bit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from ethbrake_marl.evaluation.agent_tally import AgentTally, tally_agents
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import HASHES, hash_of_chunks
-from ethbrake_marl.evaluation.measures import contexts_of, silent_because
+from ethbrake_marl.evaluation.measure_sets import contexts_of, silent_because
 from ethbrake_marl.evaluation.outcome import LeftOut
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
 from ethbrake_marl.game.harm import HARM_COUNTS
@@ -21,24 +21,28 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Statistics of some worlds of a list; tallies can be added in any order.
+    """Statistics of all agents in some worlds of a list. ``+`` adds those of other worlds of the same list."""
 
-    ``worlds_hash`` is the hash of the worlds as in ``worlds_sha256``.
-    """
-
-    worlds: int = 0  # number of worlds that all agents drove
-    hidden: int = 0  # number of worlds in which the channel hides something from a controlled vehicle
-    worlds_hash: int = 0
-    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)  # smallest and largest of every quantity
-    left_out: tuple[LeftOut, ...] = ()
-    agents: Mapping[str, AgentTally] = field(default_factory=dict)
-    silent: Mapping[str, str | None] = field(default_factory=dict)  # why sets of measures do not apply, by key
+    worlds: int = 0  # number of worlds, without those left out
+    hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle
+    worlds_hash: int = 0  # ``hash_of_chunks`` of the worlds
+    # Smallest and largest value of every quantity, one pair for each vehicle, pair or world, by the quantity's key.
+    ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)
+    left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; nothing else counts them
+    agents: Mapping[str, AgentTally] = field(default_factory=dict)  # sums of each agent's measures, by name
+    # ``MeasureSet.because_key`` -> why that set of measures does not apply; None if it applies.
+    silent: Mapping[str, str | None] = field(default_factory=dict)
 
     @classmethod
     def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
-        """Return the statistics of a part of a list.
+        """Return the statistics of an evaluation of a part of a list.
 
-        ``objectives`` as in ``tally_agents``; ``long_list`` as in ``contexts_of``.
+        Args:
+            part: outcomes of the agents.
+            objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also
+                sum the harm that each vehicle bears, and its value under each objective; None: neither.
+            long_list: omit sets of measures that do not apply to lists of more than 100,000 worlds.
+
         """
         worlds = part.worlds
         if not worlds.n:
@@ -74,7 +78,14 @@ class Tally:
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
-        """Return the mean harm of every agent under these objectives and both counts, as in ``Evaluation.rescore``."""
+        """Return the mean value of every agent under each objective, for each vehicle and both counts of harm.
+
+        Args:
+            objectives: objectives that the tally was computed with, such as ``social:45``, which weighs a vehicle's own
+                harm against the others'.
+            vehicles: number of vehicles, N.
+
+        """
         return Rescores(
             [
                 Rescored(

@@ -29,13 +29,17 @@ TRIED_CANDIDATES = 16  # number of candidates of a script that searches, when a 
 def load_runnable(
     name_or_path: str, settings: Sequence[Override] = (), *, drives: Literal["nobody", "one", "some"] = "nobody"
 ) -> Scenario:
-    """Load a scenario as ``load_scenario`` does, and try its scripts, which the check of the file cannot do.
+    """Load a scenario, and try its scripts in one world, because reading the file does not show whether they can drive.
 
-    ``settings`` override values of the file. ``drives`` says how many vehicles must be learners: ``one``, at least one
-    (``some``), or any number (``nobody``).
+    Args:
+        name_or_path: name of a scenario, or path of a YAML file.
+        settings: settings ``KEY=VALUE`` that override values of the file.
+        drives: number of learners that the scenario must have: exactly one (``one``), at least one (``some``), or any
+            number, also none (``nobody``).
 
     Raises ``InvalidInput`` naming file, line, role and script if no agent can play the script, and if the number of
     learners does not fit ``drives``.
+
     """
     scenario = load_scenario(name_or_path)
     if settings:
@@ -64,12 +68,17 @@ def load_runnable(
 
 
 def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
-    """Drive worlds from the alert on, and count, as plain data, the worlds in which something unusual happens.
+    """Drive ``worlds`` of a scenario to their ends, and count those in which something unusual happens.
 
-    Scripts are used as they are, except that a search has few candidates; learners brake fully. If a command is beyond
-    its vehicle's capacities, each world is driven separately: ``commands_out_of_range`` maps vehicle -> row -> message.
-    ``refused_by`` maps each agent, shield or setting that refuses scripts which depend on the state to its message.
-    Raises ``InvalidInput`` for whatever a script raises, ``PhysicsError`` as ``drive``.
+    The scripts drive (with few candidates if they search); learners brake fully. The result has the keys:
+
+    - ``early_impacts``, ``moving_at_horizon``, ``vehicle_1_late``: number of worlds with an impact before a learner may
+      act, with something moving at the horizon, and with a latency of Vehicle 1;
+    - ``commands_out_of_range``: vehicle -> row -> message, for commands beyond the vehicle's capacities;
+    - ``not_state_free``: vehicle -> script that depends on the state;
+    - ``refused_by``: agent, shield or setting that refuses such scripts -> message.
+
+    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds that cannot be advanced.
     """
     searches = {
         scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
@@ -115,7 +124,10 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Return the agents, shields and settings that refuse the scenario, and why. Each is actually tried."""
+    """Return why agents, shields and settings refuse the scenario: agent's spec, ``+SHIELD`` or setting -> message.
+
+    Each of them is actually tried on ``worlds``.
+    """
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:
         check_agents(

@@ -1,4 +1,4 @@
-"""Differences between the worlds of a list: their initial states, and the quantities that vary."""
+"""Initial states of worlds as table rows, and the quantities that differ between worlds."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
-    """Return the initial state of each world: gaps, speeds, and all columns that the scenario does not fix.
+    """Return the initial state of each world as column -> value: ``{"gap_1_m": 6.6, "speed_1_mps": 19.0, ...}``.
 
-    The distance to an obstacle is None in worlds without one.
+    The columns are all gaps and speeds, and every other quantity that the scenario does not fix. The distance to an
+    obstacle is None in worlds without one.
     """
     fixed = {
         rule.column_of(i)
@@ -35,9 +36,11 @@ _LONGEST_OWNERS = 30  # longest list of vehicle or pair names, in characters
 
 
 def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Floats]]:
-    """Return every quantity that varies between the worlds, by key, in groups with the same bounds.
+    """Return the values of every quantity that varies: ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``.
 
-    Each group maps a short name of its vehicles or pairs, or "" if it contains all of them, to its values [n, entries].
+    The result maps the key of a quantity to its groups, and each group's name to values [n, entries]. A group consists
+    of the vehicles (or pairs) for which the scenario declares the same smallest and largest value. Its name lists them,
+    such as ``vehicle_2``; it is "" if they are all vehicles of the line. Worlds without the quantity are omitted.
     """
     found: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():

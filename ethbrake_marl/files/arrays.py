@@ -42,8 +42,8 @@ _HARMLESS_FLAGS = 0x808  # flags of a zip member: sizes after the data, name in 
 class ArrayHeader(NamedTuple):
     """Type (in the notation of its format) and shape of an array, as its file states them."""
 
-    dtype: str
-    shape: tuple[int, ...]
+    dtype: str  # type of the numbers, such as ``<f8`` (.npy) or ``F32`` (safetensors)
+    shape: tuple[int, ...]  # length of each axis
 
 
 class ArrayRow(NamedTuple):
@@ -52,15 +52,22 @@ class ArrayRow(NamedTuple):
     A letter in ``shape`` is any length, but the same length wherever the letter occurs.
     """
 
-    name: str
-    dtype: str
-    shape: tuple[int | str, ...]
+    name: str  # name of the array
+    dtype: str  # type of its numbers, as in ``ArrayHeader``
+    shape: tuple[int | str, ...]  # such as ``("n", 3)``
 
 
 def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], word: str = "array") -> dict[str, int]:
-    """Check arrays against ``wanted``; return the length of each letter in the shapes.
+    """Check that arrays have the required names, types and shapes; return the length of each letter in the shapes.
 
-    Raises ``ValueError`` naming the first array that is missing, superfluous or different.
+    For example ``{"n": 5}`` if a required shape is ``("n", 3)`` and the array is [5, 3]. Raises ``ValueError`` naming
+    the first array that is missing, superfluous or different.
+
+    Args:
+        found: headers of the arrays in a file, by name.
+        wanted: required arrays.
+        word: what messages call an array.
+
     """
     names = {row.name for row in wanted}
     for name in sorted(names - found.keys()):
@@ -84,7 +91,10 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
 
 
 def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
-    """Return the arrays that a safetensors file declares in its header; raise ``ValueError`` for an invalid file."""
+    """Return name -> type and shape of the arrays that a safetensors file declares in its header.
+
+    ``data``: bytes of the file. Raises ``ValueError`` for an invalid file.
+    """
     length = int.from_bytes(data[:8], "little")
     if not 2 <= length <= min(len(data) - 8, HEADER_LIMIT_BYTES):
         raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)})")
@@ -95,15 +105,20 @@ def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
 
 
 def _lengths(shape: object) -> tuple[int, ...]:
-    """Convert a shape from JSON; an invalid length becomes -1, which never matches."""
+    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which never matches."""
     return tuple(each if type(each) is int else -1 for each in (shape if isinstance(shape, list) else [None]))
 
 
 class ArrayArchive:
-    """An ``.npz`` in memory whose headers have been read; at most ``limit_bytes`` when unpacked.
+    """An ``.npz`` archive in memory, whose headers have been read and checked.
 
     Accepts plain archives as ``numpy.savez`` and ``numpy.savez_compressed`` write them: one disk, no comment, no
     encryption, stored or deflated, every name once. Raises ``ValueError`` for anything else.
+
+    Args:
+        data: bytes of the archive.
+        limit_bytes: largest total size of the unpacked arrays.
+
     """
 
     def __init__(self, data: bytes, limit_bytes: int) -> None:
@@ -120,7 +135,10 @@ class ArrayArchive:
             self._read_header(member)
 
     def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
-        """Check the arrays against ``wanted`` (``check_arrays``) and return them by name, read-only."""
+        """Return the arrays by name, read-only, after checking them against the required arrays ``wanted``.
+
+        Raises ``ValueError`` as ``check_arrays`` does.
+        """
         check_arrays(self.headers, wanted)
         arrays = {}
         for member in self._members:
@@ -156,7 +174,10 @@ def _name(member: zipfile.ZipInfo) -> str:
 
 
 def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
-    """Return type and shape of a ``.npy``, and where its numbers start."""
+    """Return type and shape of a ``.npy``, and the byte at which its numbers start.
+
+    ``name``: name of the array, for messages; ``beginning``: first bytes of the ``.npy``, with the whole header.
+    """
     length = int.from_bytes(beginning[8:10], "little")
     match = _NPY.fullmatch(beginning[10 : 10 + length])
     if beginning[:8] != b"\x93NUMPY\x01\x00" or length > _NPY_HEADER_LIMIT_BYTES or match is None:
@@ -170,7 +191,10 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
 
 
 def _check_directory(data: bytes) -> None:
-    """Check the end of a zip archive before a reader creates an object for every entry of its directory."""
+    """Raise ``ValueError`` unless the end of a zip archive is plain and its directory is small.
+
+    This is checked before a reader creates an object for every entry of the directory.
+    """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
         raise ValueError("not a plain .npz archive")
     disk, first_disk, here, members, size, start, comment = struct.unpack("<4H2LH", data[-18:])
@@ -182,7 +206,7 @@ def _check_directory(data: bytes) -> None:
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Context manager: turn every error of the zip reader in a damaged archive into ``ValueError``."""
+    """Context manager: an error of the zip reader that is raised in the block becomes a ``ValueError``."""
     try:
         yield
     except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, OverflowError) as error:

@@ -14,24 +14,27 @@ class FileSchema(GenerateJsonSchema):
     """JSON Schema generator for files, in which an unused key is left out and never ``null``."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
-        """Return the schema of the value that is not null."""
+        """Return the JSON schema of an optional value without ``null`` (pydantic's hook)."""
         return self.generate_inner(schema["schema"])
 
     def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
-        """Return the usual schema, but without ``"default": null``."""
+        """Return the JSON schema of a value with a default, but without ``"default": null`` (pydantic's hook)."""
         described = super().default_schema(schema)
         return {key: value for key, value in described.items() if key != "default" or value is not None}
 
     @staticmethod
     def publish(schema: dict[str, Any]) -> dict[str, Any]:
-        """Return the schema with its dialect as the first key, ready to be printed or shipped."""
+        """Return the schema, ready to be printed or shipped: with the JSON Schema version (``$schema``) first."""
         return {"$schema": DIALECT, **schema}
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Return the comment in a new file that names its schema, and the command that prints the schema.
+    """Return a comment for a new YAML file that names its JSON schema, and the command that prints the schema.
 
-    ``kind``: ``scenario`` or ``recipe``.
+    Args:
+        kind: ``scenario`` or ``recipe``.
+        command: subcommand of ``ethbrake`` that prints the schema, such as ``scenario schema``.
+
     """
     return (
         f"# yaml-language-server: $schema={kind}.schema.json\n"

@@ -41,7 +41,10 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
-    """Base class of the content of a file: immutable; unknown keys and wrong types are errors."""
+    """Base class of pydantic models of a file's content: immutable; unknown keys and wrong types are errors.
+
+    A subclass declares a field for each key.
+    """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
@@ -52,25 +55,42 @@ UNSHOWN = object()  # marker: do not show the value in the message
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise the error for ``value`` at path ``at`` inside the checked field; ``right`` says what would be right."""
+    """Raise the error for an invalid value in a pydantic validator.
+
+    Args:
+        at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.
+        value: the value, shown in the message; ``UNSHOWN``: do not show it.
+        right: what would be valid, for example ``must be above 0``.
+
+    """
     shown = "" if value is UNSHOWN else flow_text(value, 60)
     raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
 
 
 def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
-    """Raise the error of ``refuse`` unless ``holds`` is true."""
+    """Raise the error of ``refuse(at, value, right)`` unless ``holds`` is true."""
     if not holds:
         refuse(at, value, right)
 
 
 class Wording:
-    """Texts for error messages about one kind of file; subclasses add what they know about its keys."""
+    """Texts for error messages about one kind of file.
+
+    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` to say more about the keys of this file.
+
+    A *path* is the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
+
+    Args:
+        model: the pydantic model of the file.
+        needed: text that says what a missing key needs.
+
+    """
 
     def __init__(self, model: type[BaseModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Return the keys that are allowed at the end of ``path``."""
+        """Return the names of the keys that are allowed at the end of ``path`` (keys and indices inside the file)."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -78,27 +98,39 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Return what is needed at ``path`` if it is missing."""
+        """Return a text that says what is needed at ``path`` (keys and indices inside the file), if it is missing."""
         return self._needed
 
     def instead(self, key: str) -> str:
-        """Return what replaces an unknown key; empty if nothing is known about it."""
+        """Return a text that says what replaces the unknown ``key``; empty if nothing is known about it."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Return whose value is at ``path``, in words; empty if that is obvious."""
+        """Return the vehicle or pair that the value at ``path`` belongs to, in words; empty if that is obvious.
+
+        ``path``: keys and indices inside the file.
+        """
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return what would be right, if only this kind of file knows; otherwise empty."""
+        """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
+
+        Empty if a general message says enough.
+        """
         return ""
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """Return the error for a document that does not fit its schema.
+    """Return the ``InvalidInput`` for a document that does not fit its schema.
 
-    It shows the first mistake, unknown keys before all others, and counts the rest: "(and k more mistakes)". A missing
-    key that an unknown key was probably meant to be is not counted.
+    It shows the first mistake, unknown keys before all others, and counts the rest: "(and k more mistakes)". If an
+    unknown key is probably the misspelt name of a missing key, only the unknown key counts.
+
+    Args:
+        document: the parsed file, which knows the line of each value.
+        error: pydantic's error for its content.
+        wording: texts about this kind of file.
+
     """
     # A default that depends on a field with an error is no further mistake.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
@@ -122,9 +154,16 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
-    """Read a file or document into ``model``; raise ``InvalidInput`` with file, line, key, value and what is right.
+    """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
 
-    ``advice`` says what the file must contain if it is not a mapping.
+    The message names file, line, key and value, and says what would be valid.
+
+    Args:
+        source: path of the file, or the parsed document.
+        model: pydantic model of the content.
+        wording: texts about this kind of file.
+        advice: what the file must contain, for the message if it is not a mapping.
+
     """
     document = source if isinstance(source, Document) else read_yaml(source)
     if not isinstance(document.content, dict):
@@ -136,7 +175,10 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """Return plain content and model of a JSON file from a program; raise ``ValueError`` with a one-line reason."""
+    """Parse a JSON file that a program wrote; return its plain content, and the content as ``model``.
+
+    ``data``: the bytes of the file. Raises ``ValueError`` with a one-line reason for invalid content.
+    """
     content = parse_strict_json(data)  # no key twice, no NaN
     try:
         return content, model.model_validate_json(data)
@@ -148,22 +190,25 @@ class Mistake(NamedTuple):
     """The first error that pydantic found in data from a program; its text is ``place: right``."""
 
     place: str  # keys joined by dots; empty for the whole
-    given: Any
-    right: str
+    given: Any  # the invalid value
+    right: str  # what would be valid
 
     def __str__(self) -> str:
         return f"{self.place}: {self.right}" if self.place else self.right
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Return the first mistake: for files that programs write, and for settings in code."""
+    """Return the first mistake that pydantic found, for files that programs write and for settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
-    """Return the path inside the file, without pydantic's tags and including the path that a check reports."""
+    """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
+
+    Pydantic's tags are left out; the path that ``refuse`` reports is appended.
+    """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
 
@@ -185,7 +230,10 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Format the value, unless the whole file is meant; a float instead of a whole number keeps its decimal point."""
+    """Format the invalid value for the message; empty if the whole file is meant.
+
+    A float instead of a whole number keeps its decimal point.
+    """
     given = detail["input"]
     if isinstance(given, BaseModel) or not detail["loc"]:
         return ""
@@ -199,7 +247,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """Return what would be right for a number in quotes; empty for anything else."""
+    """Return advice for a number that stands in quotes and so is a text; empty for any other mistake."""
     given = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""
@@ -230,7 +278,8 @@ def _right(detail: ErrorDetails) -> str:
 def suggestion(key: str, known: Iterable[str]) -> str:
     """Return "did you mean ...?" for an unknown ``key``; empty if no known key is close.
 
-    A key that differs from a known one only in its unit is recognised: ``gaps_km``, ``mass``.
+    ``known``: the valid keys. A key that differs from one of these only in its unit is recognised: ``gaps_km``,
+    ``mass``.
     """
     names = sorted(known)
     stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}

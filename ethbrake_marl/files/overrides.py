@@ -13,7 +13,7 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One setting: its path and its value."""
+    """One setting from the command line, such as ``reward.harm=0.5``: its path and its value."""
 
     text: str  # the setting as written
     path: tuple[str, ...]  # keys from the outermost on; for a list the index, from 0
@@ -21,21 +21,21 @@ class Override:
 
     @property
     def top(self) -> str:
-        """The outermost key."""
+        """The outermost key: ``reward`` for ``reward.harm=0.5``."""
         return self.path[0]
 
     @property
     def key(self) -> str:
-        """The path as written."""
+        """The path with dots, as written: ``reward.harm`` for ``reward.harm=0.5``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """Return the setting without its outermost key."""
+        """Return the setting without its outermost key: ``harm=0.5`` for ``reward.harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
     def parse(texts: Sequence[str]) -> list[Override]:
-        """Parse ``key.path=value``, each key once; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
+        """Parse settings ``key.path=value``; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
 
         Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated key, and a value that is not valid
         YAML.
@@ -53,9 +53,11 @@ class Override:
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Return outermost key -> new value for the changed keys of ``content``, which is not changed itself.
+        """Apply settings to plain data; return the changed top-level keys with their new values.
 
-        Raises ``InvalidInput`` for a path into a value that is neither a mapping nor a list.
+        ``content`` itself is not changed. With ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting
+        ``reward.harm=2`` the result is ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` for a path into a value
+        that is neither a mapping nor a list.
         """
         changed: dict[str, Any] = {}
         for override in overrides:
@@ -66,7 +68,10 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Return ``part`` with the value inserted at ``path``."""
+    """Return a copy of ``part`` (a mapping, list or other value) with the value of ``override`` at ``path`` inside it.
+
+    ``path``: the last keys of ``override.path``; ``()``: the value replaces ``part``. A missing mapping is created.
+    """
     if not path:
         return override.value
     key, rest = path[0], path[1:]

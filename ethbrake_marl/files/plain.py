@@ -25,9 +25,16 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """Return the content of a plain file of at most ``limit_bytes``; raise ``refusal`` like ``open_plain``.
+    """Return the content of a plain file of at most ``limit_bytes``; raise ``refusal`` if it cannot be read.
 
     The limit also holds for a file that grows while it is read.
+
+    Args:
+        path: path of the file.
+        limit_bytes: largest accepted size.
+        refusal: class of the error to raise, with path and reason; see ``open_plain``.
+        follow_links: whether a symbolic link is accepted.
+
     """
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = _read(stream.fileno(), limit_bytes + 1)
@@ -44,12 +51,19 @@ def open_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> Iterator[BufferedReader]:
-    """Open a plain file of at most ``limit_bytes`` for reading.
+    """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
 
     Kind and size are checked before anything is opened, so a pipe or device is never opened. Nothing waits for a
     writer, and no device is affected. If the file is replaced in between, the new one is opened without waiting and
-    checked again. Raises ``refusal`` with path and reason: it does not exist, is a folder, device or pipe, is too
-    large, cannot be read (also inside the block), or is a symbolic link although ``follow_links`` is off.
+    checked again.
+
+    Args:
+        path: path of the file.
+        limit_bytes: largest accepted size.
+        refusal: class of the error to raise, with path and reason: the file does not exist, is a folder, device or
+            pipe, is too large, or cannot be read (also inside the block).
+        follow_links: whether a symbolic link is accepted.
+
     """
     file = Path(path)
     try:
@@ -71,7 +85,7 @@ def open_plain(
 
 
 def _read(descriptor: int, most_bytes: int) -> bytes:
-    """Read up to ``most_bytes``; raise ``OSError`` if reading would have to wait."""
+    """Read up to ``most_bytes`` from a file descriptor; raise ``OSError`` if reading would have to wait."""
     parts: list[bytes] = []
     while most_bytes > 0 and (part := os.read(descriptor, min(most_bytes, 1 << 20))):
         parts.append(part)
@@ -96,7 +110,7 @@ def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> Et
 
 
 def parse_strict_json(data: bytes) -> Any:
-    """Parse JSON; raise ``ValueError`` with a one-line reason for anything ambiguous or outside the standard."""
+    """Parse UTF-8 JSON; raise ``ValueError`` with a one-line reason for repeated keys, NaN or invalid text."""
     try:
         return json.loads(
             data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_not_a_number, parse_float=_finite

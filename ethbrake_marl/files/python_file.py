@@ -25,10 +25,11 @@ _READ: dict[str, set[str]] = {}
 
 
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
-    """Return an object that a Python file defines. The file is run, once, and can do whatever you can do.
+    """Run a Python file, once per process, and return the object ``name`` that it defines. The file can do anything.
 
-    The SHA-256 of the file ``reads`` that it uses, such as weights, is recorded if it exists. Raises ``InvalidInput``
-    for a file that is missing, raises an error (with its line), was changed since it ran, or does not define ``name``.
+    ``reads`` is the path of a file that it uses, such as weights; its SHA-256 is recorded if the file exists. Raises
+    ``InvalidInput`` for a Python file that is missing, raises an error (with its line), was changed since it ran, or
+    does not define ``name``.
     """
     _, module = _run_file(Path(path), f"file {path!r}")
     if not hasattr(module, name):
@@ -45,7 +46,7 @@ def file_sha256(path: Path) -> str:
 
 
 def files_run() -> dict[str, str]:
-    """Return name -> SHA-256 of every file that this process ran or recorded for an agent.
+    """Return name -> SHA-256 of every Python file that this process ran, and of the files that these read.
 
     If several files have the same name, their hashes are joined by commas.
     """
@@ -56,7 +57,10 @@ def files_run() -> dict[str, str]:
 
 
 def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
-    """Return SHA-256 and module of a file; run it unless it ran before."""
+    """Return SHA-256 and module of a Python file; run it unless it ran before.
+
+    ``what``: how error messages name the file.
+    """
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'there is no such file'}")
     content = read_plain(path, _LIMIT_BYTES)
@@ -69,7 +73,17 @@ def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
-    """Run the content of a file as a module; the module is registered so that its classes can be pickled."""
+    """Run the content of a Python file as a new module, and return the module.
+
+    The module is registered in ``sys.modules`` so that its classes can be pickled.
+
+    Args:
+        content: bytes of the file.
+        path: its resolved path.
+        sha256: hash of the content, used in the module's name.
+        what: how error messages name the file.
+
+    """
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     if path in _BEING_RUN:

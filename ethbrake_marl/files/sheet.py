@@ -27,16 +27,23 @@ WIDE = 120  # width of a terminal (characters) from which on every column is sho
 class Estimate:
     """A value and its confidence interval; the interval is None if the data do not allow one (a single world)."""
 
-    value: float
-    interval: tuple[float, float] | None
+    value: float  # the estimate itself
+    interval: tuple[float, float] | None  # low and high end
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The interval; the value twice if there is none."""
+        """Low and high end of the interval; the value twice if there is none."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Format value and interval, each multiplied by ``scale``: ``24.19 [23.85, 24.53]``."""
+        """Format value and interval as text: ``24.19 [23.85, 24.53]``.
+
+        Args:
+            digits: digits after the decimal point.
+            scale: factor that all numbers are multiplied by, for example 100 for per cent.
+            unit: text directly after the value.
+
+        """
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
@@ -45,7 +52,10 @@ class Estimate:
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Return estimates as flat plain data: ``{name: value, name_interval: [low, high]}``; missing ones are null."""
+        """Return estimates by name as flat plain data: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
+
+        A missing estimate becomes None under both keys.
+        """
         found: dict[str, Any] = {}
         for name, estimate in estimates.items():
             told = {"value": None, "interval": None} if estimate is None else estimate.to_json()
@@ -54,9 +64,9 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """A cell as text."""
+    """A cell of a table as text: its value, and the interval of an estimate."""
 
-    value: str
+    value: str  # the number, with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
 
     @property
@@ -75,11 +85,11 @@ class Column:
     Whole numbers and texts are written unchanged.
     """
 
-    heading: str
+    heading: str  # heading in documents
     key: str = ""  # name in CSV and JSON; "": the heading
-    digits: int = 2
-    scale: float = 1.0
-    unit: str = ""
+    digits: int = 2  # digits after the decimal point
+    scale: float = 1.0  # numbers are multiplied by this
+    unit: str = ""  # text directly after the number
     sign: Literal["z", "+"] = "z"  # format option: "z" never shows -0.00, "+" always shows a sign
     text: bool = False  # left-aligned, and wrapped in a narrow terminal
     short: str = ""  # heading in a terminal; "": the heading
@@ -92,7 +102,7 @@ class Column:
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
-        """Format a cell of this column."""
+        """Format a cell of this column as text: a number, estimate or text; None is shown as a dash."""
         if cell is None or isinstance(cell, Shown):
             return cell or Shown(DASH)
         if isinstance(cell, str | int):
@@ -127,10 +137,10 @@ class Sheet:
 
     """
 
-    title: str
-    columns: Sequence[Column | str]
-    rows: Sequence[Row]
-    note: str = ""
+    title: str  # "": no title
+    columns: Sequence[Column | str]  # a string: a column of texts with this heading
+    rows: Sequence[Row]  # a sequence of cells, or a string that begins a section
+    note: str = ""  # text below the table
     gap: Literal[1, 2, 3] = 3  # spaces between two columns in a terminal
 
     def _columns(self) -> list[Column]:
@@ -147,7 +157,7 @@ class Sheet:
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Yield each row as formatted cells, one per column; a section is yielded as its name."""
+        """Yield each row as a tuple of formatted cells, one per column; a section is yielded as its name (a string)."""
         columns = self._columns()
         for row in self.rows:
             if isinstance(row, str):
@@ -163,16 +173,16 @@ class Sheet:
         return replace(self, columns=[self.columns[k] for k in kept], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the indices of the columns in which some row has a value; without rows, of all columns."""
+        """Return the indices of the columns in which some row has a value; without rows, all indices."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
     def rich(self, width: int = WIDE) -> RenderableType:
-        """Return the table for a terminal of this width, with the note below.
+        """Return the table as an object for ``rich``, for a terminal of ``width`` characters, with the note below.
 
-        Lines of a cell after the first are dim.
+        Lines of a cell after the first are dim. Columns marked ``wide`` are left out of a narrow terminal.
         """
         from rich import box
         from rich.console import Group
@@ -209,7 +219,10 @@ class Sheet:
         yield self.rich(options.max_width)
 
     def markdown(self) -> str:
-        """Return the table as Markdown, without title and note; rows of a section begin with its name."""
+        """Return the table as Markdown, without title and note.
+
+        Markdown has no sections: the first cell of each row begins with the name of its section, ``Section: cell``.
+        """
         columns, section = self._columns(), ""
         lines = [[column.heading for column in columns], ["---" if column.text else "---:" for column in columns]]
         for row in self.shown():
@@ -281,9 +294,14 @@ def terminal_text(*shown: RenderableType) -> str:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Return the rows as CSV text with the given ``columns``, or with all, in the order in which they appear.
+    """Return rows, each a mapping of column names to values, as CSV text with a header line.
 
     The interval of ``x``, in ``x_interval``, becomes ``x_low`` and ``x_high``. None and missing values are empty.
+
+    Args:
+        rows: the rows.
+        columns: names of the columns to write, in order, after intervals are split; None: all, in order of appearance.
+
     """
     flat: list[dict[str, Any]] = []
     for row in rows:
@@ -307,11 +325,16 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = 
 def parquet_file(
     path: Path, *, told: Callable[[], Mapping[str, str]] | None = None, **options: Any
 ) -> Iterator[Callable[..., None]]:
-    """Context manager: write a Parquet file with ``add(columns)``, which it yields.
+    """Context manager: write a Parquet file with the function ``add(columns)``, which it yields.
 
-    The file appears only if the block ends without error. ``add`` appends arrays by column name; ``together`` keeps
-    them in one row group. ``told`` is called at the end and returns metadata. ``options`` are those of
-    ``pyarrow.parquet.ParquetWriter``. Raises ``MissingExtra`` without pyarrow.
+    ``add`` appends arrays of equal length by column name; ``together=True`` keeps them in one row group. The file
+    appears only if the block ends without error. Raises ``MissingExtra`` without pyarrow.
+
+    Args:
+        path: the file.
+        told: called at the end of the block; returns metadata for the file. None: no metadata.
+        **options: options of ``pyarrow.parquet.ParquetWriter``.
+
     """
     with naming_extras():
         import pyarrow
@@ -339,7 +362,7 @@ def parquet_file(
 def _html(value: object) -> str:
     """Escape a value for HTML; control and direction characters are shown as Python escapes.
 
-    An object with ``__html__`` supplies its own HTML.
+    An object with a method ``__html__`` supplies its own HTML.
     """
     known: Callable[[], str] | None = getattr(value, "__html__", None)
     return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

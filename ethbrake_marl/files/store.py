@@ -1,4 +1,4 @@
-"""Atomic writing: files and folders appear completely or not at all, even after a crash; locks end with the process."""
+"""Atomic writing: files and folders appear completely or not at all, even after a crash. Locks end with the process."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ def write_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Context manager: yield a temporary file that replaces ``path`` if the block succeeds and is deleted otherwise."""
+    """Context manager: yield the path of a temporary file that replaces ``path`` if the block succeeds.
+
+    Otherwise the temporary file is deleted.
+    """
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
     os.close(descriptor)
     partial = Path(name)
@@ -51,11 +54,10 @@ def check_writable(folder: Path) -> None:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check that a file may be written; return its path.
+    """Check that the file ``path`` may be written; return it as a ``Path``. Call this before long work.
 
     Raises ``AlreadyExists`` for an existing file unless ``force``; ``InvalidInput`` if it cannot be written. Even
-    ``force`` replaces plain files only, not a folder, device, pipe or symbolic link. Call it before long work that ends
-    in this file.
+    ``force`` replaces plain files only, not a folder, device, pipe or symbolic link.
     """
     target = Path(path)
     try:
@@ -81,8 +83,8 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
     """Check that ``path`` can be a folder for results, without creating anything.
 
-    Raises ``InvalidInput`` if it is not a folder or cannot be written to; ``AlreadyExists`` if it contains one of
-    ``files``, unless ``force``.
+    Raises ``InvalidInput`` if it is not a folder or cannot be written to; ``AlreadyExists`` if it already contains one
+    of the file names in ``files``, unless ``force``.
     """
     try:
         places = (path, *path.absolute().parents)
@@ -100,7 +102,10 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write ``data`` to ``path`` in one step; raise like ``check_target``."""
+    """Write ``data`` to ``path`` in one step; ``force`` replaces an existing file.
+
+    Raises ``AlreadyExists`` or ``InvalidInput`` like ``check_target``.
+    """
     write_file(check_target(path, force=force), data)
 
 
@@ -137,7 +142,7 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Move a folder out of the way in one step, then delete it."""
+    """Delete the folder ``path``, after renaming it, so that no half-deleted folder has its name."""
     aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
     path.rename(aside / path.name)
     shutil.rmtree(aside)
@@ -156,7 +161,8 @@ def remove_unfinished(folder: Path) -> None:
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
     """Context manager: hold the lock file ``lock`` while the block runs.
 
-    Raises ``InvalidInput`` if another process holds it (``other`` is the message) or the file cannot be used as a lock.
+    Raises ``InvalidInput`` if another process holds it, or if the file cannot be used as a lock. ``other``: reason in
+    the message in the first case.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:
@@ -187,7 +193,7 @@ def _folder_to_disk(path: Path) -> None:
 
 
 def _umask() -> int:
-    """Return the permissions that new files do not get; temporary files are private until they are renamed."""
+    """Return the permission bits that new files do not get. Temporary files are private until they are renamed."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

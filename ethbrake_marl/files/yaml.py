@@ -32,8 +32,8 @@ _RESERVED = {"null", "true", "false"}
 def flow_text(value: Any, longest: int | None = None) -> str:
     """Write ``value`` in YAML's flow style, so that reading it back gives an equal value.
 
-    Supports printable text, lists, mappings with text keys, finite or infinite numbers, true, false and null. A text
-    longer than ``longest`` characters is cut off (for messages only).
+    Supports printable text, lists, mappings with text keys, finite or infinite numbers, true, false and null.
+    ``longest``: number of characters after which the text is cut off, for messages only; None: never.
     """
     text = _flow(value)
     return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
@@ -86,27 +86,40 @@ _LARGEST_INTEGER = 2**63
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """Content of a file, and the line of each value."""
+    """Content of a YAML file, and the line of each value.
 
-    file: str
+    A *path* is the keys and indices that lead to a value: ``("roles", "vehicle_2")``; ``()`` is the whole content.
+    """
+
+    file: str  # path or name of the file, for messages
     content: Any  # dict, list, str, int, float, bool or None, nested
     lines: Mapping[YamlPath, int]  # path of a value -> its line, from 1
 
     def line_of(self, path: YamlPath) -> int | None:
-        """Return the line of the value at ``path``, or of the innermost existing value around it; None if unknown."""
+        """Return the line (from 1) of the value at ``path``; None if it is unknown.
+
+        ``path``: keys and indices that lead to the value. If there is no such value, the line of the innermost value
+        around it is returned.
+        """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return self.lines[path[:length]]
         return None
 
     def where(self, path: YamlPath) -> str:
-        """Return file and line of ``path``, as the beginning of a message."""
+        """Return file and line of the value at ``path`` (keys and indices), as the beginning of a message.
+
+        For example ``my.yaml, line 7``.
+        """
         line = self.line_of(path)
         return self.file if line is None else f"{self.file}, line {line}"
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Context manager: prefix an ``InvalidInput`` from the block with file and line of ``path``."""
+        """Context manager: an ``InvalidInput`` raised in the block is raised again, beginning with file and line.
+
+        The line is that of the value at ``path``: keys and indices that lead to it.
+        """
         try:
             yield
         except InvalidInput as error:
@@ -122,7 +135,16 @@ def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
-    """Parse one YAML document; ``file`` is its name in messages. Raises like ``read_yaml``."""
+    """Parse one YAML document.
+
+    Args:
+        text: the document, text or UTF-8 bytes.
+        file: name of the document in messages.
+        limit: largest accepted size in bytes.
+
+    Raises ``InvalidInput`` with file, line, column and reason for every defect.
+
+    """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if len(data) > limit:
         _fail(file, None, f"larger than {limit // 1024} KiB, the limit for these files")
@@ -190,7 +212,7 @@ class _Reader:
         _fail(self.file, self.at, reason)
 
     def _value(self, event: Any, path: YamlPath) -> Any:
-        """Return the value at ``path`` that begins with this event."""
+        """Return the value that begins with the YAML event ``event`` and belongs at ``path``."""
         self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
         if isinstance(event, yaml.ScalarEvent):
@@ -231,7 +253,10 @@ class _Reader:
         return key
 
     def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
-        """Convert a scalar by the core schema of YAML 1.2; a quoted or block scalar is always text."""
+        """Convert the scalar of a YAML event by the core schema of YAML 1.2.
+
+        A quoted or block scalar is always text.
+        """
         text = str(event.value)
         if not event.implicit[0]:
             return text

@@ -18,10 +18,10 @@ LARGEST = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # 1 plus one fl
 
 
 def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Floats:
-    """Return the action as float64 of ``shape``; raise ``InvalidInput`` unless it has that shape and is in [-1, 1].
+    """Return the action as float64 of ``shape``; raise ``InvalidInput`` unless it fits and is in [-1, 1].
 
     Axes of length 1 may be missing or added: a single action may be a number, [1] or [1, 1]. Rounding in a network can
-    exceed the bounds by one float32 step; such a value counts as -1 or 1.
+    exceed the bounds by one float32 step; such a value counts as -1 or 1. ``names`` names the vehicles in the message.
     """
     given = _numbers(action, names)
     if given.shape != shape and _longer_axes(given.shape) != _longer_axes(shape):
@@ -35,9 +35,10 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str) -> Flo
 
 
 def own_actions(actions: ArrayLike, names: str) -> NDArray[Any]:
-    """Return a copy of the actions; raise ``InvalidInput`` for values that are not numbers.
+    """Return a copy of the actions as an array, which later changes by the caller do not affect.
 
-    The values of a NumPy array are not checked.
+    Raises ``InvalidInput`` for a list or tensor with values that are not numbers; a NumPy array is copied unchecked.
+    ``names``: names of the vehicles, for the message.
     """
     return actions.copy() if isinstance(actions, np.ndarray) else _numbers(actions, names).copy()
 
@@ -54,33 +55,56 @@ def _longer_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
-    """Return the acceleration that one vehicle's action [n] in [-1, 1] commands, [n] m/s2."""
+    """Return the acceleration that an action commands, [n] m/s2.
+
+    Args:
+        action: actions of one vehicle, [n] in [-1, 1].
+        vehicles: parameters of the n worlds, with the capacities.
+        vehicle: index of the vehicle, from 0.
+
+    """
     braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
     return commands_of(np.ascontiguousarray(action, np.float64), braking, driving)
 
 
 def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
-    """Return the action [n] for ``command_mps2`` [n]; clipped to [-1, 1], 0 if the capacity is 0."""
+    """Return the action that commands an acceleration, [n]; clipped to [-1, 1], and 0 if the capacity is 0.
+
+    Args:
+        command_mps2: commanded accelerations of one vehicle, [n] m/s2.
+        vehicles: parameters of the n worlds, with the capacities.
+        vehicle: index of the vehicle, from 0.
+
+    """
     braking, driving = vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
     return _actions(np.ascontiguousarray(command_mps2, np.float64), braking, driving)
 
 
 @compiled
 def command_of(action: float, braking: float, driving: float) -> float:
-    """Return the commanded acceleration (m/s2) for an action and the two capacities (m/s2)."""
+    """Return the commanded acceleration (m/s2) for an action in [-1, 1].
+
+    ``braking`` and ``driving`` are the largest deceleration and acceleration of the vehicle (m/s2).
+    """
     return action * braking if action < 0.0 else action * driving
 
 
 @compiled
 def action_of(command: float, braking: float, driving: float) -> float:
-    """Return the action for a command (m/s2); clipped to [-1, 1], 0 if the capacity is 0."""
+    """Return the action for a command (m/s2); clipped to [-1, 1], and 0 if the capacity is 0.
+
+    ``braking`` and ``driving`` are the largest deceleration and acceleration of the vehicle (m/s2).
+    """
     capacity = braking if command < 0.0 else driving
     return min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
 
 
 @compiled
 def commands_of(action: Floats, braking: Floats, driving: Floats) -> Floats:
-    """``command_of`` in every world, [n] m/s2."""
+    """Return the commanded acceleration for the action in every world, [n] m/s2.
+
+    ``action`` [n] is in [-1, 1]; ``braking`` and ``driving`` [n] are the capacities of the vehicle (m/s2).
+    """
     command = np.empty(action.shape[0])
     for k in range(action.shape[0]):
         command[k] = command_of(action[k], braking[k], driving[k])

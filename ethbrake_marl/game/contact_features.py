@@ -35,11 +35,12 @@ _FAR = len(CONTACT_SIDES) + _HARMS  # number of contact_far features per command
 
 
 class Contacts(NamedTuple):
-    """The contact features to compute, and their scaling."""
+    """Which contact features to compute, and their scaling."""
 
-    time_step_s: float  # time between two decisions
+    time_step_s: float  # time between two decisions (s)
     commands: Ints  # commands to forecast, as indices into CONTACT_COMMANDS
-    features: Floats  # 1 / scale, low, high of every contact feature: [3, 30], or [3, 42] with contact_far
+    # [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high; a column per contact feature
+    features: Floats
 
 
 @compiled
@@ -47,7 +48,19 @@ def observe_contacts(
     state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
     out: NDArray[np.float32], failed: Bools,
 ) -> None:  # fmt: skip
-    """Fill ``out`` [n, observers, features] with contact features, and ``failed`` [n] where the kernel failed."""
+    """Fill ``out`` [n, observers, features] with contact features, and set ``failed`` [n] where the kernel failed.
+
+    Args:
+        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows.
+        observers: indices of the observing vehicles.
+        time_step: time between two decisions, s.
+        commands: commands to forecast, as indices into CONTACT_COMMANDS.
+        features: scaling, [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high, a column per feature.
+        out: result; columns of commands that are not forecast stay as they are.
+        failed: set to True where a check of the kernel failed, [n].
+
+    """
     of = columns(state)
     N, at = (
         of.vehicles,
@@ -86,10 +99,19 @@ def observe_contacts(
 
 @compiled
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
-    """Write world k, as vehicle i knows it, into a table; return the first and last column that i knows.
+    """Write the part of a world that a vehicle knows into a table; return the first and last column that it knows.
 
-    Unknown vehicles are placed far away, and so are those of which a piece is missing that a forecast needs. If an
+    Unknown vehicles are placed far away, and so are those of which a piece is unknown that a forecast needs. If an
     obstacle is known, it is the first column.
+
+    Args:
+        table: table to fill, in the layout of ``physics.rows``, [rows, N + at].
+        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows.
+        k: row of the world.
+        i: index of the vehicle.
+        at: 1 if the rows have an obstacle, which is then column 0 of the table; otherwise 0.
+
     """
     of = columns(state)
     N, speed, command, gap, obstacle = of.vehicles, of.speed, of.command, of.gap, of.obstacle
@@ -131,9 +153,20 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
 
 @compiled
 def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_step: float, value: Floats) -> None:
-    """Compute the unscaled features of one forecast; 0 for a pair whose other vehicle is unknown or does not exist.
+    """Compute the unscaled contact features of one forecast into ``value``.
 
-    An impact at the very end of a decision step belongs to that step, as in the engine.
+    A feature is 0 for a pair whose other vehicle is unknown or does not exist. An impact at the very end of a decision
+    step belongs to that step, as in the engine.
+
+    Args:
+        table: the world after the forecast, in the layout of ``physics.rows``.
+        found: next impact of each pair, as ``forecast_contacts`` wrote it.
+        own: column of the observing vehicle.
+        first: first column that the vehicle knows.
+        last: last column that it knows.
+        time_step: time between two decisions, s.
+        value: result.
+
     """
     for side in range(2):
         p, at = own - 1 + side, side * _OF_PAIR

@@ -10,11 +10,11 @@ from ethbrake_marl.physics.state import Worlds
 
 
 class Drawn(Protocol):
-    """Worlds drawn from a game."""
+    """What ``Game.sample`` returns: an object with the drawn worlds in ``worlds``, such as a ``Sample``."""
 
     @property
     def worlds(self) -> Worlds:
-        """The drawn worlds [n], at the alert."""
+        """The drawn worlds [n], at the alert (time 0)."""
 
 
 class Game(Protocol):
@@ -38,7 +38,7 @@ class Game(Protocol):
 
     @property
     def scripts(self) -> Mapping[int, str]:
-        """The agent that drives each vehicle that does not learn, by index."""
+        """Name of the agent that controls each vehicle that does not learn, by index: ``{0: "full_brake"}``."""
 
     @property
     def time_step_s(self) -> float:
@@ -50,11 +50,11 @@ class Game(Protocol):
 
     @property
     def objective(self) -> Declared:
-        """Whose harm each vehicle minimises; a reward may say otherwise."""
+        """Whose harm each vehicle minimises: one name for all vehicles or one per vehicle; a reward may override it."""
 
     @property
     def observation(self) -> Any:
-        """What the vehicles observe; None: the usual. See ``observations_of``."""
+        """The features that vehicles observe: a list for all, or lists by vehicle; None: see ``observations_of``."""
 
     @property
     def has_obstacle(self) -> bool:
@@ -62,11 +62,14 @@ class Game(Protocol):
 
     @property
     def by_link(self) -> bool:
-        """Whether messages reach each vehicle over a link of its own."""
+        """Whether messages reach each vehicle over a link of its own, with its own delay and losses."""
 
     @property
     def builds_up(self) -> bool:
-        """Whether the brakes of a vehicle may build up gradually."""
+        """Whether the brakes of a vehicle may build up gradually instead of acting at once."""
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
-        """Draw worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``."""
+        """Draw worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
+
+        ``channel``: ``"list"`` for evaluation, ``"training"`` for training; the two lists are independent.
+        """

@@ -28,12 +28,12 @@ Of = Literal["own", "neighbour"]
 class Feature:
     """One number of an observation: ``clip(value / scale, low, high)``."""
 
-    name: str
-    unit: str
-    scale: float
-    low: float
-    high: float
-    meaning: str
+    name: str  # full name, such as ``own.speed``, or the name inside a group
+    unit: str  # unit of the value
+    scale: float  # the value is divided by this, in ``unit``
+    low: float  # least number that is observed
+    high: float  # largest number that is observed
+    meaning: str  # what it is, in words
 
 
 CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands of the forecasts: full braking, coasting, full driving
@@ -44,11 +44,11 @@ CONTACT_SIDES = ("front", "rear")  # the vehicle's pairs; in front of Vehicle 1 
 class Groups(NamedTuple):
     """The built-in features by group; contact features exist for each of ``CONTACT_COMMANDS``."""
 
-    own: tuple[Feature, ...]
-    role: tuple[Feature, ...]
-    obstacle: tuple[Feature, ...]
-    contact: tuple[Feature, ...]
-    contact_far: tuple[Feature, ...]
+    own: tuple[Feature, ...]  # the vehicle itself
+    role: tuple[Feature, ...]  # its place in the line
+    obstacle: tuple[Feature, ...]  # the obstacle ahead of the line
+    contact: tuple[Feature, ...]  # next impacts that it forecasts under own commands
+    contact_far: tuple[Feature, ...]  # late or hard impacts, beyond the bounds of ``contact``
     neighbour: tuple[Feature, ...]  # features of each neighbour (``front_1``, ...)
 
 
@@ -134,23 +134,31 @@ _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 class RegisteredFeature:
     """A registered feature, or a built-in one that belongs to no group."""
 
-    feature: Feature
-    function: Callable[..., Floats]
-    of: Of
+    feature: Feature  # name, unit, scale, bounds and meaning
+    function: Callable[..., Floats]  # (worlds, vehicle) or (worlds, vehicle, neighbour) -> value, [n]
+    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
     unknown: float  # value for an unknown neighbour, in the feature's unit
     tried: tuple[float, ...]  # values in a few test worlds, which reveal a changed function
     reads: tuple[Piece, ...] | None = None  # pieces of a neighbour's message that the function reads; None: not said
 
     def scaled(self, value: Floats) -> Floats:
-        """Return ``clip(value / scale, low, high)``."""
+        """Return the observed number ``clip(value / scale, low, high)`` for a ``value`` in the feature's unit."""
         feature = self.feature
         return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
 
     def checked(self, worlds: Worlds, vehicle: int, neighbour: int | None, counts: Any, steps: Floats | None) -> Floats:
-        """Compute the feature and return it scaled, [n]; worlds in which ``counts`` is False get ``unknown``.
+        """Compute the feature in n worlds and return it scaled, [n].
 
-        ``steps`` [n] is the number of steps so far, for messages, if known. Raises ``InvalidInput`` naming feature,
-        vehicle and world for a result of wrong shape or a value that is not finite.
+        Raises ``InvalidInput`` naming feature, vehicle and world for a result of wrong shape or a value that is not
+        finite.
+
+        Args:
+            worlds: the n worlds.
+            vehicle: index of the observing vehicle, from 0.
+            neighbour: index of the neighbour; None for a feature of the vehicle itself.
+            counts: whether to use the value, a mask [n] or one truth value; other worlds get ``unknown``.
+            steps: number of steps so far, [n], for messages, if known.
+
         """
         name = self.feature.name
         given = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
@@ -172,7 +180,10 @@ class RegisteredFeature:
 
 
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
-    """Return the age of the newest sample received from the neighbour, [n] s; 0 if its present state is known."""
+    """Return the age of the newest state that ``vehicle`` has received from ``neighbour``, [n] s.
+
+    It is 0 if the present state is known. Both are indices from 0.
+    """
     told = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
     return np.where(np.isfinite(told), told, 0.0)
 
@@ -183,19 +194,28 @@ def intent(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
 
 
 def build_up_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the time in which the brakes of the neighbour (or own) build up from 0 to full, [n] s; 0: at once."""
+    """Return the time in which the brakes of the neighbour build up from 0 to full, [n] s; 0: at once.
+
+    Both vehicles are indices from 0; ``neighbour`` None: the brakes of ``vehicle`` itself.
+    """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.brake_rate_mps3[:, i]
 
 
 def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the time in which the fully applied brakes of the neighbour (or own) are released, [n] s; 0: at once."""
+    """Return the time in which the fully applied brakes of the neighbour are released, [n] s; 0: at once.
+
+    Both vehicles are indices from 0; ``neighbour`` None: the brakes of ``vehicle`` itself.
+    """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
 
 
 def place(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the number of vehicles ahead in the line, [n]; it tells the vehicles of a shared policy apart."""
+    """Return the number of vehicles ahead of ``vehicle`` (index from 0) in the line, [n].
+
+    It distinguishes the vehicles of a shared policy.
+    """
     return np.full(worlds.n, float(vehicle))
 
 
@@ -264,9 +284,10 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
-    """Return the full names of the features in a list of groups (``own``, ``front_1``) and single features.
+    """Return the full names of the features in a list of groups and single features, in order.
 
-    Raises ``UnknownName`` with a suggestion; ``InvalidInput`` if it is not a list, is empty, or has a feature twice.
+    For example ``("own.speed", ..., "front_1.gap")`` for ``["own", "front_1.gap"]``. Raises ``UnknownName`` with a
+    suggestion; ``InvalidInput`` if it is not a list, is empty, or has a feature twice.
     """
     if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
@@ -278,7 +299,10 @@ def listed_features(listed: object) -> tuple[str, ...]:
 
 
 class _ListSchema:
-    """JSON schema of an observation: a list of the features that are registered when the schema is generated."""
+    """Annotation of a field that lists the features of an observation: its JSON schema names all features.
+
+    Features that are registered before the schema is made are included.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -291,7 +315,7 @@ ListedFeatures = Annotated[tuple[str, ...], Field(strict=False), _ListSchema]
 
 
 def feature_named(name: str) -> Feature:
-    """Return the feature with this full name; raise ``UnknownName`` if there is none."""
+    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` if none has it."""
     group, dot, own = name.partition(".")
     if name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
@@ -310,13 +334,19 @@ def side_of(name: str) -> tuple[str, int] | None:
 
 
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
-    """Return the registered features among full names, by their own names."""
+    """Return name -> feature of the registered features among these full names.
+
+    The key is the feature's own name: ``age`` for ``front_1.age``.
+    """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}
 
 
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
-    """Return what an ``observation:`` list may contain: groups, then single features, for these neighbours."""
+    """Return what an ``observation:`` list may contain: names of groups, then of single features.
+
+    ``sides``: neighbours whose features are included, such as ``front_1``.
+    """
     groups = ["own", *sides, "role", "obstacle", "contact", "contact_far"]
     single = [f"{group}.{feature.name}" for group in groups for feature in _group(group)]
     entries = FEATURES.usable()

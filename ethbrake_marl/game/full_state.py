@@ -30,9 +30,9 @@ _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS
 
 
 def state_features(scenario: Game) -> tuple[Feature, ...]:
-    """Return the features of the full state in order: each vehicle's own features, each pair's gap and hit flag, time.
+    """Return the features of the full state in order: own features of each vehicle, then pairs, then time.
 
-    With an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    A pair has the features gap and hit flag. With an obstacle ahead of Vehicle 1, its gap and hit flag follow.
     """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
@@ -57,7 +57,16 @@ def full_state(worlds: Worlds, scenario: Game) -> Observations:
 
 
 def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Game) -> tuple[Feature, ...]:
-    """Return the features of a learner's row in order; raise ``InvalidInput`` for an invalid ``appended``."""
+    """Return the features of a learner's whole observation, in order: its own, then what training appends to them.
+
+    Raises ``InvalidInput`` for an invalid ``appended``.
+
+    Args:
+        own: features of the learner's own observation.
+        appended: ``"number"``: the learner's place among the learners; ``"state"``: the full state; None: nothing.
+        scenario: the game, which determines the features of the full state.
+
+    """
     if appended not in (None, *get_args(Appended)):
         raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
     if appended is None:

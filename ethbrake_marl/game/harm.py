@@ -29,23 +29,23 @@ HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 
 
 def check_harm_count(harm_count: str) -> None:
-    """Raise ``InvalidInput`` unless the name is a counting rule."""
+    """Raise ``InvalidInput`` unless ``harm_count`` is ``"first"`` or ``"total"``."""
     if harm_count not in HARM_COUNTS:
         raise InvalidInput(f"harm_count {harm_count!r}: must be {' or '.join(repr(known) for known in HARM_COUNTS)}")
 
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """Harm of ``n`` worlds so far, by pair."""
+    """Harm and number of impacts of ``n`` worlds since the start of the episode, by pair."""
 
-    first_impact_harm: Floats  # [n, P] m2/s2
-    total_harm: Floats  # [n, P] m2/s2
+    first_impact_harm: Floats  # [n, P] harm of each pair's first impact (m2/s2)
+    total_harm: Floats  # [n, P] harm of all impacts of each pair (m2/s2)
     count: Ints  # [n, P] number of impacts
     obstacle_first_harm: Floats  # [n] first-impact harm of Vehicle 1 with the obstacle ahead (m2/s2)
     obstacle_total_harm: Floats  # [n] total harm of Vehicle 1 with the obstacle (m2/s2)
     obstacle_count: Ints  # [n] number of impacts with the obstacle
-    mass_t: Floats  # [n, N]
-    restitution: Floats  # [n]
+    mass_t: Floats  # [n, N] mass of each vehicle (t)
+    restitution: Floats  # [n] coefficient of restitution
 
     def __repr__(self) -> str:
         return (
@@ -53,7 +53,7 @@ class Ledger:
         )
 
     def add(self, impacts: Impacts) -> Ledger:
-        """Return the ledger with the impacts of a further segment added."""
+        """Return the ledger with the ``impacts`` of the next segment of the same episodes added."""
         return Ledger(
             self.first_impact_harm + impacts.first_impact_harm,
             self.total_harm + impacts.total_harm,
@@ -66,10 +66,10 @@ class Ledger:
         )
 
     def since(self, before: Ledger) -> Ledger:
-        """Return the harm that was added to the same worlds after ``before``, exact to the last rounding.
+        """Return the harm that was added after ``before``, an earlier ledger of the same episodes.
 
-        Raises ``InvalidInput`` if ``before`` has another shape or more impacts, for example because a row holds a new
-        episode.
+        The difference is exact to the last rounding. Raises ``InvalidInput`` if ``before`` has another shape or more
+        impacts, for example because a row holds a new episode.
         """
         names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution")]
         if before.count.shape != self.count.shape or (before.count > self.count).any():
@@ -77,31 +77,42 @@ class Ledger:
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
-        """Return the ledger of the selected worlds."""
+        """Return the ledger of the worlds selected by ``rows`` (indices or a mask [n])."""
         return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of each pair under a counting rule, [n, P]; raise ``InvalidInput`` for an unknown rule."""
+        """Return the harm of each pair, [n, P] m2/s2: of its ``"first"`` impact, or of all impacts (``"total"``).
+
+        Raises ``InvalidInput`` for another ``harm_count``.
+        """
         check_harm_count(harm_count)
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def obstacle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of Vehicle 1 with the obstacle ahead, [n]; raise ``InvalidInput`` for an unknown rule."""
+        """Return the harm of Vehicle 1 with the obstacle ahead, [n] m2/s2: of the ``"first"`` impact, or ``"total"``.
+
+        Raises ``InvalidInput`` for another ``harm_count``.
+        """
         check_harm_count(harm_count)
         return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of each vehicle, from both its pairs (``split``), [n, N]; the obstacle's is Vehicle 1's."""
+        """Return the harm that each vehicle bears, [n, N] m2/s2: its shares (``split``) of the harm of both its pairs.
+
+        Vehicle 1 also bears the harm with the obstacle. ``harm_count``: ``"first"`` impact of each pair, or
+        ``"total"``.
+        """
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)
         return harm
 
     def speed_changes(self, harm_count: HarmCount) -> tuple[Floats, Floats]:
-        """Return the change of speed of each vehicle hit in front, and of each hit at the rear, [n, N] m/s each.
+        """Return two changes of speed of each vehicle, [n, N] m/s each: by impacts in front, and at the rear.
 
-        It is the change in a single impact with the counted harm of the pair. This is exact for first impacts of one
-        pair at a time. If a pair has several impacts and ``total`` counts them all, it exceeds the change in the
-        hardest one.
+        They are computed from the harm of the pair, as if it came from one single impact of these two vehicles alone.
+        This is exact for a first impact in which no third vehicle takes part. If ``"total"`` counts several impacts of
+        a pair, the result exceeds the change in the hardest one. ``harm_count``: ``"first"`` impact of each pair, or
+        ``"total"``.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
@@ -112,7 +123,11 @@ class Ledger:
         return front, rear
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of all vehicles of a world together, [n]: the obstacle's, then the pairs' front to rear."""
+        """Return the harm of all vehicles of a world together, [n] m2/s2.
+
+        It is summed in a fixed order: obstacle, then pairs front to rear. ``harm_count``: ``"first"`` impact of each
+        pair, or ``"total"``.
+        """
         return line_sum(self.pair_harm(harm_count), self.obstacle_harm(harm_count))
 
     @property
@@ -129,7 +144,10 @@ class Ledger:
 
 @compiled
 def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
-    """Return the sum over obstacle and pairs of each world, [n], front to rear: the same bits in any batch."""
+    """Return the sum over obstacle and pairs of each world, [n], in a fixed order: the same bits in any batch.
+
+    ``pair_values`` is [n, P], ``obstacle_values`` [n]; the obstacle comes first, then the pairs front to rear.
+    """
     n, pairs = pair_values.shape
     total = np.zeros(n)
     for k in range(n):
@@ -140,7 +158,7 @@ def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
 
 
 def empty_ledger(worlds: Worlds) -> Ledger:
-    """Return the ledger at the alert, without harm."""
+    """Return the ledger of ``worlds`` at the alert (time 0), without harm."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
     of_worlds = worlds.vehicles.mass_t, worlds.vehicles.restitution
@@ -149,7 +167,10 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 
 @compiled
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
-    """Share each pair's harm [n, P] between its two vehicles by mass (the lighter one bears more), [n, N]."""
+    """Share the harm of each pair between its two vehicles by mass; return the harm of each vehicle, [n, N] m2/s2.
+
+    The lighter vehicle bears more. ``pair_harm`` is [n, P] in m2/s2, ``mass_t`` [n, N] in t.
+    """
     n, vehicles = mass_t.shape
     harm = np.zeros((n, vehicles))
     for k in range(n):
@@ -162,9 +183,10 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 
 @compiled
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
-    """Return the front vehicle's share of a pair's harm: ``m_rear / (m_front + m_rear) harm``.
+    """Return the front vehicle's share of a pair's ``harm``: ``m_rear / (m_front + m_rear) harm``.
 
     The larger share is computed and the smaller one is the rest, an exact subtraction: the two add up to the last bit.
+    Masses must have the same unit; the result has the unit of ``harm``.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
@@ -173,7 +195,7 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
 
 @compiled
 def _powers(shares: Floats, exponent: float) -> Floats:
-    """Return ``x^exponent`` of each x >= 0 in ``shares`` [k], at most 1; the same bits on every processor."""
+    """Return ``x^exponent`` of each x >= 0 in ``shares`` [k], limited to 1, [k]; the same bits on every processor."""
     found = np.zeros(len(shares))
     for i in range(len(shares)):
         if shares[i] > 0.0:
@@ -185,8 +207,8 @@ class InjuryCurve(NamedTuple):
     """Probability of an injury in a rear-end collision, as a function of the vehicle's change of speed dv (m/s)."""
 
     injury: str  # least severity, on the abbreviated injury scale
-    formula: str
-    source: str
+    formula: str  # the probability as a formula in dv
+    source: str  # where the curve comes from
     front: Callable[[Floats], Floats]  # probability in the striking vehicle, which is hit in front
     rear: Callable[[Floats], Floats]  # probability in the struck vehicle, which is hit at the rear
 
@@ -210,11 +232,17 @@ INJURY_CURVES = {
 
 
 def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"], curve: str = "lr4s") -> Floats:
-    """Return the probability that a vehicle's occupant is injured, from its change of speed in a rear-end impact, [k].
+    """Return the probability that a vehicle's occupant is injured in a rear-end impact, [k].
 
-    ``side`` is the side that is hit: the front of the striking vehicle, the rear of the struck one. ``curve`` is a key
-    of ``INJURY_CURVES``, which give formula and source. Logistic curves give about 1 % for no change of speed; do not
-    use them for a vehicle that was not hit.
+    Logistic curves give about 1 % for no change of speed; do not use them for a vehicle that was not hit.
+
+    Args:
+        speed_change_mps: change of the vehicle's speed in the impact, [k] m/s; its sign is ignored.
+        side: side that is hit: ``"front"`` of the striking vehicle, ``"rear"`` of the struck one.
+        curve: key of ``INJURY_CURVES``, which give formula and source.
+
+    Raises ``UnknownName`` for another side or curve.
+
     """
     if curve not in INJURY_CURVES:
         raise unknown_name("injury curve", curve, INJURY_CURVES)

@@ -1,4 +1,4 @@
-"""Every impact of a batch of episodes, as arrays: what measures by impacts are computed from."""
+"""Every impact of a batch of episodes, as arrays, from which measures by impacts are computed."""
 
 from __future__ import annotations
 
@@ -23,14 +23,17 @@ _NO_ROWS = ImpactRows(_NO_INTS, _NO_INTS, _NO_FLOATS, _NO_FLOATS, np.empty(0, np
 
 @dataclass(frozen=True, slots=True)
 class EpisodeImpacts:
-    """The impacts of n episodes of N vehicles so far; its arrays cannot be written to."""
+    """The impacts of n episodes of N vehicles so far; its arrays are read-only."""
 
-    worlds: Worlds  # [n] at the alert
-    rows: ImpactRows  # every impact, by world and then by time, arrays [k]
+    worlds: Worlds  # the n worlds at the alert, when the episodes began
+    rows: ImpactRows  # every impact so far, ordered by world and then by time; arrays [k]
 
     @classmethod
     def of(cls, worlds: Worlds, parts: Sequence[ImpactRows] = ()) -> EpisodeImpacts:
-        """The impacts of these episodes, from parts that follow each other in time."""
+        """Return the impacts of the episodes that began as ``worlds``.
+
+        ``parts``: their impacts, in parts that follow each other in time.
+        """
         whole = [np.concatenate([getattr(rows, name) for rows in (_NO_ROWS, *parts)]) for name in _OF_ROWS]
         order = np.argsort(whole[0], kind="stable")
         whole = [column[order] for column in whole]
@@ -40,9 +43,10 @@ class EpisodeImpacts:
 
     @property
     def largest_speed_change_mps(self) -> Floats:
-        """The largest change of speed of each vehicle in one impact (delta-v), [n, N]; 0 without one.
+        """Largest change of speed of each vehicle in one impact (delta-v), [n, N] m/s; 0 without an impact.
 
-        A vehicle that is pushed by one that touches it already has no impact of its own, and so no change from it.
+        A vehicle that is pushed by one that already touches it has no impact of its own, and so no change from the
+        push.
         """
         rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
         np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
@@ -51,7 +55,14 @@ class EpisodeImpacts:
         return change
 
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
-        """These impacts, and those on the ``way`` that some of the worlds [n] go on: see ``Engine.segments``."""
+        """Return the impacts after the episodes have gone on: these impacts, and the new ones of some worlds.
+
+        Args:
+            way: consecutive parts of the new motion: worlds at its start, constant commands [n, N] m/s2, and end [n] s,
+                as ``Engine.segments`` yields them.
+            some: worlds whose new impacts are added, a mask [n].
+
+        """
         parts, found = list(way), [self.rows]
         for k, (before, command_mps2, until_s) in enumerate(parts, 1):
             moving = until_s > before.time_s
@@ -61,12 +72,15 @@ class EpisodeImpacts:
         return EpisodeImpacts.of(self.worlds, found)
 
     def renewed(self, rows: Ints, alert: Worlds) -> EpisodeImpacts:
-        """The same with new episodes, without an impact so far, in these rows."""
+        """Return the impacts after new episodes have begun in some rows; these have no impacts yet.
+
+        ``rows``: indices of the new episodes, [k]; ``alert``: their k worlds at the alert.
+        """
         kept = ~np.isin(self.rows.world, rows)
         return EpisodeImpacts.of(self.worlds.assign(rows, alert), [_some(self.rows, kept)])
 
     def take(self, rows: Ints) -> EpisodeImpacts:
-        """The impacts of some of the episodes, or of one of them several times."""
+        """Return the impacts of the episodes at the indices ``rows`` [k]; an index may occur several times."""
         first = np.searchsorted(self.rows.world, rows)
         count = np.searchsorted(self.rows.world, rows, side="right") - first
         at = np.repeat(first - np.cumsum(count) + count, count) + np.arange(count.sum())
@@ -75,20 +89,24 @@ class EpisodeImpacts:
 
     @staticmethod
     def join(parts: Sequence[EpisodeImpacts]) -> EpisodeImpacts:
-        """The episodes of all parts, one after the other."""
+        """Join the episodes of all parts into one batch, in the order of the parts."""
         before = np.cumsum([0, *(part.worlds.n for part in parts)])
         shifted = [replace(p.rows, world=p.rows.world + n) for p, n in zip(parts, before, strict=False)]
         return EpisodeImpacts.of(Worlds.concatenate([part.worlds for part in parts]), shifted)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Arrays by name, for a snapshot; ``read`` is the way back."""
+        """Return all data as arrays by name, for a snapshot; ``read`` restores it."""
         arrays = {name: getattr(self.worlds, name) for name in _OF_WORLDS}
         arrays |= {name: getattr(self.worlds.vehicles, name) for name in _OF_VEHICLES}
         arrays["rows"] = np.stack([getattr(self.rows, name) for name in _OF_ROWS], axis=1, dtype=np.float64)
         return {f"impacts.{name}": np.array(array, order="C") for name, array in arrays.items()}
 
     def read(self, arrays: Mapping[str, NDArray[Any]]) -> EpisodeImpacts:
-        """The impacts of ``arrays``, for as many episodes. Raises ``InvalidInput`` for one that is missing."""
+        """Return the impacts that ``arrays``, made by ``EpisodeImpacts.arrays``, hold.
+
+        They must be of the same number of episodes as this object. Raises ``InvalidInput`` for an array that is missing
+        or has another shape.
+        """
         for name, own in self.arrays().items():
             have = arrays.get(name)
             if have is None or have.ndim != own.ndim or (len(have) != len(own) and name != "impacts.rows"):
@@ -106,7 +124,15 @@ def _some(rows: ImpactRows, index: NDArray[Any]) -> ImpactRows:
 
 
 def impacts_within(before: Worlds, command_mps2: Floats, until_s: Floats, rows: Ints) -> ImpactRows:
-    """Every impact in these rows while ``before`` moves to the times ``until_s`` [n] under the commands [n, N]."""
+    """Return every impact of some worlds during a segment; ``world`` in the result is the row in the whole batch.
+
+    Args:
+        before: n worlds at the start of the segment.
+        command_mps2: constant commands, [n, N] m/s2.
+        until_s: end of the segment, [n] s.
+        rows: indices of the worlds to simulate, [k].
+
+    """
     found = advance(before.take(rows), command_mps2[rows], until_s=until_s[rows], record=True)[1].rows
     assert found is not None  # they were asked for
     return replace(found, world=rows[found.world])

@@ -1,13 +1,13 @@
 """Measures by name: what is reported can be rewarded, and what is rewarded can be reported.
 
-A measure is given either by step or by impacts:
+A measure is computed either from each step or from all impacts of an episode:
 
-=======  ==================  ===================================  =========================
+=======  ==================  ===================================  ===========================
 by       computed from       a reward counts in each step         an evaluation shows
-=======  ==================  ===================================  =========================
+=======  ==================  ===================================  ===========================
 step     ``StepOutcome``     its value                            its sum over the episode
 impacts  ``EpisodeImpacts``  its change by the step's impacts     its value for all impacts
-=======  ==================  ===================================  =========================
+=======  ==================  ===================================  ===========================
 
 So the rewards of an episode add up to what evaluations show, minus the value before the first decision.
 """
@@ -39,25 +39,33 @@ MeasureFunction = Callable[[Any], Any]  # from a ``StepOutcome`` or ``EpisodeImp
 class NamedMeasure:
     """A measure that can be reported and rewarded under its name."""
 
-    name: str
-    meaning: str
-    unit: str
-    by: By
-    function: Callable[..., Any] | None = None  # None: the engine computes it
-    settings: tuple[str, ...] = ()  # of the reward, which the function of a built-in measure takes after the step
-    form: str = ""  # what a registered one gives: a truth or a number, per world or per vehicle
+    name: str  # key of its weight in a reward
+    meaning: str  # what it measures, in words
+    unit: str  # unit of its value; ``1`` for a plain number
+    by: By  # ``step`` or ``impacts``: what it is computed from
+    function: Callable[..., Any] | None = None  # computes the measure; None: the engine does
+    settings: tuple[str, ...] = ()  # fields of RewardParams that a built-in function takes as further arguments
+    form: str = ""  # result of a registered function, such as ``a number per vehicle`` or ``a truth per world``
 
     def built_in(self, step: StepOutcome, params: Any) -> Floats:
-        """Value of a built-in measure with the settings of ``RewardParams``, [n] or [n, N]."""
+        """Return the value of a built-in measure in one step, [n] or [n, N].
+
+        ``params``: the ``RewardParams`` whose settings the measure takes.
+        """
         assert self.function is not None
         value: Floats = self.function(step, *(getattr(params, name) for name in self.settings))
         return value
 
     def of(self, given: StepOutcome | EpisodeImpacts, counts: Bools | None = None, steps: Ints | None = None) -> Any:
-        """Value of a registered measure, checked: [n], or [n, N] for each vehicle.
+        """Return the value of a registered measure: [n], or [n, N] for a measure of each vehicle.
 
-        ``counts`` [n]: the worlds to look at; the others have 0. ``steps`` [n]: how many each world has made, for
-        messages. ``InvalidInput`` names the measure, and the world, vehicle and step of a number that is not finite.
+        Raises ``InvalidInput`` naming the measure, world, vehicle and step of a number that is not finite.
+
+        Args:
+            given: what the measure is computed from: a step, or the impacts of an episode.
+            counts: worlds to compute, a mask [n]; all others get 0. None: all worlds.
+            steps: number of steps that each world has made, [n], for messages.
+
         """
         if isinstance(given, StepOutcome):
             given.protect()
@@ -76,7 +84,11 @@ class NamedMeasure:
         return value
 
     def _numbers(self, given: StepOutcome | EpisodeImpacts, what: str) -> Any:
-        """What the function gives: [n] or [n, N], numbers, or truths by impacts. ``InvalidInput`` for anything else."""
+        """Call the measure's function and return its result, [n] or [n, N]; raise ``InvalidInput`` if it is unusable.
+
+        The result is float64; truth values of a measure by impacts stay truth values. Values per learner are filled up
+        with 0 for other vehicles. ``what``: how messages name the measure.
+        """
         assert self.function is not None
         learners = given.learners if isinstance(given, StepOutcome) else None
         n, vehicles = (given.worlds if isinstance(given, EpisodeImpacts) else given).speeds_mps.shape
@@ -100,31 +112,34 @@ class NamedMeasure:
         return whole
 
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
-        """How much the impacts that are new in ``after`` change a measure by impacts, [n] or [n, N]."""
+        """Return how much the new impacts in ``after`` change a measure by impacts, [n] or [n, N].
+
+        ``before`` and ``after`` are the same episodes; ``steps`` [n] is the number of steps so far, for messages.
+        """
         if len(before.rows.world) == len(after.rows.world):
             return np.zeros(after.worlds.speeds_mps.shape[: 2 if self.form.endswith("vehicle") else 1])
         return np.asarray(1.0 * self.of(after, steps=steps) - self.of(before, steps=steps))
 
 
 def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
-    """Make ``name`` a measure: rewards may give it a weight, and every evaluation from now on shows it.
+    """Register a measure: rewards may give ``name`` a weight, and every evaluation from now on shows it.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.measures``: its function, a
-    ``Part`` of it, or a mapping of names to such. Evaluations show that where they are asked to.
+    An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``: its function,
+    a ``Part`` of it, or a mapping of names to such. Evaluations show such a measure only on request.
 
     Args:
         name: 1 to 64 of ``a-z``, digits and ``_``, beginning with a letter, not ending in ``_`` and a number,
             ``_interval``, ``_low`` or ``_high``. It is the key of the weight in a reward; columns of results are called
             ``metric_NAME``, infos of a step ``reward_NAME``.
-        function: from ``EpisodeImpacts`` or, by step, from ``StepOutcome`` to one number for each world [n] or each
-            vehicle [n, N]; by step also for each learner [n, L]. Its docstring says what it is. It must work for lines
-            of any length. Of truths by impacts a rate is shown.
-        unit: of its numbers.
+        function: takes an ``EpisodeImpacts`` or, by step, a ``StepOutcome``; returns one number for each world [n] or
+            each vehicle [n, N]; by step also for each learner [n, L]. Its docstring describes the measure. It must work
+            for lines of any length. Truth values by impacts are shown as a rate.
+        unit: unit of the numbers.
         by: ``impacts`` or ``step``, what it is computed from.
 
-    Registering the same again changes nothing. Raises ``AlreadyExists`` for another one under a name that is taken,
-    ``InvalidInput`` for what cannot be used, such as a function that fails, or gives another shape or a number that is
-    not finite, in two worlds.
+    Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure,
+    ``InvalidInput`` for invalid arguments, or if in two test worlds the function fails, or returns another shape or a
+    number that is not finite.
 
     """
     _add(name, function, unit=unit, by=by)
@@ -132,7 +147,7 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
 
 def _add(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
-    """Add it to the registry alone."""
+    """Add a measure to the registry, without showing it in evaluations. Arguments are those of ``register_measure``."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(
             f"measure {name!r:.80}: must be 1 to 64 of a-z, 0-9 and _, beginning with a letter, not ending in _"
@@ -155,7 +170,7 @@ def _form(value: Any) -> str:
 
 
 def _some_impacts() -> EpisodeImpacts:
-    """Two lines of three, one with an impact of its second pair."""
+    """Return the impacts of two test lines of three vehicles; one line has an impact of its second pair."""
     worlds = make_worlds(
         [[8.0, 6.0], [3.0, 21.0]],
         [[20.0, 18.0, 22.0], [9.0, 13.0, 11.0]],
@@ -170,7 +185,7 @@ def _some_impacts() -> EpisodeImpacts:
 
 
 def _a_step() -> StepOutcome:
-    """A step of these lines, in which two vehicles learn."""
+    """Return a step of these two test lines, in which two vehicles learn."""
     w = _some_impacts().worlds
     v, command = w.vehicles, np.array([[-6.0, 0.0, 1.5], [-6.0, -7.0, -2.5]])
     return StepOutcome(
@@ -182,7 +197,7 @@ def _a_step() -> StepOutcome:
 
 _OF_RISK = ("ttc_scale_s", "safety_buffer_m", "target_gap_m", "distance_slope_per_m")
 
-# The terms of ``RewardParams`` that have a weight of their own.
+# Terms of ``RewardParams`` that have a weight of their own.
 BUILT_IN = {
     each.name: each
     for each in (
@@ -201,9 +216,9 @@ BUILT_IN = {
     )
 }  # fmt: skip
 
-# Keys of a reward that are no measures.
+# Keys of a reward that are not measures.
 SETTINGS = ("harm_count", "objective", "shaping_discount", "k_energy", *_OF_RISK, "terms")
 
 MEASURES: Registry[NamedMeasure] = Registry("measure", "measures", _add, BUILT_IN)
 
-REPORTED: dict[str, NamedMeasure] = {}  # those that every evaluation shows
+REPORTED: dict[str, NamedMeasure] = {}  # measures that every evaluation shows, by name

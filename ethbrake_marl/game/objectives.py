@@ -40,12 +40,12 @@ Declared = str | tuple[str, ...]  # one objective for all vehicles, or one per v
 
 
 class Objective(NamedTuple):
-    """A parsed objective."""
+    """An objective that ``parse_objective`` has read from a text such as ``social:45``."""
 
-    kind: str
-    angle_deg: float = 0.0
-    weights: tuple[float, ...] = ()
-    curve: str = ""
+    kind: str  # name before the colon, such as ``social``
+    angle_deg: float = 0.0  # angle of ``social`` (degrees)
+    weights: tuple[float, ...] = ()  # weights of ``weighted``, one per vehicle
+    curve: str = ""  # curve of ``injury``, a key of ``INJURY_CURVES``
 
 
 class HarmSoFar(NamedTuple):
@@ -53,26 +53,26 @@ class HarmSoFar(NamedTuple):
 
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
     whole: Floats  # [n] harm of all vehicles, m2/s2
-    mass_t: Floats  # [n, N]
-    front_change_mps: Floats  # [n, N] change of speed of each vehicle if hit in front
-    rear_change_mps: Floats  # [n, N] change of speed of each vehicle if hit at the rear
+    mass_t: Floats  # [n, N] mass of each vehicle, t
+    front_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts in front, m/s; 0: not hit there
+    rear_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts at the rear, m/s; 0: not hit there
 
 
 ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
 
 
 class Kind(NamedTuple):
-    """One kind of objective: a line of the table above."""
+    """One kind of objective, built in or registered: a line of the table at the top of this file."""
 
     form: str  # how it is written; no argument if there is no ":"
-    about: str
-    amount: Callable[[Objective, HarmSoFar, int], Floats]  # amount for a vehicle, [n]: less is better
+    about: str  # what it means, in words
+    amount: Callable[[Objective, HarmSoFar, int], Floats]  # (objective, harm, vehicle) -> amount [n]: less is better
     function: ObjectiveFunction | None = None  # the function of a registered objective
 
 
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
-    """Parse ``total``, ``own``, ``social:45``, ``maximin``, ``mass-weighted``, ``weighted:1,4,1`` or ``injury:lr4s``.
+    """Parse the text of an objective: ``total``, ``own``, ``social:45``, ``weighted:1,4,1``, ``injury:lr4s``, ...
 
     Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [1e-6, 1e6], or an
     unknown curve.
@@ -100,7 +100,10 @@ def parse_objective(text: str) -> Objective:
 
 
 def check_declared(declared: object) -> None:
-    """Raise ``InvalidInput`` unless the value is an objective or a list of objectives, of any length."""
+    """Raise ``InvalidInput`` unless ``declared`` is an objective as a scenario writes it, such as ``own``, or a list.
+
+    The number of objectives in a list is not checked here.
+    """
     each = [declared] if isinstance(declared, str) else declared
     if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
         raise InvalidInput("objective: must be a name, for instance own or social:45, or a list with one per vehicle")
@@ -109,7 +112,10 @@ def check_declared(declared: object) -> None:
 
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
-    """Return the objective of each of ``vehicles`` vehicles; raise ``InvalidInput`` for a wrong number of them."""
+    """Return the parsed objective of each of ``vehicles`` vehicles; raise ``InvalidInput`` if their number is wrong.
+
+    ``declared``: the text of one objective for all vehicles, or one text per vehicle.
+    """
     check_declared(declared)
     each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)
     if len(each) != vehicles:
@@ -125,7 +131,14 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
 
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """Return each vehicle's objective for the harm so far, [n, N] (m2/s2, or injuries): less is better."""
+    """Return what each vehicle should minimise, for the harm so far, [n, N] (m2/s2, or injuries in 1,000 lines).
+
+    Args:
+        ledger: harm of n worlds since the start of the episode.
+        harm_count: impacts that count: ``"first"`` of each pair, or ``"total"``.
+        objectives: objective of each vehicle, N of them.
+
+    """
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
     told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count)
     harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only views
@@ -138,9 +151,14 @@ def standard_objectives() -> tuple[str, ...]:
 
 
 def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
-    """Return the objectives by name, with ``standard`` replaced by ``standard_objectives``.
+    """Return the names of objectives, with ``standard`` replaced by all of ``standard_objectives``.
 
     Raises ``InvalidInput`` if an objective is unknown, listed twice, or made for another number of vehicles.
+
+    Args:
+        texts: names of objectives, or ``standard``.
+        vehicles: number of vehicles in the line.
+
     """
     names = [name for text in texts for name in (standard_objectives() if text == "standard" else (text,))]
     for k, name in enumerate(names):
@@ -193,10 +211,18 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
-    """Return the same ledger under several objectives: objective -> amount for each vehicle, [n, N] (m2/s2).
+    """Evaluate one ledger under several objectives; return the amount for each vehicle: ``{"own": [n, N], ...}``.
 
-    So a policy can be judged under objectives that it was not trained for. ``declared=None`` means
-    ``standard_objectives``. Raises ``InvalidInput`` for a single name instead of a list.
+    So a policy can be judged under objectives that it was not trained for. Amounts are in m2/s2, or injuries in 1,000
+    lines; less is better.
+
+    Args:
+        ledger: harm of n worlds since the start of the episode.
+        harm_count: impacts that count: ``"first"`` of each pair, or ``"total"``.
+        declared: list of objectives, each for all vehicles or one per vehicle; None: ``standard_objectives``.
+
+    Raises ``InvalidInput`` for a single name instead of a list.
+
     """
     if isinstance(declared, str):
         raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
@@ -217,7 +243,7 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 @lru_cache
 def _social_weights(angle_deg: float) -> tuple[float, float]:
-    """Return the weights of own and others' harm: cosine and sine of the angle, exactly 0 and 1 at 90 degrees.
+    """Return the weights of own harm and others' harm: cosine and sine of the angle, exactly 0 and 1 at 90 degrees.
 
     Computed by their series in exact fractions and rounded once, because the C library's last bits differ by processor.
     """
@@ -233,7 +259,7 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     """Return the injuries in 1,000 lines, [n], summed front to rear; the same number for all vehicles.
 
-    Of a vehicle's two impacts the larger risk counts, not the larger change of speed, so that no further impact can
+    If a vehicle has two impacts, the larger risk counts, not the larger change of speed, so that no further impact can
     lower the number.
     """
     del vehicle
@@ -247,7 +273,10 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 
 def _weighted(borne: Floats, weights: Floats) -> Floats:
-    """Return ``N sum_j w_j H_j / sum_j w_j``, summed front to rear: the same bits in any batch."""
+    """Return ``N sum_j w_j H_j / sum_j w_j``, [n], summed front to rear: the same bits in any batch.
+
+    ``borne``: harm H_j of each vehicle, [n, N] m2/s2; ``weights``: w_j, [n, N].
+    """
     n, vehicles = borne.shape
     harm, whole = np.zeros(n), np.zeros(n)
     for j in range(vehicles):

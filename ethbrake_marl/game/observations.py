@@ -59,13 +59,13 @@ class ObservationSpec:
 
     """
 
-    front: int = 1  # neighbours ahead, 0 to 64
-    rear: int = 1  # neighbours behind, 0 to 64
-    role: bool = False  # whether to add GROUPS.role
-    obstacle: bool = False  # whether to add GROUPS.obstacle
-    chosen: tuple[str, ...] = ()  # full names; the other fields are then what these features need
-    contact: bool = False  # whether to add GROUPS.contact; contact_far only through ``chosen``
-    time_step_s: float | None = None  # time between two decisions; only contact features need it
+    front: int = 1  # number of observed neighbours ahead, 0 to 64
+    rear: int = 1  # number of observed neighbours behind, 0 to 64
+    role: bool = False  # whether to add the vehicle's place in the line (GROUPS.role)
+    obstacle: bool = False  # whether to add the obstacle ahead (GROUPS.obstacle)
+    chosen: tuple[str, ...] = ()  # full names of all features, in order; the other fields are then what these need
+    contact: bool = False  # whether to add forecast impacts (GROUPS.contact); contact_far only through ``chosen``
+    time_step_s: float | None = None  # time between two decisions (s); only contact features need it
 
     def __post_init__(self) -> None:
         """Raise ``InvalidInput`` for an invalid number of neighbours, or fields that contradict ``chosen``."""
@@ -83,7 +83,10 @@ class ObservationSpec:
 
     @property
     def sides(self) -> tuple[tuple[str, int], ...]:
-        """Neighbours as (prefix, offset in the line), front ones first, nearest first."""
+        """Observed neighbours as (prefix, offset), nearest first: ``("front_1", -1)`` is the next vehicle ahead.
+
+        Neighbours in front come first; the offset is the difference of the places in the line.
+        """
         fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
         return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
 
@@ -94,7 +97,7 @@ class ObservationSpec:
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """All built-in features of every group of which the observation has a feature."""
+        """All built-in features of every group of which the observation has at least one feature, in order."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -104,7 +107,7 @@ class ObservationSpec:
 
     @property
     def far(self) -> bool:
-        """Whether a feature of GROUPS.contact_far is chosen."""
+        """Whether the observation has features of GROUPS.contact_far (late or hard forecast impacts)."""
         return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
@@ -114,7 +117,7 @@ class ObservationSpec:
 
     @property
     def plan(self) -> Plan:
-        """The ``Plan`` that computes this observation.
+        """The ``Plan`` that computes this observation from worlds.
 
         It is cached per specification and must not be changed. Raises ``InvalidInput`` for contact features without a
         time step.
@@ -132,9 +135,9 @@ Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # list: group
 def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
     """Return the observation for a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
 
-    A mapping gives the fields of an ``ObservationSpec``, as in JSON. ``time_step_s`` (s) is the time between two
-    decisions; only contact features outside an environment need it. Raises ``UnknownName`` with a suggestion,
-    ``InvalidInput`` for an invalid list.
+    A mapping gives the fields of an ``ObservationSpec``, as in JSON; an ``ObservationSpec`` is returned unchanged.
+    ``time_step_s`` (s) is the time between two decisions; only contact features outside an environment need it. Raises
+    ``UnknownName`` with a suggestion, ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed
@@ -157,7 +160,10 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return what the features need: neighbours in front and behind, own place, obstacle, contacts."""
+    """Return what features with these full names need: neighbours in front and behind, own place, obstacle, contacts.
+
+    These are the fields ``front``, ``rear``, ``role``, ``obstacle`` and ``contact`` of ``ObservationSpec``.
+    """
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -172,7 +178,10 @@ _ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
-    """Return the observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in new memory."""
+    """Return the observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in new memory.
+
+    ``spec`` says which F features are observed. Raises ``InvalidInput`` for an index without a vehicle.
+    """
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
     packed = Packed.of(worlds)
@@ -180,21 +189,21 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
 
 
 class Scaling(NamedTuple):
-    """Arguments of the kernel that computes all groups except the contact features."""
+    """Arguments of the kernel that computes all groups of features except the contact features."""
 
-    offsets: Ints  # offsets of the neighbours in the line
-    role: bool
-    obstacle: bool
-    features: Floats  # [3, F] 1 / scale, low, high of each feature
+    offsets: Ints  # place of each observed neighbour relative to the observer: -1 is the next vehicle ahead
+    role: bool  # whether the place in the line is observed
+    obstacle: bool  # whether the obstacle ahead is observed
+    features: Floats  # [3, F] rows 1 / scale, low and high; a column per feature
 
 
 class Extra(NamedTuple):
-    """A registered feature in an observation."""
+    """A registered feature in an observation, computed by its own function."""
 
-    column: int
-    entry: RegisteredFeature
-    offset: int  # offset of the neighbour in the line; 0: the vehicle itself
-    known: int  # column of the neighbour's ``known`` in the whole groups
+    column: int  # its column in the observation
+    entry: RegisteredFeature  # the feature and its function
+    offset: int  # place of the neighbour relative to the vehicle, -1 is the next one ahead; 0: the vehicle itself
+    known: int  # column of the neighbour's feature ``known`` among the built-in features
 
     def known_in(self, worlds: Worlds, vehicle: int, neighbour: int) -> NDArray[np.bool_]:
         """Return the worlds [n] in which ``vehicle`` knows every piece of the neighbour that the feature reads.
@@ -216,19 +225,26 @@ class Extra(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """How to compute an observation: kernels fill whole groups, functions compute registered features."""
+    """How to compute an observation from worlds: kernels fill whole groups, functions compute registered features."""
 
-    scaling: Scaling
+    scaling: Scaling  # how to compute all built-in features but the contact features
     contacts: Contacts | None  # contact features, after all other groups; None: no such features
-    picked: Ints | None  # [F] columns to take from the whole groups; None: all
-    extras: tuple[Extra, ...]
+    picked: Ints | None  # [F] columns to take from the features of whole groups; None: all
+    extras: tuple[Extra, ...]  # registered features
 
     def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
-        """Return the observations of several vehicles in packed worlds (``physics.columns``), [n, len(vehicles), F].
+        """Return the observations of several vehicles, [n, len(vehicles), F] float32.
 
-        ``steps`` [n] is the number of steps so far, for messages. With periodic messages a vehicle observes the worlds
-        as it estimates them (``physics.estimates``). Contact features of commands that are not needed are 0. Raises
-        ``PhysicsError`` with the worlds in which a forecast of contacts failed.
+        With periodic messages a vehicle observes the worlds as it estimates them (``physics.estimates``). Contact
+        features of commands that are not needed are 0. Raises ``PhysicsError`` with the worlds in which a forecast of
+        contacts failed.
+
+        Args:
+            state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+            params: their parameter rows.
+            vehicles: indices of the observing vehicles, from 0.
+            steps: number of steps so far, [n], for messages.
+
         """
         packed = Packed(state, params)
         if not packed.has_messages:
@@ -246,7 +262,7 @@ class Plan(NamedTuple):
     def _observe_present(
         self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None, *, says: bool = False
     ) -> Observations:
-        """``observe`` without estimation: the state of every known vehicle is its present state.
+        """Version of ``observe`` without estimation: a known vehicle is observed in its present state.
 
         ``says``: whether the worlds say what messages contain.
         """
@@ -312,7 +328,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return 1 / scale, low, high of every feature, [3, F]."""
+    """Return the scaling of features, [3, F]: rows 1 / scale, low and high, a column per feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -321,9 +337,20 @@ def _observe_rows(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
-    """Fill ``out`` with the clipped features of each observer, in the order of ``GROUPS``.
+    """Fill ``out`` [n, observers, F] with the clipped features of each observer, in the order of ``GROUPS``.
 
     This is one long loop on purpose: passing these arrays to functions made it four times slower.
+
+    Args:
+        state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows.
+        observers: indices of the observing vehicles.
+        offsets: place of each observed neighbour relative to the observer; -1 is the next vehicle ahead.
+        role: whether the vehicle's place in the line is observed.
+        with_obstacle: whether the obstacle ahead is observed.
+        features: scaling, [3, F]: rows 1 / scale, low and high, a column per feature.
+        out: result.
+
     """
     of = columns(state)
     N, speed, command, gap_column, hit, obstacle = of.vehicles, of.speed, of.command, of.gap, of.hit, of.obstacle
@@ -425,10 +452,16 @@ def _hide_untold(
 
 @compiled
 def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
-    """Return the constant deceleration that uses up ``room`` after the own latency: ``v^2 / (2 (room - v tau))``.
+    """Return the constant deceleration (m/s2) that stops a vehicle within ``room``: ``v^2 / (2 (room - v tau))``.
 
     Room below 1 mm counts as 1 mm. So without room the feature is at its upper bound (20 m/s2) from 0.2 m/s on, and
     lower for a slower vehicle; at rest it is 0.
+
+    Args:
+        speed: present speed v, m/s.
+        latency_left: time tau until its brakes act, s.
+        room: distance in which it must stop, m.
+
     """
     speed = max(speed, 0.0)
     left = max(room - speed * latency_left, 1e-3)

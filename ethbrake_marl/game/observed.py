@@ -10,10 +10,11 @@ from ethbrake_marl.game.observations import Observation, ObservationSpec, choose
 
 
 def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSpec:
-    """Return the observation of a vehicle, or of all learners, that the scenario declares.
+    """Return the observation that the scenario declares for ``vehicle``, such as ``"vehicle_2"``.
 
-    By default a vehicle observes one neighbour on each side; with an obstacle ahead also its own place in the line and
-    the obstacle. Raises ``InvalidInput`` naming two learners with different observations, if ``vehicle`` is None.
+    None: the observation that all learners share; raises ``InvalidInput`` naming two learners whose observations
+    differ. By default a vehicle observes one neighbour on each side; with an obstacle ahead also its own place in the
+    line and the obstacle.
     """
     observations = observations_of(scenario)
     if vehicle is None:
@@ -24,10 +25,15 @@ def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSp
 
 
 def observations_of(scenario: Game, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
-    """Return the observation of each vehicle, front to rear, [N]: from ``given``, otherwise from the scenario.
+    """Return the observation of each vehicle, front to rear, [N].
 
-    Both give one observation for all vehicles, or one by name for some: ``{"vehicle_2": ["own", "front_1"]}``. Raises
-    ``UnknownName`` for an unknown vehicle, and what ``choose_observation`` raises.
+    Raises ``UnknownName`` for an unknown vehicle, and what ``choose_observation`` raises.
+
+    Args:
+        scenario: the game, whose own declaration applies unless ``given`` replaces it.
+        given: one observation for all vehicles, or by name for some: ``{"vehicle_2": ["own", "front_1"]}``; None: what
+            the scenario declares.
+
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
     usual = ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
@@ -47,9 +53,10 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
 
 
 def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game) -> ObservationSpec:
-    """Return the observation that all learners share, of one per vehicle; without learners, that all vehicles share.
+    """Return the observation that all learners share; without learners, the one that all vehicles share.
 
-    Raises ``InvalidInput`` naming two of them with different observations.
+    Raises ``InvalidInput`` naming two vehicles whose observations differ. ``observations``: one per vehicle, front to
+    rear.
     """
     first, *others = scenario.learners or range(scenario.vehicles)
     for other in others:

@@ -3,8 +3,8 @@
 Built-in terms, for vehicle i and one step (the paper's section on the reward, with its printed defects repaired):
 
 =========  =======================================================================================================
-harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total); or by how
-           much the step raised what the vehicle's ``objective`` makes of the harm so far
+harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total); or minus
+           the change in this step of the amount that the vehicle's ``objective`` minimises
 collision  the paper's r_collision: minus ``sum_p k_energy w_p^2`` over every impact of the step
 risk       the paper's r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))``; an
            opening pair has TTC = infinity (first part 0) and ``d - d_safe`` is not negative
@@ -36,11 +36,11 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class WithoutEffect(UserWarning):
-    """Something that was given changes nothing here."""
+    """Warning: a setting has no effect, for example an objective in a reward that gives harm the weight 0."""
 
 
 def own_terms() -> list[str]:
-    """Names of the measures that are not built in; nothing is loaded."""
+    """Return the names of the registered measures, which are not built in; nothing is loaded."""
     return [name for name in MEASURES if name not in RewardParams.model_fields]
 
 
@@ -61,8 +61,9 @@ class RewardParams(FileModel):
     """Weights of the terms and their constants; a weight of 0 switches a term off.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of the terms that the module's head lists;
-            harm must be given beside any other.
+        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of these terms: harm of the line, all
+            impacts, nearness of a collision, change of the command, an end without collision, and change of a
+            potential. The head of the module has the formulas. harm must be given beside any other.
         harm_count: impacts that count, ``first`` of each pair or ``total``.
         objective: whose harm counts, one name or one for each vehicle; None: the scenario's.
         shaping_discount: the learner's own discount, in (0, 1].
@@ -70,7 +71,7 @@ class RewardParams(FileModel):
         ttc_scale_s: time to collision at which the risk term falls, s.
         safety_buffer_m: distance kept free in the risk term, m.
         target_gap_m: gap below which the risk term rises, m.
-        distance_slope_per_m: how steeply it does, 1/m.
+        distance_slope_per_m: how steeply the risk term rises below that gap, 1/m.
         terms: weights of registered measures, which may be negative: a measure of harm gets a negative one.
 
     >>> import ethbrake_marl as eb
@@ -98,7 +99,7 @@ class RewardParams(FileModel):
     @model_validator(mode="before")
     @classmethod
     def _own_terms(cls, value: Any) -> Any:
-        """Weights of registered measures that stand beside the others go where they belong."""
+        """Move the weights of registered measures that stand beside the other settings into ``terms``."""
         if not isinstance(value, dict):
             return value
         beside = {name: weight for name, weight in value.items() if name in own_terms()}
@@ -112,7 +113,7 @@ class RewardParams(FileModel):
     @field_validator("terms")
     @classmethod
     def _settled(cls, value: dict[str, float]) -> dict[str, float]:
-        """Those that count, which are loaded."""
+        """Load the registered measures of ``terms`` and drop those with weight 0."""
         for name in value:
             if name not in own_terms():
                 raise unknown_name("measure", name, own_terms(), may_be_own=True)
@@ -130,7 +131,10 @@ class RewardParams(FileModel):
 
     @model_validator(mode="after")
     def _harm_is_meant(self) -> Self:
-        """Harm weighs 1 by default, and an objective is about harm: neither may hold without being meant."""
+        """Require an explicit weight of harm beside other terms, and a weight of harm above 0 for an objective.
+
+        Harm weighs 1 by default, which must not happen unnoticed.
+        """
         given = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in given]
         right = f"is left out, and would weigh 1 beside {''.join(beside[:1])}; say harm: 1, or 0 for none"
@@ -140,24 +144,29 @@ class RewardParams(FileModel):
         return self
 
     def weight(self, term: str) -> float:
-        """The weight of a built-in term or a registered measure."""
+        """Return the weight of the built-in term or registered measure ``term``; 0 if this reward does not have it."""
         found: float = self.terms[term] if term in self.terms else self.__dict__.get(term, 0.0)
         return found
 
     @property
     def weights(self) -> dict[str, float]:
-        """The weight of every built-in term, and of the registered measures that this reward counts."""
+        """Weight of every built-in term, and of the registered measures in ``terms``, by name."""
         return {name: self.weight(name) for name in (*BUILT_IN, *self.terms)}
 
     @property
     def counted(self) -> tuple[str, ...]:
-        """Names of the terms that this reward counts, in the order of the table."""
+        """Names of the terms with a weight other than 0: built-in terms in order, then registered measures."""
         return tuple(name for name, weight in self.weights.items() if weight != 0.0)
 
     def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
-        """The terms that all vehicles share and that need no more than the step's facts, of many worlds [n] or of one.
+        """Return the terms ``harm`` and ``terminal`` by name, as far as they count and are equal for all vehicles.
 
-        ``harm`` as counted; ``safe_end`` is 1 or 0. With an objective other than everybody's harm, harm is not shared.
+        With an objective the harm term differs between vehicles and is left out.
+
+        Args:
+            harm: harm of the step, of many worlds [n] or of one, m2/s2.
+            safe_end: 1 where the episode ended without any collision, else 0.
+
         """
         terms = {}
         if self.harm > 0.0 and self.objective is None:
@@ -167,18 +176,28 @@ class RewardParams(FileModel):
         return terms
 
     def weighted_sum(self, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:
-        """Reward of every vehicle, [n, N], by terms [n] or [n, N]."""
+        """Return the reward of every vehicle, [n, N]: the sum of weight times term.
+
+        ``terms``: values of each term by name, [n] or [n, N]; ``shape``: (n, N).
+        """
         total = np.zeros(shape)
         for name, term in terms.items():
             total += self.weight(name) * (term if term.ndim == 2 else term[:, np.newaxis])
         return total
 
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
-        """The reward with its objective settled (the scenario's where it has none), and that of each vehicle.
+        """Return this reward with its field ``objective`` filled in, and the parsed objective of each vehicle.
 
-        Everybody's harm alike, the usual one, is ``None`` and no objectives: it needs no telling apart. So is any where
-        harm weighs nothing, with a warning (``WithoutEffect``).
+        The objective is the reward's own, or else the scenario's. If all vehicles minimise everybody's harm (the usual
+        case), the field is None and the tuple is empty. The same holds if harm has weight 0; then a warning
+        (``WithoutEffect``) says that the objective changes nothing.
+
+        Args:
+            of_scenario: objective that the scenario declares.
+            vehicles: number of vehicles in the line.
+
         Raises ``InvalidInput`` for an objective that does not fit the number of vehicles.
+
         """
         declared = of_scenario if self.objective is None else self.objective
         try:
@@ -194,12 +213,17 @@ class RewardParams(FileModel):
         return self.model_copy(update={"objective": declared}), objectives
 
     def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
-        """Minus the least harm ahead, [n], that was found with a constant deceleration of each learner from now on.
+        """Return the potential of the shaping term, [n] m2/s2: minus the least harm ahead that simple braking achieves.
 
-        All others brake fully; harm is what ``harm_count`` counts, from now to the horizon, in the engine's physics.
-        One learner takes the best of nine shares of its capacity. Several begin with full braking and choose so one
-        after the other, front to rear, twice round, each given what the others have chosen: all have the same
-        potential.
+        Each learner holds a constant deceleration from now on; all other vehicles brake fully. A single learner takes
+        the best of nine shares of its capacity. Several learners begin with full braking and choose one after the
+        other, front to rear, twice round; all get the same potential.
+
+        Args:
+            worlds: n worlds of N vehicles.
+            learners: indices of the learners, from 0.
+            horizon_s: end of the episode, s; harm until then counts, by ``harm_count``.
+
         """
         braking = worlds.vehicles.braking_capacity_mps2
         command, least = -braking, np.zeros(worlds.n)
@@ -223,7 +247,7 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Look up a named reward, build one from a mapping of settings, or pass one through.
+    """Return the ``RewardParams`` for a name in ``REWARDS``, a mapping of settings, or parameters (unchanged).
 
     Raises ``UnknownName`` for an unknown name or setting and ``InvalidInput`` for a value out of its range.
     """
@@ -251,5 +275,5 @@ def reward_params(reward: Reward) -> RewardParams:
 
 
 def setting_names() -> list[str]:
-    """The keys that a reward may have: its own, then the registered measures."""
+    """Return the keys that a reward may have: fields of ``RewardParams``, then registered measures."""
     return [*RewardParams.model_fields, *own_terms()]

@@ -22,7 +22,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, checked_num
 
 @compiled
 def finite_among(values: Floats) -> int:
-    """Return how many of the n ``values`` are below infinity.
+    """Return how many entries of ``values`` [n] are below infinity.
 
     A counting loop over an index is compiled to vector instructions.
     """
@@ -39,14 +39,21 @@ def advance_worlds(
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
     restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Advance every world to its time ``until``, in place, and record its harm.
+    """Advance every world to its time ``until``, in place; return the number of impacts and whether the input is valid.
 
-    The first seven arrays (state) are updated, the next six (harm) are filled. ``at`` is 1 if some world has an
-    obstacle ``ahead``, otherwise 0; vehicle i is column ``at + i`` of the table (``physics.rows``). ``rows`` [capacity,
-    LISTED.WIDTH] receives impacts until it is full. ``failed`` [n] receives the status of each world: DONE, or the
-    check of the kernel that failed. A failed world keeps its state; the others go on.
+    A failed world keeps its state; the others go on. The second result is False if some ``until`` or command is
+    invalid. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for example
+    ``gaps`` for ``gaps_m``.
 
-    Returns the number of all impacts, and False if a world's ``until`` or command is invalid.
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2. The first seven arrays, the state, are updated.
+    - ``ahead``: gap to the obstacle ahead, [n] m.
+    - ``first_harm``: harm of first impacts, [n, P] m2/s2. The six arrays from this one to ``ahead_count`` are filled.
+    - ``command``: commands, [n, N] m/s2.
+    - ``until``: time at which each world's segment ends, [n] s.
+    - ``failed``: [n] receives the status of each world: ``FLAG.DONE``, or the code of the check that failed.
+    - ``at``: 1 if some world has an obstacle, otherwise 0; vehicle i is column ``at + i`` of the table
+      (``physics.rows``).
+    - ``rows``: list of impacts, [capacity, LISTED.WIDTH], filled until it is full; further impacts are only counted.
     """
     n, vehicles = speeds.shape
     building = pieces.shape[2] > 0 or finite_among(brake_rate.ravel()) + finite_among(release_rate.ravel()) > 0
@@ -113,7 +120,7 @@ def advance(
     Raises ``InvalidInput`` for an invalid command, end time or ``threads``; ``PhysicsError`` with the failed worlds.
 
     Args:
-        worlds: n worlds of N vehicles.
+        worlds: n worlds of N vehicles; they are not changed.
         command_mps2: commanded acceleration, [n, N] m/s2, negative brakes, within the vehicles' capacities; it has no
             effect before a vehicle's latency has elapsed.
         duration_s: length of the segment, one number or [n], s. Pass this or ``until_s``.
@@ -157,16 +164,24 @@ def advance(
 
 
 class _Part(NamedTuple):
-    """Result of the kernel for a contiguous part of the worlds."""
+    """Result of the kernel ``advance_worlds`` for a contiguous part of the worlds."""
 
     first: int  # row in the whole batch of the part's first world
-    rows: Floats  # impacts, until the array is full; their worlds are numbered from ``first``
+    rows: Floats  # [capacity, LISTED.WIDTH] impacts, until it is full; worlds are numbered within the part
     recorded: int  # number of all impacts
     good: bool  # every end time and command was valid
 
 
 def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part: slice) -> _Part:
-    """Advance the worlds of the slice ``part`` in place."""
+    """Advance the worlds of the slice ``part`` in place; return their impacts and whether the input is valid.
+
+    Args:
+        arrays: array arguments of ``advance_worlds`` for all worlds, in its order.
+        at: 1 if some world has an obstacle ahead, otherwise 0.
+        capacity: number of impacts to record.
+        part: slice of the worlds.
+
+    """
     rows, kernel = np.empty((capacity, LISTED.WIDTH)), cast("Any", advance_worlds)
     whole = part.stop - part.start == len(arrays[0])
     mine = arrays if whole else [array[part] for array in arrays]
@@ -205,7 +220,10 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
 
 
 def _impact_rows(parts: list[_Part], ahead: int) -> ImpactRows:
-    """Join the impacts of all parts; ``ahead`` is 1 if column 0 of the tables is an obstacle, otherwise 0."""
+    """Join the recorded impacts of all parts of a batch.
+
+    ``ahead`` is 1 if column 0 of the kernel's tables is an obstacle, otherwise 0.
+    """
     rows = np.concatenate([part.rows[: part.recorded] for part in parts])
     first = np.repeat([part.first for part in parts], [part.recorded for part in parts])
     return ImpactRows(

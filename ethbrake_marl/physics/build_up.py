@@ -1,5 +1,8 @@
 """Motion with brake build-up: the force moves towards the command at a constant rate, so motion is cubic in time.
 
+The kernels advance one world in a ``table`` with the layout of ``physics.rows``: a row per quantity, a column per
+vehicle or pair.
+
 The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine call for at the moment. It falls at
 the rate BRAKE_RATE and rises at the rate RELEASE_RATE until it equals the command; before the latency has elapsed the
 command counts as 0. The force keeps moving while a vehicle stands, is held, or is struck.
@@ -29,7 +32,12 @@ _PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
-    """Return whether every force equals the command in effect, so that ``move`` is exact until the next onset."""
+    """Return whether no force will change before the next latency elapses: each already equals its command.
+
+    The force of a vehicle is the acceleration by its brakes or engine. A vehicle that brakes in *pieces* (by a fixed
+    sequence of commands) must also have begun the last one. If the result is True, ``constant_motion.move`` is exact.
+    ``table``: one world in the layout of ``physics.rows``.
+    """
     there = True
     for i in range(table.shape[1]):
         there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
@@ -38,9 +46,9 @@ def built_up(table: Floats) -> bool:
 
 @compiled
 def first_return(value: float, rate: float, jerk: float) -> float:
-    """Return the first time > 0 at which ``value + rate t + jerk t^2 / 2`` is 0; infinite if there is none.
+    """Return the first time t > 0 at which ``value + rate t + jerk t^2 / 2`` is 0, in s; infinite if there is none.
 
-    A value of 0 at the start does not count.
+    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. A value that is 0 at t = 0 does not count.
     """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
@@ -60,10 +68,17 @@ def first_return(value: float, rate: float, jerk: float) -> float:
 
 @compiled
 def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
-    """Return the gap after ``time`` t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``, in m.
+    """Return the gap (m) after the time t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``.
 
-    g is ``gap`` (m), w ``closing`` (closing speed, m/s), b ``pressing`` (closing acceleration, m/s2), j ``jerk``
-    (m/s3).
+    Closing quantities are rear minus front.
+
+    Args:
+        gap: present gap g, m.
+        closing: present closing speed w, m/s.
+        pressing: present closing acceleration b, m/s2.
+        jerk: rate j of the closing acceleration, m/s3.
+        time: t, s.
+
     """
     return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
 
@@ -72,10 +87,17 @@ def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: fl
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
     """Return the time of a pair's first contact before ``end`` (s) and the closing speed there; ``(inf, 0)`` if none.
 
-    Like ``contact``, for a closing acceleration that changes at the rate ``jerk`` (m/s3). The closing speed ``w + b t +
-    j t^2 / 2`` has at most two roots, and between them the gap is monotone. The contact lies in the first monotone
-    stretch that ends with a gap of at most 0. Newton's method finds it; bisection keeps the iterates inside the
-    stretch.
+    Like ``contact``, for a closing acceleration that changes with time. The closing speed ``w + b t + j t^2 / 2`` has
+    at most two roots, and between them the gap is monotone. The contact lies in the first monotone stretch that ends
+    with a gap of at most 0. Newton's method finds it; bisection keeps the iterates inside the stretch.
+
+    Args:
+        gap: present gap of the pair, m.
+        closing: present closing speed w (rear minus front), m/s.
+        pressing: present closing acceleration b, m/s2.
+        jerk: rate j of the closing acceleration, m/s3.
+        end: length of the time interval to search, s.
+
     """
     if jerk == 0.0:
         return contact(gap, closing, pressing)
@@ -117,9 +139,11 @@ def contact_within(gap: float, closing: float, pressing: float, jerk: float, end
 
 @compiled(bare=True)
 def plan_force(table: Floats, i: int, wanted: float) -> None:
-    """Set the rate of vehicle ``i``'s force, its next goal and the time until then.
+    """Write into the table how the force of vehicle ``i`` changes next: rate, next goal and the time until then.
 
-    The goal is the command ``wanted``, or 0 if the force changes sign on the way to it.
+    The force is the acceleration by brakes or engine. The goal is the command ``wanted`` (m/s2), or 0 if the force
+    changes sign on the way to it. Writes the rows FORCE, FORCE_RATE, FORCE_TIME and FORCE_VALUE; the time is infinite
+    if the force already equals the command.
     """
     force = table[ROW.FORCE, i]
     force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
@@ -137,7 +161,18 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """Return ``force_range`` under the present force, and the rates at which its two ends move."""
+    """Return a vehicle's own acceleration if it is about to move forward and if backward, and how fast both change.
+
+    The result is ``(forward, backward, rate of forward, rate of backward)``, in m/s2 and m/s3. The two accelerations
+    differ where the force depends on the direction, for example for brakes at standstill, see ``motion.force_range``.
+
+    Args:
+        force: present acceleration by brakes or engine, m/s2.
+        rate: rate at which the force changes, m/s3.
+        speed: present speed, m/s.
+        limit: speed up to which the vehicle drives, m/s.
+
+    """
     if force < 0.0 or (force == 0.0 and rate < 0.0):
         if speed > 0.0:
             return force, force, rate, rate
@@ -154,7 +189,11 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
 
 @compiled
 def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
-    """Return acceleration and jerk of a free body whose force range ``[low, high]`` moves at the two given jerks."""
+    """Return acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several that move as one).
+
+    Its own forces allow every acceleration in the range ``[low, high]`` (m/s2), whose ends move at the rates
+    ``low_jerk`` and ``high_jerk`` (m/s3). The body takes the value nearest to 0, as in ``motion.settle``.
+    """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
     if high < 0.0 or (high == 0.0 and high_jerk < 0.0):
@@ -164,11 +203,12 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 
 @compiled(apart=True, bare=True)
 def pool_moving(table: Floats, first: int, last: int) -> float:
-    """Set accelerations and jerks of the touching vehicles ``first..last``; return the time until two separate (s).
+    """Set accelerations and jerks of touching vehicles; return the time until two of them separate (s).
 
-    All have the same speed. The rule is the isotonic regression of ``impact.pool`` with two differences: vehicles of
-    equal acceleration are joined, and separate later by their jerks; accelerations that differ by no more than rounding
-    count as equal. The time is infinite if no joined vehicles separate.
+    The vehicles are the columns ``first..last`` of ``table`` and have the same speed. A vehicle whose acceleration is
+    at least as large as that of the vehicle in front, up to rounding, joins it: both move as one body with a common
+    acceleration and jerk. They separate later if their jerks differ. The time is infinite if no joined vehicles
+    separate. Writes the rows ACCELERATION, JERK and JOINED.
     """
     count = 0
     for i in range(first, last + 1):
@@ -205,7 +245,11 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 
 @compiled(bare=True)
 def settle_block(table: Floats, block: int, out: int) -> None:
-    """Write acceleration and jerk of the pooled block ``block`` into column ``out``."""
+    """Write the common acceleration and jerk of a pooled block into column ``out`` of the table.
+
+    A block is a run of touching vehicles that move as one body; ``block`` is its column in the rows BLOCK_*, which hold
+    its mass and the sums of mass times force.
+    """
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
         table[ROW.BLOCK_LOW, block] / mass, table[ROW.BLOCK_HIGH, block] / mass,
@@ -215,11 +259,18 @@ def settle_block(table: Floats, block: int, out: int) -> None:
 
 @compiled(bare=True)
 def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
-    """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s).
+    """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s); infinite: never.
 
-    ``value`` and ``jerk`` are the body's acceleration and jerk. A moving body splits where its front vehicles alone
-    would be faster than the whole. A body that is held starts to move where its front vehicles drive away or its rear
-    vehicles would be pushed back.
+    A moving body splits where its front vehicles alone would be faster than the whole. A body that is held starts to
+    move where its front vehicles drive away or its rear vehicles would be pushed back.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        head: column of the body's front vehicle.
+        tail: column of its rear vehicle.
+        value: acceleration of the body, m/s2.
+        jerk: jerk of the body, m/s3.
+
     """
     soonest = math.inf
     held = value == 0.0 and jerk == 0.0
@@ -247,9 +298,10 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
 
 @compiled
 def crossing_s(below: float, rate: float) -> float:
-    """Return when a difference of accelerations, at first ``below`` <= 0, is surely positive (s); infinite: never.
+    """Return the time after which a difference of two accelerations is surely positive (s); infinite: never.
 
-    ``below`` in m/s2; it grows at ``rate`` m/s3.
+    The difference is now ``below`` <= 0 (m/s2) and grows at ``rate`` (m/s3). A small delay is added, so that rounding
+    cannot leave the difference at 0.
     """
     if rate <= 0.0:
         return math.inf
@@ -258,9 +310,11 @@ def crossing_s(below: float, rate: float) -> float:
 
 @compiled(apart=True, bare=True)
 def accelerate_moving(table: Floats) -> float:
-    """Version of ``accelerate`` for brake build-up: set accelerations and jerks; return the time until vehicles part.
+    """Set the acceleration and jerk of every vehicle; return the time until touching vehicles separate (s).
 
-    The time (s) is that until the first touching vehicles separate.
+    Version of ``constant_motion.accelerate`` for brake build-up; ``table`` is one world in the layout of
+    ``physics.rows``. Also sets how each vehicle's force changes next and marks the pairs that move as one body (row
+    JOINED). The time is infinite if no touching vehicles separate.
     """
     vehicles = table.shape[1]
     for i in range(vehicles):
@@ -291,7 +345,20 @@ def accelerate_moving(table: Floats) -> float:
 
 @compiled(apart=True, bare=True)
 def next_moving_event(table: Floats, now: float, end: float, parting: float) -> float:
-    """Version of ``next_event`` for brake build-up; ``parting`` is the time until touching vehicles separate (s)."""
+    """Return the time from ``now`` to the next event, at most ``end - now`` (s).
+
+    An event is a contact, a separation, a vehicle that comes to rest or reaches its speed limit, a command that takes
+    effect, or a force that reaches its command. Also writes into the table when each vehicle next comes to rest or
+    reaches its speed limit, and when each pair comes into contact. Version of ``constant_motion.next_event`` for brake
+    build-up.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.
+        now: present time, counted from the start of the segment, s.
+        end: end of the segment, s.
+        parting: time until touching vehicles separate, s: the result of ``accelerate_moving``.
+
+    """
     vehicles = table.shape[1]
     soonest = min(end - now, parting)
     for i in range(vehicles):
@@ -335,7 +402,10 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 
 @compiled(apart=True, bare=True)
 def move_on_cubics(table: Floats, duration: float) -> bool:
-    """Version of ``move`` for brake build-up: move gaps, speeds and forces; return False if a contact was missed."""
+    """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
+
+    Version of ``constant_motion.move`` for brake build-up; ``table`` is one world in the layout of ``physics.rows``.
+    """
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
         if table[ROW.CONTACT_TIME, p] <= duration:
@@ -377,9 +447,11 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """Version of ``move_apart`` for brake build-up: move each vehicle alone if no two can meet, else return False.
+    """Move every vehicle alone by ``duration`` (s) and return True if no two can meet; otherwise return False.
 
-    Whether two can meet is bounded by the speeds that each of them reaches on its way.
+    In the second case speeds and gaps do not change. Version of ``segment.move_apart`` for brake build-up; ``table`` is
+    one world in the layout of ``physics.rows``. A bound decides whether two vehicles can meet: their gap must exceed
+    ``duration`` times the largest possible closing speed.
     """
     vehicles = table.shape[1]
     slowest_in_front = math.inf
@@ -420,9 +492,16 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Move vehicle ``i`` alone under the command ``wanted``; return its lowest and its highest speed.
+    """Move vehicle ``i`` alone under a constant command; return its lowest and its highest speed on the way (m/s).
 
-    The motion starts at the speed SPEED_VALUE, which is updated; the distance is added to WAY.
+    The motion starts at the speed in row SPEED_VALUE, which is updated, as is FORCE; the distance is added to row WAY.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        i: column of the vehicle.
+        wanted: command, m/s2.
+        duration: length of the motion, s.
+
     """
     speed = table[ROW.SPEED_VALUE, i]
     force = force_now(table[ROW.FORCE, i], wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
@@ -448,7 +527,10 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 
 @compiled(apart=True, bare=True)
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Version of ``move_alone`` for a vehicle that may come to rest or reach its speed limit: event by event."""
+    """Version of ``move_alone`` for a vehicle that may come to rest or reach its speed limit: it moves event by event.
+
+    Arguments, result and updated rows are the same as in ``move_alone``.
+    """
     speed, limit, now = table[ROW.SPEED_VALUE, i], table[ROW.LIMIT, i], 0.0
     slowest, fastest = speed, speed
     while now < duration:

@@ -17,7 +17,7 @@ from ethbrake_marl.physics.state import Floats, Ints, Vehicles, Worlds
 
 
 class Columns(NamedTuple):
-    """First column of each group of quantities in the rows, for N vehicles and P = N - 1 pairs.
+    """First column of each group of quantities in the rows of ``Packed``, for N vehicles and P = N - 1 pairs.
 
     A group ends where the next one begins. *News by link* is the time from which each vehicle may act on information
     about each other one. Its columns exist only if some world needs them; without them a vehicle knows everything from
@@ -27,26 +27,26 @@ class Columns(NamedTuple):
 
     vehicles: int  # the number N itself, not a column
     # of the state
-    time: int
-    speed: int  # N (m/s)
-    command: int  # N, acceleration in force (m/s2)
-    previous: int  # N, acceleration in force before the last segment (m/s2)
-    gap: int  # P (m)
-    hit: int  # P
-    harm: int  # since the start of the episode: first-impact harm P, total harm P, number of impacts P
-    obstacle: int  # gap (infinite: none), hit flag, both harms, impacts; the row's width if it has no obstacle
+    time: int  # 1 column: since Vehicle 1 began to brake (s)
+    speed: int  # N columns (m/s)
+    command: int  # N columns, acceleration in force (m/s2)
+    previous: int  # N columns, acceleration in force before the last segment (m/s2)
+    gap: int  # P columns, bumper to bumper (m)
+    hit: int  # P columns, 1 once the pair has had an impact
+    harm: int  # 3 P columns since the start of the episode: first-impact harm, total harm, number of impacts
+    obstacle: int  # 5 columns: gap (m; infinite: none), hit flag, both harms, impacts; if absent, the row's width
     # of the parameters
-    restitution: int
-    braking: int  # N
-    driving: int  # N
-    latency: int  # N
-    mass: int  # N
-    limit: int  # N
-    brake_rate: int  # N
-    release_rate: int  # N
-    own_latency: int  # N; the row's width if it has no news by link
-    news: int  # N * N, time from which vehicle i acts on news of vehicle j (s)
-    messages: int  # the row's width if it has no periodic messages
+    restitution: int  # 1 column, coefficient of restitution
+    braking: int  # N columns, braking capacity (m/s2)
+    driving: int  # N columns, driving capacity (m/s2)
+    latency: int  # N columns, time before which commands have no effect (s)
+    mass: int  # N columns (t)
+    limit: int  # N columns, speed up to which a vehicle drives (m/s)
+    brake_rate: int  # N columns, rate at which the acceleration in force falls (m/s3)
+    release_rate: int  # N columns, rate at which it rises (m/s3)
+    own_latency: int  # N columns, part of the latency without the channel (s); if absent, the row's width
+    news: int  # N * N columns, time from which vehicle i acts on news of vehicle j (s)
+    messages: int  # M columns, ``physics.messages``; if absent, the row's width
 
 
 OBSTACLE_WIDTH = 5
@@ -68,21 +68,24 @@ _compiled_columns = compiled(_columns_of)
 
 @compiled
 def columns(state: Floats) -> Columns:
-    """Return the columns for rows of ``state`` [n, S] and for their parameters."""
+    """Return the first column of each group of quantities, for rows of ``state`` [n, S] and of their parameters."""
     return _compiled_columns((state.shape[1] + 4) // 8)
 
 
 class Packed(NamedTuple):
     """n worlds packed into two arrays, one row per world."""
 
-    state: Floats  # [n, S]
-    params: Floats  # [n, 1 + 7 N], [n, 1 + 8 N + N * N] or, with M columns of messages, [n, 1 + 8 N + N * N + M]
+    state: Floats  # [n, S] what changes during an episode; columns ``time`` to ``obstacle`` of ``Columns``
+    # parameters of the vehicles and state of the messages; columns ``restitution`` to ``messages`` of ``Columns``:
+    # [n, 1 + 7 N]; with news by link [n, 1 + 8 N + N * N]; with M columns of messages [n, 1 + 8 N + N * N + M]
+    params: Floats
 
     @classmethod
     def of(cls, worlds: Worlds) -> Packed:
-        """Pack worlds at the start of their episode, with harm 0.
+        """Pack ``worlds`` at the start of their episode, with harm 0.
 
-        Columns of the obstacle and of news by link exist only if some world needs them.
+        Columns of the obstacle, and of news by link (the time from which each vehicle may act on information about each
+        other one), exist only if some world needs them.
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
@@ -102,7 +105,7 @@ class Packed(NamedTuple):
 
     @property
     def column(self) -> Columns:
-        """Index of the first column of each group."""
+        """First column of each group of quantities in these rows."""
         return _known_columns((self.state.shape[1] + 4) // 8)
 
     @property
@@ -112,7 +115,7 @@ class Packed(NamedTuple):
 
     @property
     def has_news(self) -> bool:
-        """Whether the rows have columns for news by link."""
+        """Whether the rows have columns for news by link: when each vehicle may act on information about others."""
         return bool(self.params.shape[1] > self.column.own_latency)
 
     @property
@@ -130,6 +133,11 @@ class Packed(NamedTuple):
         """Return the rows with columns for an obstacle, and for news by link, if requested and not there yet.
 
         The new columns say that there is no obstacle, and that each vehicle knows everything from its own latency on.
+
+        Args:
+            obstacle: add the columns of an obstacle.
+            news: add the columns of news by link.
+
         """
         (state, params), column = self, self.column
         if obstacle and not self.has_obstacle:
@@ -141,7 +149,10 @@ class Packed(NamedTuple):
         return Packed(state, params)
 
     def worlds(self, vehicles: Vehicles | None = None) -> Worlds:
-        """Unpack the worlds into new arrays; ``vehicles``, if given, are reused instead of unpacked."""
+        """Unpack the worlds into new arrays.
+
+        ``vehicles``: parameters to use in the result; None: unpack them too.
+        """
         (state, params), column, far = self, self.column, not self.has_obstacle
         return Worlds(
             self._vehicles() if vehicles is None else vehicles,
@@ -174,17 +185,17 @@ class Packed(NamedTuple):
 
     @property
     def known_from_s(self) -> Floats:
-        """``Vehicles.known_from_s`` of these rows, [n, N, N] s, as a new array."""
+        """Time from which vehicle i acts on news of vehicle j, [n, N, N] s, as a new array."""
         column = self.column
         if not self.has_news:
             return Vehicles.known_at_once(self.params[:, column.latency : column.mass].copy())
         return self.params[:, column.news : column.messages].copy().reshape(-1, column.vehicles, column.vehicles)
 
     def ledger(self) -> tuple[Floats, Floats, Ints, Floats, Floats, Ints]:
-        """Return harm and impacts since the start of the episode.
+        """Return six arrays: harm and impacts since the start of the episode, for the pairs and for the obstacle.
 
-        First-impact harm, total harm and number of impacts of each pair, [n, P] each; then the same of the obstacle,
-        [n] each.
+        First-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each pair, [n, P] each; then the same
+        three for the obstacle, [n] each.
         """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1
         first, total, count = (state[:, at : at + pairs].copy() for at in range(column.harm, column.obstacle, pairs))

@@ -1,4 +1,7 @@
-"""Motion under constant accelerations: set the accelerations, find the next event, move to it. Compiled."""
+"""Motion of one world under constant accelerations: set the accelerations, find the next event, move to it. Compiled.
+
+The kernels work on a ``table`` in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def accelerate(table: Floats) -> None:
-    """Set the acceleration of every vehicle, coupling touching ones, and mark the pairs that move as one body."""
+    """Set the acceleration of every vehicle, coupling touching ones, and mark the pairs that move as one body.
+
+    Reads speeds, commands and gaps of ``table``; writes the rows ACCELERATION and JOINED.
+    """
     vehicles = table.shape[1]
     for i in range(vehicles):
         wanted = table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
@@ -41,7 +47,15 @@ def accelerate(table: Floats) -> None:
 def next_event(table: Floats, now: float, end: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    Also writes into the table when each vehicle reaches its next speed event and when each pair comes into contact.
+    An event is a contact, a vehicle that comes to rest or reaches its speed limit, or a command that takes effect. Also
+    writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each pair comes into
+    contact.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, after ``accelerate``.
+        now: present time, counted from the start of the segment, s.
+        end: end of the segment, s.
+
     """
     vehicles = table.shape[1]
     soonest = end - now
@@ -67,9 +81,10 @@ def next_event(table: Floats, now: float, end: float) -> float:
 
 @compiled(bare=True)
 def move(table: Floats, duration: float) -> bool:
-    """Move the world by ``duration`` (s), to its next event; return False if a gap became impossibly negative.
+    """Move the world of ``table`` to its next event, ``duration`` (s) later; return False if a contact was missed.
 
-    Quantities that reach an event are set to its exact value: a gap to 0, a speed to 0 or the speed limit.
+    Quantities that reach an event are set to its exact value: a gap to 0, a speed to 0 or the speed limit. A missed
+    contact shows as a negative gap.
     """
     sound = True
     for p in range(table.shape[1] - 1):
@@ -89,9 +104,10 @@ def move(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_speeds(table: Floats, duration: float) -> None:
-    """Set the speeds after ``duration`` (s).
+    """Set the speeds of ``table`` to those after ``duration`` (s), before or at the next event.
 
-    Joined vehicles get one common speed; the speeds of a pair in contact differ exactly by its closing speed.
+    Vehicles that move as one body get one common speed; the speeds of a pair that comes into contact differ exactly by
+    its closing speed.
     """
     vehicles = table.shape[1]
     first = 0

@@ -1,4 +1,4 @@
-"""Forecast of contacts: when each pair of a line first meets under constant commands, and at what closing speed.
+"""Forecast of contacts: when each pair of a line next has an impact under constant commands, and its closing speed.
 
 Uses the physics of ``advance`` on a table that the caller has filled. The resulting motion is not kept.
 """
@@ -17,11 +17,11 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Contact(NamedTuple):
-    """Rows of the forecast array: the next impact of each pair."""
+    """Row numbers of the forecast array ``found`` [WIDTH, N]; column p describes the next impact of pair p."""
 
     TIME: int = 0  # time from now to the pair's next impact (s); infinite: none
     CLOSING: int = 1  # closing speed of that impact (m/s); 0: none
-    WIDTH: int = 2
+    WIDTH: int = 2  # number of rows
 
 
 CONTACT = _Contact()
@@ -29,10 +29,19 @@ CONTACT = _Contact()
 
 @compiled(apart=True)
 def forecast_contacts(table: Floats, restitution: float, duration: float, found: Floats) -> int:
-    """Simulate one world for ``duration`` (s) and fill ``found`` [CONTACT.WIDTH, N] with each pair's next impact.
+    """Simulate one world for ``duration`` (s) and write each pair's next impact into ``found``; return a status.
 
-    Also fills the harm rows of the table. A pair that had an impact before the forecast can have a next impact here,
-    but it adds no first-impact harm. Returns the status: ``FLAG.DONE``, or the check that failed.
+    The status is ``FLAG.DONE``, or the check that failed. A pair that had an impact before the forecast can have
+    another one here, but that one adds no first-impact harm.
+
+    Args:
+        table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. Its motion
+            and harm rows are overwritten.
+        restitution: coefficient of restitution of every impact, in [0, 1].
+        duration: length of the forecast, s.
+        found: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is the
+            time to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
+
     """
     for p in range(table.shape[1] - 1):
         found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = math.inf, 0.0

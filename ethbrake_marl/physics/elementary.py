@@ -76,7 +76,7 @@ _FRACTIONS = 150  # terms of the continued fraction: for x >= 2 its remainder is
 
 @compiled
 def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
-    """Evaluate a polynomial by Horner's rule; coefficients from the highest power down."""
+    """Evaluate the polynomial with these coefficients (highest power first) at ``x``, by Horner's rule."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient
@@ -98,7 +98,7 @@ def power_of_two(k: int) -> float:
 
 @compiled
 def exp_rest(x: float, k: int) -> float:
-    """Return ``e^x / 2^k`` for the whole k nearest to ``x / ln 2``.
+    """Return ``e^x / 2^k``; pass the whole number k nearest to ``x / ln 2``.
 
     Taylor's series to the 13th power of ``x - k ln 2``, which lies within ``ln(2) / 2`` of 0; relative error 5e-18.
     """
@@ -121,10 +121,11 @@ def exp(x: float) -> float:
 
 @compiled
 def _log_parts(x: float) -> tuple[float, float]:
-    """Return ``ln x`` of a finite x > 0 as a sum of two numbers: a multiple of a constant, exact, and a small rest.
+    """Return two numbers whose sum is ``ln x``, for a finite x > 0, more accurate than one number could be.
 
-    ``x = 2^k m`` with m around 1, and ``ln m = 2 artanh(s)`` with ``s = (m - 1) / (m + 1)``; the series of artanh
-    starts with separate first terms.
+    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
+    ``ln 2``, without rounding. The second is the rest of ``k ln 2``, plus ``ln m = 2 artanh((m - 1) / (m + 1))`` by its
+    series.
     """
     k, m = 0, x
     while m >= _SQRT2:
@@ -199,7 +200,7 @@ def normal_probability(x: float) -> float:
 
 @compiled
 def exp_each(values: Floats) -> Floats:
-    """Return ``exp`` of each of ``values`` [n]."""
+    """Return ``e^x`` of each entry x of ``values`` [n], as ``exp`` computes it, [n]."""
     found = np.empty(len(values))
     for i in range(len(values)):
         found[i] = exp(values[i])
@@ -208,7 +209,7 @@ def exp_each(values: Floats) -> Floats:
 
 @compiled
 def normal_quantile_each(values: Floats) -> Floats:
-    """Return ``normal_quantile`` of each of ``values`` [n]."""
+    """Return the standard normal quantile of each probability in ``values`` [n], by ``normal_quantile``, [n]."""
     found = np.empty(len(values))
     for i in range(len(values)):
         found[i] = normal_quantile(values[i])

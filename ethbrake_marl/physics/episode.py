@@ -32,16 +32,16 @@ GOES_ON, AT_REST, AT_HORIZON = 0, 1, 2
 
 
 class _Clock(NamedTuple):
-    """Entries of the array ``clock`` of an episode."""
+    """Index of each entry of the array ``clock`` [WIDTH] of an episode."""
 
     START: int = 0  # time of the first decision (s)
     TIME_STEP: int = 1  # time between decisions (s)
     LAST_STEP: int = 2  # number of steps
-    HORIZON: int = 3  # s
-    RESTITUTION: int = 4
-    HARM_IS_TOTAL: int = 5  # 1 if the search minimises total harm, 0 for first-impact harm
-    STEPWISE: int = 6  # 1 to advance one decision at a time, 0 one phase at a time
-    WIDTH: int = 7
+    HORIZON: int = 3  # end of the last step (s)
+    RESTITUTION: int = 4  # coefficient of restitution of every impact
+    HARM_IS_TOTAL: int = 5  # 1 if total harm is to be minimised, 0 for first-impact harm
+    STEPWISE: int = 6  # 1 to advance decision by decision; 0 phase by phase (intervals of constant command)
+    WIDTH: int = 7  # number of entries
 
 
 CLOCK = _Clock()
@@ -54,34 +54,39 @@ _ON_GRID = 1e-6  # part of a step: a time this close before a decision counts as
 
 
 class Grid(NamedTuple):
-    """Decision times of one episode: ``last_step`` decisions from ``first_s`` on, ``time_step_s`` apart."""
+    """Decision times of one episode: from ``first_s`` on, every ``time_step_s``, up to the horizon."""
 
-    first_s: float
-    time_step_s: float
-    last_step: float
-    horizon_s: float  # end of the last step
+    first_s: float  # time of the first decision (s)
+    time_step_s: float  # time between two decisions (s)
+    last_step: float  # number of steps (a whole number)
+    horizon_s: float  # end of the last step (s)
 
 
 class Episode(NamedTuple):
-    """One world in which profiles are simulated."""
+    """One world, prepared for simulating *profiles*: sequences of constant commands for the controlled vehicles.
 
-    table: Floats  # [rows_for(2 K), N], filled with latencies, masses, limits and other vehicles' commands
-    clock: Floats  # [CLOCK.WIDTH]
+    A phase is the time interval of one of these commands.
+    """
+
+    # [rows_for(2 K), N] table in the layout of ``physics.rows``, for K pieces of braking per vehicle; filled with
+    # latencies, masses, limits and other vehicles' commands
+    table: Floats
+    clock: Floats  # [CLOCK.WIDTH] decision times and settings, see ``CLOCK``
     controlled: Ints  # [C] indices of the controlled vehicles
 
 
 class Decisions(NamedTuple):
     """Decision times of one or many worlds: ``first_s``, and every ``time_step_s`` after it."""
 
-    first_s: Floats  # s
-    time_step_s: Floats | float  # s
+    first_s: Floats  # time of the first decision in each world, [n] or one number (s)
+    time_step_s: Floats | float  # time between two decisions (s)
 
     def before(self, time_s: Floats | float) -> Floats:
         """Return the number of decisions before ``time_s``, for example before the horizon."""
         return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
     def latest(self, time_s: Floats) -> Ints:
-        """Return the number of the latest decision at each time, counted from 0; negative before the first decision."""
+        """Return the number of the latest decision at each time (s), counted from 0; negative before the first."""
         number: Floats = np.floor((time_s - self.first_s) / self.time_step_s + _ON_GRID)
         return number.astype(np.int64)
 
@@ -98,31 +103,46 @@ def grid_of(clock: Floats) -> Grid:
 
 @compiled
 def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float, horizon_s: float) -> float:
-    """Return the time at which step number ``step`` ends (s), counted from 1; the last step ends at the horizon."""
+    """Return the time at which step number ``step`` ends (s), counted from 1; the last step ends at the horizon.
+
+    Args:
+        step: number of the step; a step is the time between two decisions.
+        last_step: number of the last step.
+        first_s: time of the first decision, s.
+        time_step_s: time between two decisions, s.
+        horizon_s: end of the last step, s.
+
+    """
     return horizon_s if step >= last_step else first_s + step * time_step_s
 
 
 @compiled
 def time_of(grid: Grid, step: int) -> float:
-    """Return the time at which step number ``step`` begins (s), counted from 0."""
+    """Return the time of decision number ``step`` (s), counted from 0; ``grid`` holds the decision times."""
     return step_end_s(step, grid.last_step, grid.first_s, grid.time_step_s, grid.horizon_s)
 
 
 @compiled
 def onset_s(latency_s: float, time_s: float) -> float:
-    """Return the time from ``time_s`` until a command takes effect (s); 0 or less: it takes effect at once."""
+    """Return the time from ``time_s`` until a command takes effect (s); 0 or less: it takes effect at once.
+
+    ``latency_s`` is the time at which commands begin to have effect, on the same clock as ``time_s``.
+    """
     return latency_s - time_s
 
 
 @compiled
 def stands(speed_mps: float, command_mps2: float) -> bool:
-    """Return whether a vehicle stands still and its command does not start it moving."""
+    """Return whether a vehicle stands still and its command (negative brakes) does not start it moving."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
 
 
 @compiled(within=True)
 def at_rest(table: Floats) -> bool:
-    """Return whether all vehicles stand still and no command or force would start one moving: the episode has ended."""
+    """Return whether all vehicles of ``table`` stand still and no command or force would start one moving.
+
+    Then the episode has ended. ``table``: one world in the layout of ``physics.rows``.
+    """
     for i in range(table.shape[1]):  # numba does not compile all()
         command = table[ROW.COMMAND, i]
         if not stands(table[ROW.SPEED, i], max(command, table[ROW.FORCE, i]) if builds_up(table) else command):
@@ -134,11 +154,20 @@ def at_rest(table: Floats) -> bool:
 def step_episode(
     table: Floats, restitution: float, time: float, until: float, horizon_s: float, no_rows: Floats
 ) -> int:
-    """Advance the table from ``time`` to ``until`` (s) under its commands and add the harm: the one step of an episode.
+    """Advance one world from ``time`` to ``until`` under its commands, and add the harm: the one step of an episode.
 
     Returns GOES_ON, AT_REST, AT_HORIZON (not at rest at the horizon), or minus the status of a failed kernel; after a
-    failure the table is invalid. ``no_rows`` is an empty list of impacts, such as ``table[:0]``. The bits of the result
-    depend on where steps end; the engine's steps go from each decision to the next.
+    failure the table is invalid. The bits of the result depend on where steps end; the engine's steps go from each
+    decision to the next.
+
+    Args:
+        table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
+        restitution: coefficient of restitution of every impact.
+        time: present time, s.
+        until: end of the step, s.
+        horizon_s: end of the episode, s.
+        no_rows: an empty list of impacts, such as ``table[:0]``.
+
     """
     status = advance_table(table, restitution, until - time, time, 0, no_rows, 0)[1]
     if status != FLAG.DONE:
@@ -153,7 +182,20 @@ def step_episode(
 
 @compiled(within=True)
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
-    """``step_episode`` from decision ``step`` to decision ``end``, for a table still loaded from the previous step."""
+    """Advance a world from decision number ``step`` to decision number ``end``; the result is as in ``step_episode``.
+
+    The table must still hold the world as the previous step left it; only the times at which commands take effect are
+    computed anew.
+
+    Args:
+        table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
+        restitution: coefficient of restitution of every impact.
+        grid: decision times.
+        step: number of the decision to start at, from 0.
+        end: number of the decision to stop at.
+        no_rows: an empty list of impacts, such as ``table[:0]``.
+
+    """
     time = time_of(grid, step)
     for i in range(table.shape[1]):
         table[ROW.ONSET, i] = onset_s(table[ROW.LATENCY, i], time)
@@ -164,7 +206,10 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
 def harm_so_far(table: Floats, total: float) -> float:
     """Return the harm of the line since the episode began, summed front to rear (m2/s2).
 
-    ``total``: 1 for total harm, 0 for first-impact harm.
+    Args:
+        table: one world in the layout of ``physics.rows``, with its rows of an episode.
+        total: 1 for the harm of all impacts, 0 for that of each pair's first impact.
+
     """
     value, row = 0.0, ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM
     for p in range(table.shape[1] - 1):
@@ -174,13 +219,22 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 @compiled
 def value_of(table: Floats, total: float) -> float:
-    """Return the value that a search minimises: harm under one count plus ``OTHER_WEIGHT`` times the other (m2/s2)."""
+    """Return the number that a search minimises (m2/s2): the chosen harm, plus ``OTHER_WEIGHT`` times the other one.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, with its rows of an episode.
+        total: 1 if total harm is chosen, 0 for first-impact harm; the other one only decides between equals.
+
+    """
     return harm_so_far(table, total) + OTHER_WEIGHT * harm_so_far(table, 1.0 - total)
 
 
 @compiled
 def save(table: Floats, state: Floats) -> None:
-    """Save the state of a world and its harm so far in a row ``state`` [S]."""
+    """Save the state of a world, and its harm so far, from its ``table`` into the row ``state`` [S].
+
+    The columns are listed at S at the top of this file.
+    """
     vehicles = table.shape[1]
     pairs = vehicles - 1
     for i in range(vehicles):
@@ -196,7 +250,7 @@ def save(table: Floats, state: Floats) -> None:
 
 @compiled
 def restore(table: Floats, state: Floats) -> None:
-    """Restore the state that ``save`` wrote."""
+    """Load the row ``state`` [S], which ``save`` wrote, into the ``table`` of a world."""
     vehicles = table.shape[1]
     pairs = vehicles - 1
     for i in range(vehicles):
@@ -212,20 +266,31 @@ def restore(table: Floats, state: Floats) -> None:
 
 @compiled(apart=True)
 def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
-    """``follow`` a profile from its first phase on."""
+    """Simulate a whole profile: a sequence of constant commands, one per phase.
+
+    Arguments and result are those of ``follow``, with ``phase`` 0.
+    """
     phase = min(0, ends.shape[0])  # 0, but not as a literal: numba would compile everything again for it
     return follow(world, ends, commands, states, phase, bound)
 
 
 @compiled
 def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
-    """Simulate a profile from ``phase`` on; return its value and the number of phases until the episode ends.
+    """Simulate a profile from ``phase`` on; return its value (m2/s2) and the number of phases until the episode ends.
 
-    The number is -1 if the kernel failed. ``states[k]`` [K + 1, S] is the state at the start of phase k: entry
-    ``phase`` is read, later entries are written. ``ends`` [K], ``commands`` [K, C]. The simulation stops as soon as the
-    value reaches ``bound``, because harm never decreases. With ``clock[STEPWISE]`` it advances decision by decision, to
-    the same bits as the engine. Otherwise it advances phase by phase, which is several times faster and differs by
-    rounding.
+    A profile is a sequence of constant commands; a phase is the time interval of one of them. The value is the harm
+    that a search minimises (``value_of``). The number is -1 if the kernel failed. If ``world.clock[CLOCK.STEPWISE]`` is
+    1, it advances decision by decision, to the same bits as the engine. Otherwise it advances phase by phase, which is
+    several times faster and differs by rounding.
+
+    Args:
+        world: the world and its decision times; its table is a workspace.
+        ends: number of the decision at which each phase ends, [K].
+        commands: commands of the C controlled vehicles in each phase, [K, C] m/s2.
+        states: state at the start of each phase, [K + 1, S]: entry ``phase`` is read, later entries are written.
+        phase: number of the first phase to simulate, from 0.
+        bound: stop as soon as the value reaches this (m2/s2), because harm never decreases.
+
     """
     table, clock, controlled = world.table, world.clock, world.controlled
     grid, restitution, total = grid_of(clock), clock[CLOCK.RESTITUTION], clock[CLOCK.HARM_IS_TOTAL]

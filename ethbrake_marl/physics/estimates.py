@@ -23,14 +23,20 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled
 def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> None:
-    """Fill ``out`` [n, S] with the worlds as vehicle ``observer`` estimates them from the messages it has received.
+    """Fill ``out`` with the worlds as vehicle ``observer`` estimates them from the messages it has received.
 
-    ``out`` has the layout of ``physics.columns``. For a vehicle that the observer knows: the newest received place and
-    speed, extrapolated alone under the command received with them. A pair in which the observer sees both vehicles at
-    present has its true gap. Hit flags are known for the observer's own pairs only. A vehicle that the observer does
-    not know is put at rest, at the place of the next vehicle towards the observer, so that it gives no information. A
-    piece that the observer does not know is replaced likewise: a place by that of the next vehicle, a speed or a
-    command by 0.
+    For a vehicle that the observer knows: the newest received place and speed, extrapolated alone under the command
+    received with them. A pair in which the observer sees both vehicles at present has its true gap. Hit flags are known
+    for the observer's own pairs only. A vehicle that the observer does not know is put at rest, at the place of the
+    next vehicle towards the observer, so that it gives no information. A piece that messages do not tell is replaced
+    likewise: a place by that of the next vehicle, a speed or a command by 0.
+
+    Args:
+        state: true state rows of the worlds, [n, S], in the layout of ``physics.columns``.
+        params: their parameter rows, with the columns of messages.
+        observer: index of the observing vehicle, from 0.
+        out: result, [n, S], in the layout of ``state``. Worlds without periodic messages get their true state.
+
     """
     column = columns(state)
     N, gap, speed, command, obstacle = column.vehicles, column.gap, column.speed, column.command, column.obstacle
@@ -79,9 +85,16 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
 
 @compiled
 def moved_on(speed: float, command: float, limit: float, duration: float) -> tuple[float, float]:
-    """Return speed and distance of a vehicle alone after ``duration`` (s) under a command in force.
+    """Return speed (m/s) and distance (m) of a vehicle alone after ``duration`` (s) under a command in force.
 
-    A vehicle that moves backward brakes, whatever the sign of its command. [m/s, m]
+    A vehicle that moves backward brakes, whatever the sign of its command.
+
+    Args:
+        speed: present speed, m/s; may be negative.
+        command: acceleration in force, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+        duration: length of the motion, s.
+
     """
     if speed >= 0.0:
         after, way, _ = solo_motion(speed, command, 0.0, limit, duration)
@@ -93,9 +106,15 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
 
 @compiled
 def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Return speeds and distances of vehicles alone after ``duration`` (s), [n, N] each.
+    """Return speeds (m/s) and distances (m) of vehicles alone after ``duration`` (s), [n, N] each.
 
-    All arguments are [n, N], with speeds of at least 0; a command acts from ``onset`` (s) on. [m/s, m]
+    Args:
+        speed: present speeds, [n, N] m/s, at least 0.
+        command: commands, [n, N] m/s2; negative brakes.
+        onset: time from now until the command takes effect, [n, N] s.
+        limit: speed up to which each vehicle drives, [n, N] m/s.
+        duration: length of the motion, [n, N] s.
+
     """
     after, way = np.empty(speed.shape), np.empty(speed.shape)
     for k in range(speed.shape[0]):

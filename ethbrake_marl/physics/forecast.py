@@ -19,16 +19,16 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 def forecast(
     worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
 ) -> tuple[Floats, Floats]:
-    """Return first-impact and total harm until ``until_s`` if ``vehicle`` held each candidate command, [n, K] each.
+    """Return first-impact and total harm until ``until_s`` if ``vehicle`` held each candidate command.
 
-    Harm is summed over all pairs and the obstacle ahead, if there is one. A world at or after ``until_s`` has harm 0. A
-    pair that was hit before adds no first-impact harm.
+    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. A world at
+    or after ``until_s`` has harm 0. A pair that was hit before adds no first-impact harm.
 
     Args:
         worlds: n worlds of N vehicles.
         command_mps2: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
         vehicle: index of the vehicle, from 0.
-        candidates_mps2: its candidate commands, [n, K] m/s2.
+        candidates_mps2: K candidate commands for it in each world, [n, K] m/s2.
         until_s: absolute end of the forecast, s.
 
     Raises ``InvalidInput`` for arrays of wrong shape or a candidate beyond capacity; ``PhysicsError`` with the worlds
@@ -71,9 +71,18 @@ def forecast_worlds(
     in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, first: Floats, total: Floats,
     failed: Bools,
 ) -> None:  # fmt: skip
-    """Fill ``first`` and ``total`` [n, K] with the harm, and ``failed`` [n] where a check of the kernel failed.
+    """Simulate every world with each candidate command; fill ``first`` and ``total`` [n, K] with the harm (m2/s2).
 
-    ``ahead`` [n] is the gap to an obstacle, ``FAR_AWAY_M`` in a world without one; it is empty if no world has one.
+    ``first`` and ``total`` must be 0 on entry. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names, for example ``gaps`` for ``gaps_m``.
+
+    - ``ahead``: gap to an obstacle, [n] m, ``FAR_AWAY_M`` in a world without one; empty if no world has one.
+    - ``command``: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
+    - ``vehicle``: index of the vehicle that tries the candidates, from 0.
+    - ``candidates``: K candidate commands for it in each world, [n, K] m/s2.
+    - ``until_s``: absolute end of the forecast, s.
+    - ``in_force``: accelerations in force at the start, [n, N] m/s2.
+    - ``failed``: set to True where a check of the kernel failed, [n].
     """
     n, vehicles = speeds.shape
     at = min(ahead.shape[0], 1)  # vehicle i is column at + i; an obstacle is column 0

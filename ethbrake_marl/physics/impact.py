@@ -26,11 +26,20 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Pool vehicles ``first..last`` by mass-weighted isotonic regression into row ``out``; return the number of blocks.
+    """Give touching vehicles values with which none is faster than the vehicle in front; return the number of blocks.
 
-    Rows ``low`` and ``high`` bound the value of each vehicle; they are equal for an ordinary value. All members of a
-    pooled block get the same bits. Rows BLOCK_* describe the blocks. A vehicle of infinite mass (the obstacle) stands
-    still, and so does its block.
+    A vehicle that would be faster than the one in front is pooled with it into a *block*, whose vehicles all get the
+    same value: the mean weighted by mass (isotonic regression). The values are written to row ``out``, and rows BLOCK_*
+    describe the blocks. A vehicle of infinite mass (the obstacle) stands still, and so does its block.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        low: row with the lower bound of each vehicle's value (a speed or an acceleration).
+        high: row with the upper bound; the same row as ``low`` for an exactly known value.
+        first: column of the front vehicle of the touching run.
+        last: column of its rear vehicle.
+        out: row that receives the results.
+
     """
     count = 0
     for i in range(first, last + 1):
@@ -63,13 +72,20 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
-    All clusters of a world have the same restitution. A cluster is plastic if its largest closing speed is below
-    ``PLASTIC_SPEED_MPS``. The common speed of a block is corrected by the mean of the remaining error, so the momentum
-    error stays within 4 eps of ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps its bits.
+    Nothing bounces (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. The vehicles fall into
+    blocks with one common speed before the bounce (``pool``). This speed is corrected by the mean of the remaining
+    error, so the momentum error stays within 4 eps of ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps
+    its bits.
 
-    Exact block speeds are ordered; corrected ones only up to rounding. So in a plastic cluster each speed is finally
-    limited to that of the vehicle in front. Then no pair approaches any more and the instant needs no further round of
-    impacts. Without this step two blocks could exchange a rounding error forever.
+    Corrected speeds are ordered only up to rounding. So if nothing bounces, each speed is finally limited to that of
+    the vehicle in front. Without this step two blocks could exchange a rounding error forever.
+
+    Args:
+        table: one world in the layout of ``physics.rows``.
+        restitution: coefficient of restitution of every impact.
+        first: column of the front vehicle.
+        last: column of the rear vehicle.
+
     """
     largest = 0.0
     for p in range(first, last):
@@ -94,9 +110,10 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 
 @compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
-    """Resolve every cluster with an approaching pair, once; return False if no pair approaches.
+    """Resolve, once, every run of touching vehicles in which some pair approaches; return False if no pair approaches.
 
-    Writes the rows CLOSING, BEFORE and STRUCK of this round of impacts; clears CONTACT_SPEED.
+    ``table``: one world in the layout of ``physics.rows``; ``restitution``: coefficient of restitution in [0, 1].
+    Updates SPEED, writes the rows CLOSING, BEFORE and STRUCK of this round of impacts, and clears CONTACT_SPEED.
     """
     pairs = table.shape[1] - 1
     approaching = False
@@ -130,7 +147,16 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the last round of impacts to the harm and to the list ``rows``; return the new number of impacts."""
+    """Add the last round of impacts to the harm rows and to the list ``rows``; return the new number of impacts.
+
+    Args:
+        table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
+        time_s: time of the impacts, s.
+        world: number to write into the list for this world.
+        rows: list of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
+        recorded: number of impacts counted so far.
+
+    """
     for p in range(table.shape[1] - 1):
         if table[ROW.STRUCK, p] == 0.0:
             continue

@@ -81,7 +81,7 @@ class _Linkable(JITCodeLibrary):  # type: ignore[misc]
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """A compiled function like that of numba's ``njit``, with its own cache and less to compile.
+    """A compiled function like the result of numba's ``njit``, with its own cache and less to compile.
 
     Numba generates machine code and two wrappers for each compiled function that another one calls, although the caller
     already contains its code. And it compiles once per integer literal that is passed as an argument. This class does
@@ -94,7 +94,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self._linked: dict[tuple[Any, ...], Any] = {}  # types of the arguments -> signature, library, environments
 
     def compile(self, sig: Any) -> Any:
-        """Return the machine code for one signature; load it from the cache, or compile and cache it."""
+        """Load or compile the machine code for one numba signature ``sig``, and return its entry point."""
         with global_compiler_lock:
             arguments, returned = normalize_signature(sig)
             if tuple(arguments) not in self.overloads:
@@ -122,7 +122,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.add_overload(made)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return what numba needs to type a call of this kernel from another kernel."""
+        """Return what numba needs to type a call of this kernel from another kernel (numba's own protocol).
+
+        ``args`` and ``kws`` are the numba types of the call's arguments.
+        """
         if not _KNOWN:
             return super().get_call_template(args, kws)
         pysig, folded = self._compiler.fold_argument_types(args, kws)
@@ -133,7 +136,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         return make_concrete_template(self.__name__, self.__name__, signatures), pysig, arguments, {}
 
     def get_overload(self, sig: Any) -> Any:
-        """Return the key under which numba stores the code for a signature."""
+        """Return the key under which numba stores the code for the signature ``sig`` (numba's own protocol)."""
         return self._linked[tuple(normalize_signature(sig)[0])][1] if _KNOWN else super().get_overload(sig)
 
     def _compile_linked(self, arguments: tuple[Any, ...]) -> Any:
@@ -163,7 +166,15 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self._linked[signature.args] = signature, library, environments
 
     def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
-        """Load a kernel from the cache, or make and cache it while no other process makes the same one."""
+        """Load a kernel from the cache, or make and cache it while no other process makes the same one.
+
+        Args:
+            way: ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
+            kinds: numba types of the arguments, and for an entry also of the result.
+            make: compiles the kernel; returns whether it must not be cached, and its parts, which can be pickled.
+            load: takes these parts and makes the kernel usable in this process.
+
+        """
         name = self._name(way, kinds)
         kept = load_kernel(name)
         if kept is None:
@@ -177,7 +188,10 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         load(*pickle.loads(kept))
 
     def _name(self, way: str, kinds: tuple[Any, ...]) -> str:
-        """Return the cache file name of a signature; empty if the sources of the code are not fully known."""
+        """Return the cache file name for argument types ``kinds``; empty if the code's sources are not fully known.
+
+        ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
+        """
         code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
         digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
         if not digest or not own or self.py_func.__closure__:
@@ -195,26 +209,27 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
 
 def _without_c_wrapper(flags: Any) -> Any:
-    """Switch off the C wrapper: these functions are called from Python and from other kernels only."""
+    """Set numba's compiler ``flags`` to make no C wrapper: kernels are called from Python and other kernels only."""
     flags.no_cfunc_wrapper = _KNOWN
     return flags
 
 
 def _symbols(library: Any) -> list[str]:
-    """Return the names of the functions that a library defines for callers from outside."""
+    """Return the names under which other kernels call the functions of ``library``, numba's code of one kernel."""
     return [function.name for function in library._final_module.functions if function.name.startswith("_ZN7cpython")]
 
 
 def _described(kind: Any) -> str:
-    """Describe a type with the field names of its named tuples, which numba's own type name omits."""
+    """Return a text for a numba type ``kind``, with the field names of named tuples, which its own name omits."""
     parts = [_described(part) for part in getattr(kind, "types", ())]
     return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
 
 def load_kernel(name: str) -> bytes | None:
-    """Return the cached content for ``name``; None if it is missing or damaged, or its owner is not this user or root.
+    """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if it cannot be used.
 
-    The owner matters because a cached kernel is executed.
+    It cannot be used if it is missing or damaged, or if its owner is not this user or root: the owner matters because a
+    cached kernel is executed.
     """
     try:
         with (cache_folder() / name).open("rb") as file:
@@ -230,7 +245,7 @@ def load_kernel(name: str) -> bytes | None:
 
 
 def keep_kernel(name: str, content: bytes) -> None:
-    """Cache ``content`` under ``name`` for ``load_kernel``; warn if it cannot be written (for example, full disk)."""
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if that fails (for example, full disk)."""
     folder = cache_folder()
     try:
         handle, part = tempfile.mkstemp(dir=folder, prefix=".")
@@ -251,7 +266,7 @@ def _digest_of(name: str, content: bytes) -> bytes:
 
 @contextmanager
 def _alone(name: str) -> Iterator[None]:
-    """Context manager: hold a lock on ``name`` against other processes, if the file system supports locks."""
+    """Context manager: hold a lock on the cache file ``name`` against other processes, if the file system can lock."""
     if not name:
         yield
         return
@@ -270,7 +285,7 @@ def _alone(name: str) -> Iterator[None]:
 
 @cache
 def digest_of_sources(source: Path) -> str:
-    """Return a hash of all files that the kernels of ``source`` may be compiled from; empty if that is not known.
+    """Return a hash of all files that the kernels in the file ``source`` may be compiled from; empty if not known.
 
     It is not known for code outside a file (a shell), and for a file that was edited after this process started,
     because the process may have imported the older version. A file dated in the future counts as edited, with a
@@ -288,12 +303,12 @@ def digest_of_sources(source: Path) -> str:
 
 
 def _place_of(file: Path) -> str:
-    """Return the path of a file inside this package, or the full path of any other file."""
+    """Return the path of ``file`` relative to this package's folder, or its full path if it lies elsewhere."""
     return file.relative_to(_PACKAGE).as_posix() if file.is_relative_to(_PACKAGE) else str(file)
 
 
 def kernel_sources(source: Path) -> list[Path]:
-    """Return ``source`` and all files of this package that its kernels may be compiled from, sorted by name.
+    """Return the file ``source`` and all files of this package that its kernels may be compiled from, sorted by name.
 
     These are the files with kernels that it imports, directly or through other such files, and the files from which any
     of them imports a constant (a name in capitals).
@@ -309,7 +324,7 @@ def kernel_sources(source: Path) -> list[Path]:
 
 @cache
 def _imports(source: Path) -> list[tuple[Path, bool]]:
-    """Return the files with kernels or constants that ``source`` imports, each with whether it has kernels."""
+    """Return (file, whether it has kernels) for the files with kernels or constants that ``source`` imports."""
     found = []
     for module, names in _IMPORT.findall(source.read_bytes()):
         for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):
@@ -320,7 +335,11 @@ def _imports(source: Path) -> list[tuple[Path, bool]]:
 
 
 def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
-    """Return (file, names defined there) for names imported from a module or through a folder's ``__init__``."""
+    """Return (file, names defined there) for each file that the imported ``names`` come from.
+
+    ``module`` is the dotted name in the import: a module, or a folder whose ``__init__`` imports the names from
+    elsewhere.
+    """
     place = _PACKAGE.joinpath(*module.split(".")[1:])
     if place.with_suffix(".py").is_file():
         return [(place.with_suffix(".py"), names)]
@@ -370,10 +389,17 @@ Result = TypeVar("Result")
 
 
 def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Result]:
-    """Return the results of ``work`` on up to ``threads`` contiguous slices of ``n`` rows, in the order of the rows.
+    """Return the results of ``work`` on contiguous slices that divide the rows 0 to n - 1, in the order of the rows.
 
-    The calling thread does the first part, so ``threads=1`` starts no thread. If parts fail, all parts end and then the
-    error of the first failed part is raised. Raises ``InvalidInput`` unless ``threads`` is a whole number >= 1.
+    There is one slice per thread, so up to ``threads`` results. The calling thread does the first slice, so
+    ``threads=1`` starts no thread. If slices fail, all others still end, and then the error of the first failed slice
+    is raised. Raises ``InvalidInput`` unless ``threads`` is a whole number >= 1.
+
+    Args:
+        work: function of a slice of the rows, called once per slice.
+        n: number of rows.
+        threads: largest number of threads.
+
     """
     check_whole_number("threads", threads, 1)
     parts = min(int(threads), n)

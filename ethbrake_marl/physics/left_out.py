@@ -17,9 +17,16 @@ LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out
 
 
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
-    """Return the result of ``measure`` on those of ``n`` worlds that do not fail, their rows, and the worlds left out.
+    """Measure n worlds without those that fail; return the result, the rows that were measured, and the failed rows.
 
-    Like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
+    Like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails. The failed rows come as (row,
+    reason), in ascending order.
+
+    Args:
+        measure: function of rows (indices of worlds, from 0 to n - 1); raises ``PhysicsError`` naming the worlds that
+            fail, numbered within these rows.
+        n: number of worlds.
+
     """
     found, rows, failed = leaving_out_failed(measure, np.arange(n))
     if found is None:
@@ -28,11 +35,16 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
-    """Return the result of ``work`` on those ``rows`` that do not fail, these rows, and the failures as row -> reason.
+    """Run ``work`` without the rows that fail; return its result, the rows it used, and the failures as row -> reason.
 
-    ``work`` takes rows of a batch; its ``PhysicsError`` numbers the worlds within the rows it was called with. A
-    world's result does not depend on its batch, so ``work`` is simply repeated without the failed rows until none
+    A world's result does not depend on its batch, so ``work`` is simply repeated without the failed rows until none
     fails. The result is None if no row is left.
+
+    Args:
+        work: function of rows of a batch; raises ``PhysicsError`` naming the worlds that fail, numbered within these
+            rows.
+        rows: indices of the worlds to begin with, [k].
+
     """
     failed: dict[int, str] = {}
     while len(rows):
@@ -47,11 +59,11 @@ def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Resu
 
 @dataclass(frozen=True, slots=True)
 class ImpactRows:
-    """Every impact of a segment, ordered by world and then by time; arrays [k]."""
+    """Every impact of a segment (an interval of constant commands), ordered by world and then by time; arrays [k]."""
 
-    world: Ints
+    world: Ints  # row of the world in the batch
     pair: Ints  # index of the pair; -1: Vehicle 1 and the obstacle ahead
-    time_s: Floats  # since Vehicle 1 began to brake
+    time_s: Floats  # time since Vehicle 1 began to brake
     closing_speed_mps: Floats  # just before the impact, > 0
     first: Bools  # whether this is the pair's first impact
     front_speed_change_mps: Floats  # change of the front vehicle's speed in this round of impacts, >= 0
@@ -60,7 +72,10 @@ class ImpactRows:
 
 @dataclass(frozen=True, slots=True)
 class Impacts:
-    """Harm and number of impacts in a segment. The harm of an impact is its squared closing speed (m2/s2)."""
+    """Harm and number of impacts in a segment (a time interval of constant commands).
+
+    The harm of an impact is its squared closing speed, in m2/s2. Pair p is (vehicle p, vehicle p + 1).
+    """
 
     first_impact_harm: Floats  # [n, P] harm of each pair's first impact of the episode, if it is in this segment
     total_harm: Floats  # [n, P] harm of every impact
@@ -72,5 +87,5 @@ class Impacts:
 
     @staticmethod
     def no_obstacle(n: int) -> tuple[Floats, Floats, Ints]:
-        """Return zeros for first-impact harm, total harm and number of impacts with an obstacle, [n] each."""
+        """Return zeros for the three obstacle fields of n worlds: first-impact harm, total harm and count, [n] each."""
         return np.zeros(n), np.zeros(n), np.zeros(n, np.int64)

@@ -59,34 +59,34 @@ CONTENTS = len(PIECES)  # number of columns that say what messages of one vehicl
 
 
 class _Channel(NamedTuple):
-    """Columns of the head, which all links of a world share."""
+    """Column numbers of the head of the messages: quantities that all links of a world share."""
 
-    PERIOD: int = 0
-    DELAY: int = 1
-    LOSS_BEGINS: int = 2
-    LOSS_ENDS: int = 3
-    KEY: int = 4
-    TAKEN: int = 5
-    OBSTACLE_PLACE: int = 6
-    WIDTH: int = 7
+    PERIOD: int = 0  # time between two messages of a link (s); 0: the world has no periodic messages
+    DELAY: int = 1  # time from sending a message to its use (s)
+    LOSS_BEGINS: int = 2  # probability per message that a good channel turns bad
+    LOSS_ENDS: int = 3  # probability per message that a bad channel turns good again
+    KEY: int = 4  # seed of the message losses, a whole number below 2^53
+    TAKEN: int = 5  # number of samples taken so far
+    OBSTACLE_PLACE: int = 6  # place of the obstacle ahead (m); infinite: none
+    WIDTH: int = 7  # number of columns of the head
 
 
 CHANNEL = _Channel()
 
 
 class _Link(NamedTuple):
-    """Columns of a link from a sender to a receiver."""
+    """Column numbers of a link, which is one direction between two vehicles, from a sender to a receiver."""
 
     NEXT_SENT: int = 0  # when the next unprocessed message is sent (s); infinite: no messages on this link
     NUMBER: int = 1  # number of that message; 0 is the first message that arrives
     BAD: int = 2  # 1 while the channel is bad
     SEEN_FROM: int = 3  # time from which the receiver measures the sender (s); infinite: never
     TOLD_S: int = 4  # when the newest received state was sampled (s); below 0: nothing received
-    TOLD_PLACE: int = 5
-    TOLD_SPEED: int = 6
-    TOLD_COMMAND: int = 7
-    TOLD_HIT: int = 8  # whether Vehicle 1 had hit the obstacle at that time
-    WIDTH: int = 9
+    TOLD_PLACE: int = 5  # place of the sender in that state (m)
+    TOLD_SPEED: int = 6  # speed of the sender in that state (m/s)
+    TOLD_COMMAND: int = 7  # acceleration in force of the sender in that state (m/s2)
+    TOLD_HIT: int = 8  # 1 if Vehicle 1 had hit the obstacle at that time, else 0
+    WIDTH: int = 9  # number of columns of a link
 
 
 LINK = _Link()
@@ -100,13 +100,19 @@ _ON_GRID = 1e-9
 
 @compiled
 def place_at(vehicles: int) -> int:
-    """Return the first column of the places, relative to the head."""
+    """Return the column at which the places of the vehicles begin, counted from the first column of the messages.
+
+    A place is a position along the road (m). ``vehicles``: number N of vehicles.
+    """
     return CHANNEL.WIDTH
 
 
 @compiled
 def link_at(receiver: int, sender: int, vehicles: int) -> int:
-    """Return the first column of the link from ``sender`` to ``receiver``, relative to the head."""
+    """Return the first column of the link from ``sender`` to ``receiver`` (vehicle numbers from 0).
+
+    Columns are counted from the first column of the messages; ``vehicles`` is N.
+    """
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * (receiver * vehicles + sender)
 
 
@@ -130,7 +136,10 @@ def has_contents(told: Floats, vehicles: int) -> bool:
 
 @compiled
 def ring_at(told: Floats, vehicles: int) -> int:
-    """Return the first column of the ring buffer, relative to the head."""
+    """Return the first column of the ring buffer of samples, counted from the first column of the messages.
+
+    ``vehicles`` is N.
+    """
     contents = vehicles * (CONTENTS + 1 + vehicles) if has_contents(told, vehicles) else 0
     return contents_at(vehicles) + contents
 
@@ -177,31 +186,37 @@ def _known_pieces(told: Floats, time: Floats, vehicles: int, receiver: int, know
 
 
 class Told(NamedTuple):
-    """Newest state of each vehicle that one vehicle has received, [n, N] each; views of the columns."""
+    """Newest state of each vehicle that one receiving vehicle has received, by message or by sight.
 
-    at_s: Floats  # when the state was sampled; below 0: nothing received
-    place_m: Floats
-    speed_mps: Floats
-    command_mps2: Floats
+    Arrays are [n, N] unless stated otherwise, with column j for sender j; they are views of the columns.
+    """
+
+    at_s: Floats  # time at which the state was sampled (s); below 0: nothing received
+    place_m: Floats  # front of vehicle j in that state; 0 is the front of Vehicle 1 at the alert (m)
+    speed_mps: Floats  # speed of vehicle j in that state (m/s)
+    command_mps2: Floats  # acceleration in force of vehicle j in that state (m/s2)
     obstacle_hit: Floats  # 1 if Vehicle 1 had hit the obstacle at that time
-    own_place_m: Floats  # [n] present place of the receiving vehicle
-    obstacle_place_m: Floats  # [n] place of the obstacle ahead; infinite: none
+    own_place_m: Floats  # [n] present place of the receiving vehicle (m)
+    obstacle_place_m: Floats  # [n] place of the obstacle ahead (m); infinite: none
 
 
 class Messages(NamedTuple):
-    """Columns of the periodic messages of n worlds."""
+    """Periodic messages of n worlds: what each vehicle has received from the others, and the channel's settings."""
 
-    columns: Floats  # [n, M]; M is 0 without periodic messages
-    vehicles: int
+    columns: Floats  # [n, M] the columns that the module describes; M is 0 without periodic messages
+    vehicles: int  # number N of vehicles in a line
 
     @classmethod
     def of(cls, worlds: Worlds) -> Messages:
-        """Return the message columns of ``worlds``."""
+        """Return the messages of ``worlds``, as a view of their columns."""
         return cls(worlds.messages, worlds.N)
 
     @staticmethod
     def ring_length(delay_s: float, time_step_s: float) -> int:
-        """Return the number of samples to store: those taken during a message's delay, and one at each end."""
+        """Return the number of samples to store: those taken during a message's delay, and one at each end.
+
+        ``delay_s``: time from sending a message to its use (s); ``time_step_s``: time between two samples (s).
+        """
         return math.ceil(delay_s / time_step_s - _ON_GRID) + 3
 
     @classmethod
@@ -209,18 +224,18 @@ class Messages(NamedTuple):
         cls, heard_s: Floats, seen_s: Floats, key: Floats, samples: int, *, period_s: float, delay_s: float,
         loss_begins: float, loss_ends: float, contents: Bools | None = None,
     ) -> Messages:  # fmt: skip
-        """Return the columns at the alert, before any message is sent.
+        """Return the messages of n worlds at the alert (time 0), before any message is sent.
 
         Args:
-            heard_s: when vehicle i can first use a message of vehicle j, [n, N, N]; infinite: never.
-            seen_s: from when on vehicle i measures vehicle j, [n, N, N]; infinite: never.
+            heard_s: time at which vehicle i can first use a message of vehicle j, [n, N, N] s; infinite: never.
+            seen_s: time from which vehicle i measures vehicle j, [n, N, N] s; infinite: never.
             key: seed of the message losses, [n], whole numbers below 2^53.
             samples: length of the ring buffer, see ``ring_length``.
-            period_s: time between two messages of a link.
-            delay_s: time from sending a message to its use.
+            period_s: time between two messages of a link, s.
+            delay_s: time from sending a message to its use, s.
             loss_begins: probability that a good channel turns bad, per message.
             loss_ends: probability that a bad channel turns good again, per message.
-            contents: whether messages of vehicle j contain each of ``PIECES``, [N, CONTENTS]; None: the usual ones.
+            contents: whether messages of vehicle j contain each of ``PIECES``, [N, CONTENTS]; None: all but intent.
 
         """
         n, N = heard_s.shape[:2]
@@ -240,13 +255,13 @@ class Messages(NamedTuple):
 
     @property
     def links(self) -> Floats:
-        """Columns of every link, [n, N, N, LINK.WIDTH]; a view."""
+        """Columns of every link, [n, N, N, LINK.WIDTH], by world, receiver, sender and entry (``LINK``); a view."""
         N = self.vehicles
         return self.columns[:, link_at(0, 0, N) : contents_at(N)].reshape(-1, N, N, LINK.WIDTH)
 
     @property
     def periodic(self) -> Bools:
-        """Worlds in which messages are sent periodically, so that knowledge of others ages between them, [n]."""
+        """Whether a world sends messages periodically, so that knowledge of others ages between them, [n]."""
         return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
 
     @property
@@ -307,17 +322,21 @@ class Messages(NamedTuple):
         return columns
 
     def newest_told(self, vehicle: int) -> Told:
-        """Return the newest states that ``vehicle`` has received, in worlds with columns of messages."""
+        """Return the newest state of every vehicle that ``vehicle`` (index from 0) has received.
+
+        All worlds must have columns of messages.
+        """
         own, obstacle = self.columns[:, place_at(self.vehicles) + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
         told = self.links[:, vehicle]
         at_s, place, speed, command, hit = (told[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
         return Told(at_s, place, speed, command, hit, own, obstacle)
 
     def age_s(self, time_s: Floats) -> Floats:
-        """Return the age at ``time_s`` [n] of what vehicle i last received from vehicle j, [n, N, N] s.
+        """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
-        Age is counted from when the state was sampled. It is 0 without periodic messages, where the present is known,
-        and infinite if nothing was received yet. ``Vehicles.known_from_s`` says from when on vehicle i may act on it.
+        Age is counted from when the state was sampled. It is 0 in worlds without periodic messages, where the present
+        state is known, and infinite if nothing was received yet. ``Vehicles.known_from_s`` says from when on vehicle i
+        may act on it.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():
@@ -354,9 +373,15 @@ def refuse_untold(
 
 @compiled
 def chance(key: float, link: int, number: float) -> float:
-    """Return a random number in [0, 1) for message ``number`` of a link, in the world of this ``key``.
+    """Return a random number in [0, 1) that decides whether a message is lost; a pure function of its arguments.
 
-    The number has 53 bits of a SplitMix64 hash of its arguments.
+    The number has 53 bits of a SplitMix64 hash.
+
+    Args:
+        key: seed of the message losses in this world, a whole number below 2^53.
+        link: number of the link, ``receiver * N + sender``.
+        number: number of the message on this link, from 0.
+
     """
     z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
     z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
@@ -372,20 +397,21 @@ def hear_rows(
     moving: Floats, params: Floats, wanted: Floats, until_s: Floats, decision_s: Floats, time_step_s: float,
     pieces: Floats,
 ) -> None:  # fmt: skip
-    """Process the messages of every world from its time in ``moving`` to ``until_s`` [n], in place.
+    """Advance the messages, and with them the state, of every world from its present time to ``until_s``, in place.
 
-    Samples are taken every ``time_step_s``, counted back from the next decision. A world that ends between two samples
-    measures the present at its end; that sample is not stored. If the kernel cannot advance a world, it receives
-    nothing.
+    A sample of all vehicles is taken at every multiple of ``time_step_s`` before the next decision. A world that ends
+    between two samples measures the present at its end; that sample is not stored. If the kernel cannot advance a
+    world, the world receives nothing more.
 
     Args:
-        moving: state rows of the worlds at the start, [n, S]; they are advanced too.
-        params: their parameter rows, with the columns of messages.
+        moving: state rows of the worlds at the start, [n, S], in the layout of ``physics.columns``; advanced too.
+        params: their parameter rows, whose columns of messages are updated.
         wanted: commands of the vehicles in the meantime, [n, N] m/s2.
         until_s: end times, [n] s.
         decision_s: time of the next decision, [n] s.
         time_step_s: time between decisions, s.
-        pieces: braking in pieces, [N, 2 K], equal in all worlds; see ``Vehicles.pieces``.
+        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K], equal in all
+            worlds; see ``Vehicles.pieces``.
 
     """
     column = columns(moving)
@@ -416,7 +442,18 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Set the places and take the first sample, at the alert."""
+    """Begin the messages of one world at the alert. Updates the rows ``state`` and ``params``.
+
+    Sets the place of each vehicle along the road, stores the first sample of all states, and lets each vehicle measure
+    the vehicles in sight.
+
+    Args:
+        state: state row of one world, [S].
+        params: its parameter row.
+        column: first column of each group of quantities in the two rows.
+        wanted: commands of the vehicles, [N] m/s2.
+
+    """
     N, obstacle, gap, force = column.vehicles, column.obstacle, column.gap, column.command
     told, place = params[column.messages :], place_at(N)
     told[place] = 0.0
@@ -453,7 +490,22 @@ def _move(
     state: Floats, params: Floats, column: Columns, wanted: Floats, end: float, pieces: Floats, table: Floats,
     no_rows: Floats,
 ) -> bool:  # fmt: skip
-    """Advance one world to ``end`` (s), with its places; return False, and change nothing, if the kernel fails."""
+    """Advance one world, and the places of its vehicles, to the time ``end``; return whether the kernel succeeded.
+
+    After a failure nothing has changed.
+
+    Args:
+        state: state row of the world, [S]; updated.
+        params: its parameter row; its places are updated.
+        column: first column of each group of quantities in the two rows.
+        wanted: commands of the vehicles, [N] m/s2.
+        end: time to advance to, s.
+        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
+            ``Vehicles.pieces``.
+        table: workspace in the layout of ``physics.rows``, N + 1 columns; overwritten.
+        no_rows: empty list of impacts, [0, LISTED.WIDTH].
+
+    """
     N, time = column.vehicles, state[column.time]
     speed, command, gap, obstacle = column.speed, column.command, column.gap, column.obstacle
     with_obstacle = state.shape[0] > obstacle and state[obstacle] < math.inf
@@ -493,7 +545,10 @@ def _move(
 
 @compiled
 def _sample(state: Floats, told: Floats, column: Columns) -> None:
-    """Store a sample of every vehicle's state, over the oldest sample of the ring buffer."""
+    """Store a sample of every vehicle's state, over the oldest sample of the ring buffer.
+
+    ``state``: state row of one world, [S]; ``told``: its columns of messages, updated; ``column``: layout of the state.
+    """
     N, obstacle = column.vehicles, column.obstacle
     width, first = sample_width(told, N), ring_at(told, N)
     at = first + width * (int(told[CHANNEL.TAKEN]) % ((told.shape[0] - first) // width))
@@ -510,7 +565,10 @@ def _sample(state: Floats, told: Floats, column: Columns) -> None:
 
 @compiled
 def _receive(time: float, told: Floats, N: int) -> None:
-    """Process every message that can be used by ``time`` (s), and measure the vehicles in sight."""
+    """Process every message of one world that can be used by ``time`` (s), and measure the vehicles in sight.
+
+    ``told``: columns of messages of the world, updated; ``N``: number of vehicles.
+    """
     for i in range(N):
         for j in range(N):
             link = link_at(i, j, N)
@@ -531,9 +589,18 @@ def _receive(time: float, told: Floats, N: int) -> None:
 
 @compiled
 def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> int:
-    """Receive a message sent at ``sent_s``: it carries the sender's newest sample at that time.
+    """Receive one message: copy the sender's newest sample from the ring buffer to the link.
 
-    Return the first column of that sample; 0: there is none any more.
+    It is the newest sample taken at ``sent_s`` or earlier. Nothing changes if the receiver already has a newer one.
+    Return the first column of that sample; 0: none is left.
+
+    Args:
+        told: columns of messages of one world; updated.
+        link: first column of the link, see ``link_at``.
+        sender: index of the sending vehicle, from 0.
+        sent_s: time at which the message is sent, s.
+        N: number of vehicles.
+
     """
     width, first = sample_width(told, N), ring_at(told, N)
     length: int = (told.shape[0] - first) // width

@@ -31,10 +31,15 @@ ONSET_ROUNDING_S = 1e-9  # a latency that elapses this shortly before the end of
 
 
 def has_acted(latency_s: Any, time_s: Any) -> Any:
-    """Return whether a command acts in the interval from 0 to ``time_s``; numbers (in kernels) or arrays, s.
+    """Return whether a command has taken effect before the end of a time interval, for numbers (in kernels) or arrays.
 
     A latency that elapses at the start of the interval counts. A latency that elapses at its end does not: the next
     decision replaces the command before it acts.
+
+    Args:
+        latency_s: time from the start of the interval until the command takes effect, s; may be negative.
+        time_s: length of the interval, s.
+
     """
     return (latency_s <= 0.0) | (latency_s < time_s - ONSET_ROUNDING_S)
 
@@ -44,12 +49,17 @@ command_acts = compiled(has_acted)
 
 @compiled
 def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
-    """Return the time to a pair's first contact and the closing speed there; ``(inf, 0)`` if there is none.
+    """Return the time to a pair's first contact (s) and the closing speed there (m/s); ``(inf, 0)`` if there is none.
 
-    With gap ``g >= 0``, closing speed ``w`` and closing acceleration ``b`` (arguments ``gap``, ``closing``,
-    ``pressing``): ``D = w^2 + 2 b g``. For ``w > 0``: no contact if ``D < 0``, otherwise ``t = 2 g / (w + sqrt D)``.
-    For ``w <= 0``: contact only if ``b > 0``, ``t = (-w + sqrt D) / b``. The closing speed at contact is ``sqrt D``,
-    because ``w + b t`` would suffer cancellation. [m, m/s, m/s2]
+    With ``D = w^2 + 2 b g``: for ``w > 0`` there is no contact if ``D < 0``, otherwise ``t = 2 g / (w + sqrt(D))``. For
+    ``w <= 0`` there is one only if ``b > 0``: ``t = (sqrt(D) - w) / b``. The closing speed at contact is computed as
+    ``sqrt(D)``; the equal ``w + b t`` would suffer cancellation.
+
+    Args:
+        gap: present gap g >= 0, m.
+        closing: present closing speed w (rear minus front), m/s.
+        pressing: constant closing acceleration b (rear minus front), m/s2.
+
     """
     if closing > 0.0:
         squared = closing * closing + 2.0 * pressing * gap
@@ -65,18 +75,30 @@ def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
 
 @compiled
 def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
-    """Return the gap after ``duration`` t at constant closing acceleration: ``g - (w + b t / 2) t``. [m]
+    """Return the gap (m) after the time t at constant closing acceleration: ``g - (w + b t / 2) t``.
 
-    g is ``gap`` (m), w ``closing`` (closing speed, m/s), b ``pressing`` (closing acceleration, m/s2).
+    Args:
+        gap: present gap g, m.
+        closing: present closing speed w (rear minus front), m/s.
+        pressing: closing acceleration b (rear minus front), m/s2.
+        duration: t, s.
+
     """
     return gap - (closing + 0.5 * pressing * duration) * duration
 
 
 @compiled
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
-    """Return the time until the speed next reaches a value where forces change, and that value; ``(inf, 0)``: never.
+    """Return the time (s) until the speed next reaches a value where forces change, and that value (m/s).
 
-    These values are standstill, where brakes hold, and the speed limit of a vehicle that drives.
+    These values are standstill, where brakes hold, and the speed limit of a vehicle that drives. ``(inf, 0)``: never.
+
+    Args:
+        speed: present speed, m/s.
+        acceleration: constant acceleration, m/s2.
+        command: command in force, m/s2; positive drives.
+        limit: speed up to which the vehicle drives, m/s.
+
     """
     if acceleration == 0.0:
         return math.inf, 0.0
@@ -94,10 +116,16 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 
 @compiled
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
-    """Return the acceleration from a vehicle's own forces if it is about to move forward, and if backward.
+    """Return a vehicle's own acceleration (m/s2) if it is about to move forward, and if it is about to move backward.
 
     The two differ where the force is set-valued: brakes at standstill hold against a push from either side, and a
     driving vehicle at its speed limit drives only as much as keeps it there.
+
+    Args:
+        speed: present speed, m/s.
+        command: command in force, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+
     """
     if command < 0.0:
         if speed > 0.0:
@@ -115,7 +143,10 @@ def force_range(speed: float, command: float, limit: float) -> tuple[float, floa
 
 @compiled
 def settle(low: float, high: float) -> float:
-    """Return the acceleration of a free body whose forces range over ``[low, high]``: the value nearest to 0."""
+    """Return the acceleration of a body whose own forces allow ``[low, high]`` (m/s2): the value nearest to 0.
+
+    The body is a vehicle, or several that move as one.
+    """
     if low > 0.0:
         return low
     if high < 0.0:
@@ -127,10 +158,18 @@ def settle(low: float, high: float) -> float:
 def solo_motion(
     speed: float, command: float, onset: float, limit: float, duration: float
 ) -> tuple[float, float, float]:
-    """Move a vehicle alone for ``duration``: coast until ``onset``, then brake to standstill or drive to the limit.
+    """Move a vehicle alone; return its final speed (m/s), its distance (m) and its acceleration (m/s2).
 
-    Returns the final speed, the distance, and the acceleration if it was constant throughout (otherwise NaN).
-    Requires ``speed >= 0``. [m/s, m, m/s2]
+    It coasts until ``onset``, then brakes to standstill or drives up to the limit. The acceleration is NaN unless it
+    was constant throughout.
+
+    Args:
+        speed: present speed, m/s, at least 0.
+        command: command, m/s2; negative brakes.
+        onset: time from now until the command takes effect, s; 0 or less: at once.
+        limit: speed up to which the vehicle drives, m/s.
+        duration: length of the motion, s.
+
     """
     way = 0.0
     steady = command
@@ -155,10 +194,15 @@ def solo_motion(
 
 @compiled
 def stopping_distance(speed: float, latency_left: float, capacity: float) -> float:
-    """Return the distance to rest under full braking after the remaining latency: ``v tau + v^2 / (2 a)``.
+    """Return the distance (m) to rest under full braking after the remaining latency: ``v tau + v^2 / (2 a)``.
 
-    v is ``speed`` (m/s), tau ``latency_left`` (s), a ``capacity`` (m/s2). The distance is 0 if the vehicle does not
-    move forward. [m]
+    The distance is 0 if the vehicle does not move forward.
+
+    Args:
+        speed: present speed v, m/s.
+        latency_left: time tau until the brakes act, s.
+        capacity: largest deceleration a, m/s2.
+
     """
     speed = max(speed, 0.0)
     return speed * latency_left + speed * speed / (2.0 * capacity)
@@ -166,10 +210,17 @@ def stopping_distance(speed: float, latency_left: float, capacity: float) -> flo
 
 @compiled
 def ramped_stopping_distance(speed: float, latency_left: float, capacity: float, rate: float) -> float:
-    """Return ``stopping_distance`` with brakes that build up from 0 at ``rate`` r (m/s3). [m]
+    """Return the distance (m) to rest under full braking with brakes that build up from 0 at a constant rate.
 
-    With capacity a: ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If the vehicle stops before its brakes
-    reach full force, ``v < a^2 / (2 r)``: ``v tau + 2/3 v sqrt(2 v / r)``.
+    It is ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If the vehicle stops before its brakes reach full
+    force, ``v < a^2 / (2 r)``, it is ``v tau + (2 / 3) v sqrt(2 v / r)``.
+
+    Args:
+        speed: present speed v, m/s.
+        latency_left: time tau until the brakes act, s.
+        capacity: largest deceleration a, m/s2.
+        rate: r, m/s3; infinite: the brakes act at once.
+
     """
     speed = max(speed, 0.0)
     if math.isinf(rate):
@@ -182,7 +233,15 @@ def ramped_stopping_distance(speed: float, latency_left: float, capacity: float,
 
 @compiled
 def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
-    """Return ``ramped_stopping_distance`` of n vehicles, [n]."""
+    """Return the distance to rest under full braking of n vehicles, [n] m; see ``ramped_stopping_distance``.
+
+    Args:
+        speed: present speeds, [n] m/s.
+        latency_left: time until the brakes act, [n] s.
+        capacity: largest decelerations, [n] m/s2.
+        rate: rates at which brakes build up, [n] m/s3; infinite: at once.
+
+    """
     distance = np.empty(len(speed))
     for k in range(len(speed)):
         distance[k] = ramped_stopping_distance(speed[k], latency_left[k], capacity[k], rate[k])

@@ -54,10 +54,18 @@ _ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, becau
 def exchange(
     front_mps: float, rear_mps: float, front_t: float, rear_t: float, restitution: float
 ) -> tuple[float, float]:
-    """Return the speeds of a pair after its impact, by the paper's eq. (13).
+    """Return the speeds of a pair (front, rear) after its impact, by the paper's eq. (13), in m/s.
 
-    With w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and
-    ``v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``. [m/s, t]
+    With w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ = v_{i+1} - m_i (1 + e)
+    w / (m_i + m_{i+1})``.
+
+    Args:
+        front_mps: speed v_i of the front vehicle, m/s.
+        rear_mps: speed v_{i+1} of the rear vehicle, m/s.
+        front_t: mass m_i of the front vehicle, t.
+        rear_t: mass m_{i+1} of the rear vehicle, t.
+        restitution: coefficient of restitution e.
+
     """
     impulse = (1.0 + restitution) * (rear_mps - front_mps) / (front_t + rear_t)
     return front_mps + rear_t * impulse, rear_mps - front_t * impulse
@@ -72,6 +80,18 @@ def exchange_at_sample(
 
     As in ``advance``, harm is the squared closing speed of the impact itself, and a closing speed of at most
     ``TOUCH_SPEED_MPS`` is a touch without harm.
+
+    Args:
+        k: row of the world in all arrays.
+        gaps: [n, P] m.
+        speeds: [n, N] m/s; updated.
+        mass: [n, N] t.
+        restitution: coefficient of restitution of this world.
+        hit: whether a pair has had an impact, [n, P]; updated.
+        first_harm: first-impact harm, [n, P] m2/s2; updated.
+        total_harm: harm of all impacts, [n, P] m2/s2; updated.
+        count: number of impacts, [n, P]; updated.
+
     """
     for p in range(gaps.shape[1] - 1, -1, -1):
         closing = speeds[k, p + 1] - speeds[k, p]
@@ -92,10 +112,17 @@ def exchange_at_sample(
 
 @compiled
 def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
-    """Return speed and distance after a step of constant command: ``v + h u`` and ``h v + h^2 / 2 u``. [m/s, m]
+    """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
     u is the command, limited so that the speed ends at standstill or at its limit instead of beyond it. The distance is
     computed as h times the mean of both speeds, which is the same for constant u. Brakes act against the motion.
+
+    Args:
+        speed: speed v at the start, m/s; may be negative after an impact.
+        command: command, m/s2; negative brakes.
+        limit: speed up to which the vehicle drives, m/s.
+        step: length h of the step, s.
+
     """
     after = speed
     if command < 0.0:
@@ -107,7 +134,10 @@ def held_motion(speed: float, command: float, limit: float, step: float) -> tupl
 
 @compiled
 def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> Floats:
-    """Return the speeds of ``held_motion`` after a step, [n, N] m/s."""
+    """Return the speeds after a step of constant command, [n, N] m/s; see ``held_motion``.
+
+    Speeds (m/s), commands (m/s2) and limits (m/s) are [n, N]; ``step`` is the length of the step in s.
+    """
     after = np.empty(speeds.shape)
     for k in range(speeds.shape[0]):
         for i in range(speeds.shape[1]):
@@ -119,7 +149,19 @@ def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> 
 def move_to_grid(
     k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
 ) -> None:
-    """Move world ``k`` exactly, before its first sample and without impacts."""
+    """Move world ``k`` exactly, before its first sample and without impacts. Updates ``gaps`` and ``speeds``.
+
+    Args:
+        k: row of the world in all arrays.
+        duration: length of the motion, s.
+        time: present time, s.
+        gaps: [n, P] m; updated.
+        speeds: [n, N] m/s; updated.
+        command: [n, N] m/s2.
+        latency: time before which commands have no effect, [n, N] s.
+        limit: speed up to which each vehicle drives, [n, N] m/s.
+
+    """
     way_in_front = 0.0
     for i in range(speeds.shape[1]):
         after, way, _ = solo_motion(speeds[k, i], command[k, i], latency[k, i] - time, limit[k, i], duration)
@@ -135,7 +177,20 @@ def sample_worlds(
     last: Ints, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """Advance every world from sample ``first`` to sample ``last``, in place; -1 means before sample 0."""
+    """Advance every world by the paper's fixed-step map, from one sample to another, in place.
+
+    Sample 0 is at the latency of Vehicle 2. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
+    under short names; ``gaps``, ``speeds``, ``time`` and ``hit`` are updated.
+
+    - ``command``: commands, [n, N] m/s2.
+    - ``until``: end times, [n] s; used only in a world that ends before sample 0.
+    - ``step``: sampling period, s.
+    - ``first``: number of the sample at which each world starts, [n]; -1: before sample 0.
+    - ``last``: number of the sample at which it ends, [n]; -1: before sample 0.
+    - ``first_harm``: first-impact harm, [n, P] m2/s2; updated.
+    - ``total_harm``: harm of all impacts, [n, P] m2/s2; updated.
+    - ``count``: number of impacts, [n, P]; updated.
+    """
     for k in range(speeds.shape[0]):
         start = latency[k, 1]
         begin = first[k]
@@ -163,10 +218,10 @@ def advance_sampled(
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
-    Steps are whole: a world ends at its first sample at or after ``until_s``, or at ``until_s`` itself if that is
-    before its first sample. Impacts of the last sample belong to the next call, so calls can be chained; the returned
-    state is the paper's s(n), before these impacts. ``Impacts.rows`` is None. The result of a world does not depend on
-    its batch. Inputs are not changed.
+    Samples are ``step_s`` apart, the first one at the latency of Vehicle 2. A world ends at its first sample at or
+    after ``until_s``, or at ``until_s`` itself if that is before its first sample. Impacts of the last sample belong to
+    the next call, so calls can be chained; the returned state is the paper's s(n), before these impacts.
+    ``Impacts.rows`` is None. The result of a world does not depend on its batch. Inputs are not changed.
 
     Gaps of the result may be negative: it can be continued here, but not by ``advance``.
 
@@ -199,7 +254,17 @@ def advance_sampled(
 
 
 def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> Impacts:
-    """``advance_sampled`` in place, without checks; ``command_mps2`` of the worlds is not updated."""
+    """Advance ``worlds`` in place by the paper's fixed-step map, without checks, and return the impacts.
+
+    Like ``advance_sampled``; ``command_mps2`` of the worlds is not updated.
+
+    Args:
+        worlds: n worlds of N vehicles; updated.
+        command: commanded accelerations, [n, N] m/s2.
+        until: absolute end times, [n] s.
+        step_s: sampling period, s.
+
+    """
     vehicles = worlds.vehicles
     start = vehicles.latency_s[:, 1]
     position, end = (worlds.time_s - start) / step_s, (until - start) / step_s  # times of samples may be rounded
@@ -215,7 +280,10 @@ def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> 
 
 
 def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
-    """Raise ``InvalidInput`` for a step, an end or a state that the map does not cover."""
+    """Raise ``InvalidInput`` for a step length, an end time or a state that the fixed-step map does not cover.
+
+    ``until``: end times, [n] s; ``step_s``: sampling period, s.
+    """
     if not (SHORTEST_STEP_S <= step_s < math.inf):
         raise InvalidInput(f"step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
     good = (until >= worlds.time_s) & (until <= worlds.time_s + MOST_STEPS * step_s)

@@ -1,6 +1,7 @@
 """Braking in pieces: from its onset on, a vehicle follows a fixed sequence of commands instead of the given command.
 
-Its world is advanced like one with brake build-up, whose rates may be infinite.
+A *piece* is a time interval of constant command. The world is advanced like one with brake build-up, whose rates may be
+infinite.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def begin_piece(table: Floats, i: int, now: float) -> None:
-    """Give vehicle ``i`` the command of its piece at ``now`` and write down when its next piece begins.
+    """Set the command of vehicle ``i`` to that of its piece (interval of constant command) at the time ``now``.
 
-    Times are in seconds from the start of the segment.
+    Also writes down when its next piece begins (row NEXT_PIECE). Times are in seconds from the start of the segment.
+    ``table``: one world in the layout of ``physics.rows``.
     """
     count = (table.shape[0] - ROW.PIECES) // 2
     table[ROW.NEXT_PIECE, i] = math.inf
@@ -31,7 +33,10 @@ def begin_piece(table: Floats, i: int, now: float) -> None:
 
 @compiled(bare=True)
 def pieces_to_come(table: Floats) -> bool:
-    """Return whether some vehicle has a piece that has not begun yet."""
+    """Return whether some vehicle has a piece (interval of constant command) that has not begun yet.
+
+    ``table``: one world in the layout of ``physics.rows``.
+    """
     if table.shape[0] > ROW.OF_BUILD_UP:
         for i in range(table.shape[1]):
             if table[ROW.NEXT_PIECE, i] < math.inf:
@@ -41,7 +46,18 @@ def pieces_to_come(table: Floats) -> bool:
 
 @compiled(bare=True)
 def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: float) -> float:
-    """Return the force of vehicle ``i`` at the end of a segment, ``time_s``; 0 command before the latency. [m/s2]"""
+    """Return the force (m/s2) of a vehicle at the end of a segment.
+
+    The force is the acceleration by brakes or engine; before the latency has elapsed the command counts as 0.
+
+    Args:
+        table: the world at the end of the segment, in the layout of ``physics.rows``.
+        i: column of the vehicle.
+        command: its command in the segment, m/s2.
+        latency_s: time before which its commands have no effect, s.
+        time_s: end of the segment, s, counted like ``latency_s``.
+
+    """
     acts = command_acts(latency_s, time_s)
     if not builds_up(table):
         return command if acts else 0.0
@@ -51,5 +67,13 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
 
 @compiled
 def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
-    """Return the force just after the command ``wanted`` takes effect: it jumps only if its rate is infinite. [m/s2]"""
+    """Return the force (m/s2) just after a command takes effect: it jumps to the command only if its rate is infinite.
+
+    Args:
+        force: acceleration by brakes or engine just before, m/s2.
+        wanted: the command, m/s2.
+        brake_rate: rate at which the force falls, m/s3.
+        release_rate: rate at which the force rises, m/s3.
+
+    """
     return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force

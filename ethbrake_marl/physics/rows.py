@@ -1,4 +1,8 @@
-"""The table on which the compiled kernels work, one per world: a row per quantity, a column per vehicle or pair."""
+"""The table on which the compiled kernels work, one per world: a row per quantity, a column per vehicle or pair.
+
+Rows are named by the constants of ``ROW``: ``table[ROW.SPEED, i]`` is the speed of vehicle i. Column p of a pair's
+quantity is the pair (vehicle p, vehicle p + 1). An obstacle ahead is the vehicle in column 0.
+"""
 
 from __future__ import annotations
 
@@ -14,60 +18,64 @@ from ethbrake_marl.physics.state import Floats, Ints
 
 
 class _Rows(NamedTuple):
-    """Rows of the table of one world: quantities of its vehicles, its pairs and its pooled blocks."""
+    """Row numbers of the table of one world: quantities of its vehicles, its pairs and its pooled blocks.
+
+    A *block* is a run of touching vehicles that get one common speed or acceleration. The *force* of a vehicle is the
+    acceleration that its brakes or engine call for.
+    """
 
     # per vehicle
-    SPEED: int = 0
-    MASS: int = 1
-    BEFORE: int = 2  # speed before an impact
-    POOLED: int = 3
+    SPEED: int = 0  # m/s
+    MASS: int = 1  # t; infinite: an obstacle
+    BEFORE: int = 2  # speed before the last round of impacts (m/s)
+    POOLED: int = 3  # common speed of the vehicle's block (m/s)
     # per pair
-    GAP: int = 4
-    CLOSING: int = 5  # closing speed before an impact; 0 if the pair does not touch
-    CONTACT_SPEED: int = 6  # exact closing speed of a pair that has just come into contact, otherwise 0
+    GAP: int = 4  # bumper to bumper (m)
+    CLOSING: int = 5  # closing speed before an impact (m/s); 0 if the pair does not touch
+    CONTACT_SPEED: int = 6  # exact closing speed of a pair that has just come into contact (m/s), otherwise 0
     STRUCK: int = 7  # 1 if the pair had an impact (not a touch) in the last round
     # per pooled block
-    BLOCK_MASS: int = 8
-    BLOCK_LOW: int = 9
-    BLOCK_HIGH: int = 10
-    BLOCK_FIRST: int = 11
+    BLOCK_MASS: int = 8  # total mass (t)
+    BLOCK_LOW: int = 9  # sum of mass times the lower bound of each vehicle's speed or acceleration
+    BLOCK_HIGH: int = 10  # sum of mass times the upper bound
+    BLOCK_FIRST: int = 11  # column of the front vehicle
     # motion, per vehicle
-    COMMAND: int = 12
+    COMMAND: int = 12  # commanded acceleration; negative brakes (m/s2)
     ONSET: int = 13  # when the command takes effect, in seconds from the start of the segment
-    LIMIT: int = 14
+    LIMIT: int = 14  # speed up to which the vehicle drives (m/s)
     ACTIVE: int = 15  # 1 once the command is in effect
-    ACCELERATION: int = 16
-    FORCE_LOW: int = 17
-    FORCE_HIGH: int = 18
-    SPEED_TIME: int = 19  # time to the next speed event
-    SPEED_VALUE: int = 20  # the speed there
-    WAY: int = 21
+    ACCELERATION: int = 16  # until the next event (m/s2)
+    FORCE_LOW: int = 17  # acceleration by own forces if the vehicle is about to move forward (m/s2)
+    FORCE_HIGH: int = 18  # the same if it is about to move backward (m/s2)
+    SPEED_TIME: int = 19  # time until the vehicle stands or reaches its speed limit (s); infinite: never
+    SPEED_VALUE: int = 20  # speed at that time (m/s)
+    WAY: int = 21  # distance travelled in the segment (m)
     # motion, per pair
     JOINED: int = 22  # 1 if the pair moves as one body
-    CONTACT_TIME: int = 23
+    CONTACT_TIME: int = 23  # time to the next contact (s); infinite: none
     HIT: int = 24  # 1 once the pair has had an impact
-    FIRST_HARM: int = 25  # harm in this segment
-    TOTAL_HARM: int = 26
+    FIRST_HARM: int = 25  # harm of the pair's first impact of the episode, if in this segment (m2/s2)
+    TOTAL_HARM: int = 26  # harm of all impacts in this segment (m2/s2)
     COUNT: int = 27  # number of impacts in this segment
     # episode, per vehicle
     LATENCY: int = 28  # when the command takes effect (s since Vehicle 1 began to brake)
     # episode, per pair
-    SUM_FIRST_HARM: int = 29  # harm since the episode began (m2/s2)
-    SUM_TOTAL_HARM: int = 30
+    SUM_FIRST_HARM: int = 29  # first-impact harm since the episode began (m2/s2)
+    SUM_TOTAL_HARM: int = 30  # harm of all impacts since the episode began (m2/s2)
     # brake build-up, per vehicle
-    FORCE: int = 31  # present acceleration by brakes or engine; it moves towards the command (m/s2)
+    FORCE: int = 31  # present force; it moves towards the command (m/s2)
     BRAKE_RATE: int = 32  # rate at which FORCE falls (m/s3); infinite: at once
     RELEASE_RATE: int = 33  # rate at which FORCE rises (m/s3)
     BUILDS_UP: int = 34  # of the world, in column 0: 1 if some rate is finite or some vehicle brakes in pieces
     FORCE_RATE: int = 35  # rate of FORCE until the next event (m/s3)
-    FORCE_TIME: int = 36  # time until FORCE reaches the command or passes 0
-    FORCE_VALUE: int = 37  # FORCE at that time
-    JERK: int = 38
-    LOW_JERK: int = 39  # rate of FORCE_LOW; HIGH_JERK: of FORCE_HIGH
-    HIGH_JERK: int = 40
+    FORCE_TIME: int = 36  # time until FORCE reaches the command or passes 0 (s)
+    FORCE_VALUE: int = 37  # FORCE at that time (m/s2)
+    JERK: int = 38  # rate of ACCELERATION until the next event (m/s3)
+    LOW_JERK: int = 39  # rate of FORCE_LOW (m/s3)
+    HIGH_JERK: int = 40  # rate of FORCE_HIGH (m/s3)
     # per pooled block
-    BLOCK_LOW_JERK: int = 41
-    BLOCK_HIGH_JERK: int = 42
+    BLOCK_LOW_JERK: int = 41  # sum of mass times LOW_JERK
+    BLOCK_HIGH_JERK: int = 42  # sum of mass times HIGH_JERK
     # number of rows that a table needs
     OF_IMPACT: int = 12  # for impacts only
     OF_SEGMENT: int = 28  # for a segment
@@ -82,15 +90,22 @@ ROW = _Rows()
 
 
 class _Flags(NamedTuple):
-    """Status of a world after the kernel has advanced it."""
+    """Status codes of a world after a kernel has advanced it."""
 
-    IMPACT: int = 0
-    DONE: int = 1
-    PENETRATED: int = 2
-    STUCK: int = 3
+    IMPACT: int = 0  # a round of impacts was resolved; the segment goes on
+    DONE: int = 1  # the end of the segment is reached
+    PENETRATED: int = 2  # failure: a gap became negative, so a contact was missed
+    STUCK: int = 3  # failure: more than BOUND.MOST_EVENTS events
 
     def failure(self, status: Ints, from_s: Floats, until_s: Floats) -> PhysicsError:
-        """Return the error for all worlds with a ``status`` [n] other than DONE."""
+        """Return the error that names every world whose status is not DONE.
+
+        Args:
+            status: status of each world, [n].
+            from_s: start of each world's segment, [n] s, for the message.
+            until_s: end of each world's segment, [n] s, for the message.
+
+        """
         reasons = {self.PENETRATED: "a contact was missed", self.STUCK: f"more than {BOUND.MOST_EVENTS} events"}
         return PhysicsError(
             {
@@ -104,16 +119,16 @@ FLAG = _Flags()
 
 
 class _Listed(NamedTuple):
-    """Columns of the list of impacts."""
+    """Column numbers of the list of impacts, an array with one row per impact."""
 
-    WORLD: int = 0
-    PAIR: int = 1
-    TIME: int = 2
-    CLOSING: int = 3
-    FIRST: int = 4
-    FRONT_CHANGE: int = 5
-    REAR_CHANGE: int = 6
-    WIDTH: int = 7
+    WORLD: int = 0  # number of the world
+    PAIR: int = 1  # column of the pair in the table
+    TIME: int = 2  # time of the impact (s)
+    CLOSING: int = 3  # closing speed just before it (m/s)
+    FIRST: int = 4  # 1 if it is the pair's first impact, else 0
+    FRONT_CHANGE: int = 5  # change of the front vehicle's speed (m/s)
+    REAR_CHANGE: int = 6  # change of the rear vehicle's speed (m/s)
+    WIDTH: int = 7  # number of columns
 
 
 LISTED = _Listed()
@@ -121,21 +136,35 @@ LISTED = _Listed()
 
 @compiled(bare=True)
 def builds_up(table: Floats) -> bool:
-    """Return whether the brakes of this world build up or come in pieces."""
+    """Return whether some vehicle's brakes build up (finite rate) or follow a fixed sequence of commands.
+
+    ``table``: one world in the layout of ``_Rows``.
+    """
     return bool(table.shape[0] > ROW.OF_EPISODE and table[ROW.BUILDS_UP, 0] == 1.0)
 
 
 @compiled
 def rows_for(pieces: int) -> int:
-    """Return the number of table rows for ``pieces`` = 2 K columns of braking in pieces; 0: ROW.OF_BUILD_UP rows."""
+    """Return the number of rows of a table for braking in K pieces per vehicle; pass ``pieces`` = 2 K.
+
+    A piece is a time interval of constant command. With ``pieces`` = 0 the result is ROW.OF_BUILD_UP.
+    """
     return ROW.PIECES + pieces if pieces > 0 else ROW.OF_BUILD_UP
 
 
 @compiled(bare=True)
 def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats) -> None:
-    """Write brake and release rates [N] (m/s3) and pieces [N, 2 K] into a table [rows_for(2 K), N or N + 1].
+    """Write brake rates, release rates and sequences of commands of one world's vehicles into its table.
 
-    If all rates are infinite and no vehicle brakes in pieces, BUILDS_UP is 0 and forces are not used.
+    A piece is one interval of a fixed sequence of commands. If all rates are infinite and no vehicle has pieces,
+    BUILDS_UP is 0 and forces are not used.
+
+    Args:
+        table: table to fill, [rows_for(2 K), N or N + 1]; with N + 1 columns, column 0 is an obstacle.
+        brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite: at once.
+        release_rate: rate at which it rises, [N] m/s3; infinite: at once.
+        pieces: start (s) and command (m/s2) of each piece, [N, 2 K], as in ``Vehicles.pieces``.
+
     """
     at, least = table.shape[1] - brake_rate.shape[0], math.inf
     for row in range(pieces.shape[1]):
@@ -155,7 +184,11 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
 def place_forces(
     table: Floats, force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats
 ) -> None:  # fmt: skip
-    """``place_rates``, and write the forces of the vehicles [N] (m/s2)."""
+    """Write brake and release rates, sequences of commands and present forces of one world's vehicles into its table.
+
+    ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are those of ``place_rates``.
+    Forces are written only if BUILDS_UP is 1.
+    """
     place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:
         for i in range(force.shape[0]):
@@ -164,7 +197,14 @@ def place_forces(
 
 @compiled
 def place_obstacle(table: Floats, gap: float, hit: float) -> None:
-    """Write the obstacle into column 0 of a table; its speed and command stay at the zeros of a new table."""
+    """Write an obstacle into column 0 of a new table; its speed and command stay 0.
+
+    Args:
+        table: table to fill.
+        gap: gap from the obstacle to Vehicle 1, m.
+        hit: 1 if Vehicle 1 has already had an impact with the obstacle, else 0.
+
+    """
     table[ROW.MASS, 0] = math.inf
     table[ROW.GAP, 0] = gap
     table[ROW.HIT, 0] = hit

@@ -1,4 +1,4 @@
-"""Advance one world through a segment of constant commands, from event to event. Compiled."""
+"""Advance one world through a segment (an interval of constant commands), from event to event. Compiled."""
 
 from __future__ import annotations
 
@@ -26,8 +26,17 @@ def advance_table(
 ) -> tuple[int, int]:
     """Advance one world through a segment; return the number of recorded impacts and a status (DONE if successful).
 
-    Writes the harm of the segment to the rows FIRST_HARM, TOTAL_HARM and COUNT. ``rows`` [capacity, LISTED.WIDTH]
-    receives impacts until it is full; further ones are only counted.
+    Writes the harm of the segment to the rows FIRST_HARM, TOTAL_HARM and COUNT.
+
+    Args:
+        table: the world in the layout of ``physics.rows``; it is advanced.
+        restitution: coefficient of restitution of every impact.
+        duration: length of the segment, s.
+        start_s: absolute time at its start, s, for the list of impacts.
+        world: number of the world, for the list of impacts.
+        rows: list of impacts, [capacity, LISTED.WIDTH], filled until it is full; further impacts are only counted.
+        recorded: number of impacts counted so far.
+
     """
     if builds_up(table):
         return advance_on_cubics(table, restitution, duration, start_s, world, rows, recorded)
@@ -38,7 +47,10 @@ def advance_table(
 def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """Version of ``advance_table`` for brake build-up."""
+    """Version of ``advance_table`` for brakes that build up or follow a fixed sequence of commands.
+
+    Same arguments and result.
+    """
     for i in range(table.shape[1]):
         if not command_acts(table[ROW.ONSET, i], duration):
             table[ROW.ONSET, i] = max(table[ROW.ONSET, i], duration)
@@ -50,7 +62,10 @@ def _advance(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int,
     building: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """``advance_table`` for both kinds of motion; callers pass ``building`` as a constant, so only one is compiled."""
+    """Advance one world through a segment, for both kinds of motion; arguments and result of ``advance_table``.
+
+    Callers pass ``building`` (whether brakes build up) as a constant, so that only one kind is compiled.
+    """
     for p in range(table.shape[1] - 1):
         table[ROW.FIRST_HARM, p] = 0.0
         table[ROW.TOTAL_HARM, p] = 0.0
@@ -69,11 +84,17 @@ def _advance(
 
 @compiled(bare=True)
 def move_apart(table: Floats, duration: float, building: bool) -> bool:
-    """Move a world to the end of the segment if no two vehicles can touch; otherwise leave it and return False.
+    """Move a world to the end of the segment and return True if no two vehicles can touch; otherwise return False.
 
-    If both vehicles of a pair have constant accelerations, the time of contact decides exactly. Otherwise a bound
-    decides: speeds are monotone within a segment, so a pair closes by at most ``(max rear speed - min front speed) T``.
-    ``building``: brakes build up, see ``builds_up``.
+    In the second case the world does not move. If both vehicles of a pair have constant accelerations, the time of
+    contact decides exactly. Otherwise a bound decides: speeds are monotone within a segment, so a pair closes by at
+    most ``(max rear speed - min front speed) T``.
+
+    Args:
+        table: the world in the layout of ``physics.rows``.
+        duration: length T of the segment, s.
+        building: whether its brakes build up, see ``builds_up``.
+
     """
     if building:
         return move_apart_on_cubics(table, duration)
@@ -106,7 +127,13 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
 
 @compiled(bare=True)
 def start_events(table: Floats, building: bool) -> None:
-    """Prepare the table for ``to_next_impact`` at the start of a segment."""
+    """Prepare a world for ``to_next_impact`` at the start of a segment: mark the commands that are already in effect.
+
+    Args:
+        table: the world in the layout of ``physics.rows``.
+        building: whether its brakes build up, see ``builds_up``.
+
+    """
     for i in range(table.shape[1]):
         table[ROW.ACTIVE, i] = 1.0 if table[ROW.ONSET, i] <= 0.0 else 0.0
         table[ROW.CONTACT_SPEED, i] = 0.0
@@ -116,9 +143,17 @@ def start_events(table: Floats, building: bool) -> None:
 
 @compiled(bare=True)
 def to_next_impact(table: Floats, restitution: float, now: float, duration: float, building: bool) -> tuple[int, float]:
-    """Move from ``now`` through the events up to and including the next round of impacts, or to the end of the segment.
+    """Move a world up to and including its next round of impacts, or to the end of the segment.
 
-    Returns a status and the time reached: IMPACT (call again), DONE, or the check that failed.
+    Returns a status and the time reached (s): IMPACT (call again), DONE, or the check that failed.
+
+    Args:
+        table: the world in the layout of ``physics.rows``; it is advanced.
+        restitution: coefficient of restitution of every impact.
+        now: present time, counted from the start of the segment, s.
+        duration: length of the segment, s.
+        building: whether its brakes build up, see ``builds_up``.
+
     """
     for _ in range(BOUND.MOST_EVENTS):
         if resolve_impacts(table, restitution):
@@ -133,9 +168,16 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 
 @compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float, building: bool) -> tuple[bool, float]:
-    """Move from ``now`` to the next event or the end of the segment; return False if a gap became impossible.
+    """Move a world to its next event or the end of the segment; return whether all is sound, and the time reached (s).
 
-    Also returns the time reached.
+    The first result is False if a gap became negative, which means that a contact was missed.
+
+    Args:
+        table: the world in the layout of ``physics.rows``; it is advanced.
+        now: present time, counted from the start of the segment, s.
+        duration: length of the segment, s.
+        building: whether its brakes build up, see ``builds_up``.
+
     """
     if building and not built_up(table):
         passed = next_moving_event(table, now, duration, accelerate_moving(table))
@@ -152,7 +194,17 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 
 @compiled(bare=True)
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
-    """Put into effect the commands and pieces that begin within ``passed`` (s) from ``now`` on."""
+    """Put into effect the commands that begin between ``now`` and ``now + passed``.
+
+    They include the next commands of vehicles that brake by a fixed sequence of commands.
+
+    Args:
+        table: the world in the layout of ``physics.rows``.
+        now: time counted from the start of the segment, s.
+        passed: length of the interval, s.
+        building: whether its brakes build up, see ``builds_up``.
+
+    """
     for i in range(table.shape[1]):
         if table[ROW.ONSET, i] - now <= passed:
             table[ROW.ACTIVE, i] = 1.0

@@ -39,7 +39,11 @@ _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by fri
 
 
 def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
-    """Return the quantities with all capacities limited to ``friction * GRAVITY_MPS2``."""
+    """Return ``quantities`` with the braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
+
+    ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
+    Other fields stay as they are.
+    """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
 
@@ -71,7 +75,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Return the selected worlds, by index or mask; always a copy."""
+        """Return the vehicles of the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -90,7 +94,9 @@ class Vehicles:
     ) -> Vehicles:
         """Return vehicles without a channel: each has only its own latency and knows everything from then on.
 
-        Without rates a command takes full effect at once; without ``pieces`` no vehicle brakes in pieces.
+        Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
+        ``restitution`` is [n], rates are [n, N]. Rates None: a command takes full effect at once. ``pieces`` None: no
+        vehicle follows a fixed sequence of commands.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
@@ -103,9 +109,10 @@ class Vehicles:
 
     @staticmethod
     def known_at_once(latency_s: Floats) -> Floats:
-        """Return ``known_from_s`` [n, N, N] without a channel: all news is known from the own latency [n, N] on.
+        """Return ``known_from_s`` [n, N, N] without a channel, from the latencies [n, N] s.
 
-        The result is a read-only view of ``latency_s``; its last axis has stride 0, so it takes no memory.
+        Vehicle i acts on news of every vehicle from its own latency on. The result is a read-only view of
+        ``latency_s``; its last axis has stride 0, so it takes no memory.
         """
         latency = np.ascontiguousarray(latency_s, np.float64)
         (n, N), size = latency.shape, latency.itemsize
@@ -115,17 +122,25 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """Worlds in which some vehicle has a finite brake or release rate, or brakes in pieces, [n]."""
+        """Whether some vehicle of a world has a finite brake or release rate, or a fixed sequence of commands, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
     @property
     def in_pieces(self) -> Bools:
-        """Worlds in which some vehicle brakes in pieces, [n]."""
+        """Whether some vehicle of a world brakes in pieces, that is, by a fixed sequence of commands, [n]."""
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
-        """Return the commands at ``time_s`` [n], replaced by the current piece if a vehicle has pieces, [n, N] m/s2."""
+        """Return the commands in which vehicles that brake in pieces follow their current piece, [n, N] m/s2.
+
+        A piece is a time interval of constant command.
+
+        Args:
+            command_mps2: commands of all vehicles, [n, N] m/s2; kept for vehicles without pieces.
+            time_s: absolute time in each world, [n] s.
+
+        """
         command, count = command_mps2, self.pieces.shape[2] // 2
         for piece in range(count):
             begins = self.latency_s + self.pieces[:, :, piece]
@@ -134,7 +149,7 @@ class Vehicles:
         return command
 
     def hide_from(self, vehicle: int) -> Bools:
-        """Return the worlds in which a channel hides part of the line from ``vehicle`` at its first decision, [n].
+        """Return whether a channel hides part of the line from ``vehicle`` (index from 0) at its first decision, [n].
 
         Either news of another vehicle has not arrived yet, or another vehicle reacts later than its own latency, which
         is all that a message reports. Without a channel nothing is hidden.
@@ -206,7 +221,10 @@ class Worlds:
         return int(self.speeds_mps.shape[1])
 
     def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
-        """Return worlds with ``change`` applied to each column of these and ``others``; it selects or joins rows."""
+        """Return new worlds, each field of which is ``change(own field, field of the first of others, ...)``.
+
+        ``change`` takes one array per batch and returns one array: it selects or joins rows.
+        """
         parts = (self, *others)
         columns = (change(*(getattr(w, name) for w in parts)) for name in _OF_WORLDS)
         return Worlds(_combined(change, *(w.vehicles for w in parts)), *columns)
@@ -216,18 +234,18 @@ class Worlds:
         return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
 
     def take(self, rows: ArrayLike) -> Worlds:
-        """Return the selected worlds, by index or mask; always a copy."""
+        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
         index = np.asarray(rows)
         return self._each(lambda column: np.ascontiguousarray(column[index]))
 
     @staticmethod
     def concatenate(parts: Sequence[Worlds]) -> Worlds:
-        """Join worlds with the same number of vehicles into one batch."""
+        """Join the batches ``parts``, all with the same number of vehicles, into one batch, in this order."""
         parts = _alike(parts)
         return parts[0]._each(lambda *columns: np.concatenate(columns), *parts[1:])
 
     def assign(self, rows: Ints, fresh: Worlds) -> Worlds:
-        """Return a copy of the batch with the worlds at ``rows`` replaced by those of ``fresh``."""
+        """Return a copy of the batch with the worlds at indices ``rows`` [k] replaced by the k worlds of ``fresh``."""
 
         def assigned(whole: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
             copy = whole.copy()
@@ -248,12 +266,19 @@ class Worlds:
     ) -> Worlds:
         """Return these worlds with a later state, for example from another simulator.
 
-        Arguments broadcast to full shape. Raises ``InvalidInput`` naming the field and its first bad entry.
-
         >>> import ethbrake_marl as eb
         >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
         >>> alert.running(0.7, [4.0, 6.0], [18.0, 17.0, 19.0], command_mps2=[-5.0, -2.0, 0.0]).time_s
         array([0.7, 0.7])
+
+        Args:
+            time_s: time since Vehicle 1 began to brake, broadcast to [n], s.
+            gaps_m: bumper to bumper, broadcast to [n, P], m.
+            speeds_mps: broadcast to [n, N], m/s.
+            command_mps2: acceleration in force of each vehicle, broadcast to [n, N], m/s2.
+            pair_hit: whether each pair has had an impact, broadcast to [n, P].
+
+        Raises ``InvalidInput`` naming the field and its first bad entry.
 
         """
         (n, N), inf = self.speeds_mps.shape, math.inf
@@ -271,9 +296,10 @@ class Worlds:
         return self._each(_unwritable)
 
     def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
-        """Return these worlds on a road with this ``friction`` [n].
+        """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
 
-        ``dry``: capacities on a dry road by field name, [n, N], instead of the present ones.
+        ``dry`` gives new capacities on a dry road, [n, N] by field name, for example ``{"braking_capacity_mps2":
+        array}``; fields that it does not name keep theirs.
         """
         on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
         vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
@@ -283,11 +309,11 @@ class Worlds:
 
     @property
     def friction(self) -> Floats:
-        """Friction of the road, [n]; infinite if no friction is modelled."""
+        """Friction coefficient of the road, [n]; infinite if no friction is modelled."""
         return self.road[:, 0] if self.road.shape[1] else np.full(self.n, np.inf)
 
     def dry(self, name: str) -> Floats:
-        """Return a field of ``vehicles``, [n, N]; a capacity as it is on a dry road."""
+        """Return the field ``name`` of ``vehicles``, [n, N]; a braking or driving capacity as it is on a dry road."""
         value: Floats = getattr(self.vehicles, name)
         if self.road.shape[1] and name in _ON_ROADS:
             begin = 1 + self.N * _ON_ROADS.index(name)
@@ -295,10 +321,11 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """Return these worlds with the given vehicles (index from 0) braking in pieces, and no others.
+        """Return these worlds with some vehicles braking in pieces, that is, by a fixed sequence of commands.
 
-        A piece is (start, braking): s after the latency has elapsed, 0 for the first piece; and m/s2. A vehicle with a
-        single piece does not count as braking in pieces.
+        ``pieces`` maps a vehicle (index from 0) to its sequence of (start, braking): seconds after its latency, 0 for
+        the first piece; and deceleration in m/s2. Vehicles that it does not name do not brake in pieces, nor does a
+        vehicle with a single piece.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -310,9 +337,9 @@ class Worlds:
         return replace(self, vehicles=replace(self.vehicles, pieces=found.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` if brakes of some world build up or come in pieces.
+        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a sequence of commands.
 
-        ``who`` names the caller in the message; it has no exact answer for such brakes.
+        For callers that have no exact answer in these worlds. ``who`` names the caller in the message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
@@ -329,7 +356,8 @@ class Worlds:
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
         """Return the time of the first decision, [n] s: the least latency of the ``deciders``, at least ``time_s``.
 
-        Without deciders it is ``time_s``.
+        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without deciders it is
+        ``time_s``.
         """
         if len(deciders) == 0:
             return self.time_s.copy()
@@ -341,11 +369,14 @@ class Worlds:
 
     @property
     def obstacle_ahead(self) -> Bools:
-        """Worlds with an obstacle ahead of Vehicle 1, [n]."""
+        """Whether a world has an obstacle ahead of Vehicle 1, [n]."""
         return np.isfinite(self.obstacle_gap_m)
 
     def with_obstacle(self) -> Worlds:
-        """Return these worlds, all with an obstacle, with the obstacle as vehicle 0 and vehicle i as vehicle i + 1."""
+        """Return these worlds with the obstacle as vehicle 0, so that vehicle i becomes vehicle i + 1.
+
+        Every world must have an obstacle.
+        """
 
         def ahead(value: float, columns: Floats) -> Floats:
             return np.concatenate([np.full((len(columns), 1), value), columns], axis=1)
@@ -378,10 +409,10 @@ class Worlds:
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
         """Return these worlds with an obstacle each: their own, or one out of Vehicle 1's reach for ``duration_s`` [n].
 
-        Worlds store gaps and speeds, not places. With such a dummy the change of one more gap is the distance that
-        Vehicle 1 travels, and no motion changes. It is farther away than Vehicle 1 can travel, ``T sqrt(2 E / m_1)``,
-        if it had all the energy E that the line can ever have: impacts and brakes only remove energy; driving adds at
-        most ``m a v`` per second, and never above the speed limit.
+        Worlds store gaps and speeds, not places. With the obstacle, the change of its gap is the distance that Vehicle
+        1 travels. An added obstacle changes no motion: it is farther away than ``T sqrt(2 E / m_1)``, the distance that
+        Vehicle 1 would travel in the duration T if it had all the energy E that the line can ever have. Impacts and
+        brakes only remove energy; driving adds at most ``m a v`` per second, and never above the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -391,7 +422,10 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the same worlds, all with equally many pieces; if some have a road, the others get infinite friction."""
+    """Return the batches ``parts``, made alike so that their columns can be joined.
+
+    All get columns for equally many pieces of braking; if some have a road, the others get one with infinite friction.
+    """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
         parts = [
@@ -403,7 +437,10 @@ def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
 
 
 def _padded(pieces: Floats, most: int) -> Floats:
-    """Pad pieces [n, N, 2 K] with infinity to [n, N, most]."""
+    """Return ``pieces`` [n, N, 2 K] with added empty pieces (infinite entries), [n, N, most].
+
+    ``most`` is even: each piece has a start and a command.
+    """
     n, N, width = pieces.shape
     halves = pieces.reshape(n, N, 2, width // 2)
     more = [(0, 0), (0, 0), (0, 0), (0, (most - width) // 2)]
@@ -429,9 +466,10 @@ def _span(values: Floats) -> str:
 
 
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
-    """Return vehicles whose columns are ``change`` of the columns of ``parts``; ``change`` selects or joins rows.
+    """Return new vehicles, each field of which is ``change(field of the first part, field of the second, ...)``.
 
-    Without a channel the result shares one memory for latency and news again.
+    ``change`` takes one array per part and returns one array: it selects or joins rows. If no part has a channel,
+    ``latency_s``, ``own_latency_s`` and ``known_from_s`` share one memory in the result, as in ``at_once``.
     """
     at_once = all(part._is_view for part in parts)
     columns = [
@@ -483,7 +521,7 @@ def real_numbers(value: ArrayLike) -> Floats:
 
 
 def checked_numbers(name: str, value: ArrayLike) -> Floats:
-    """Return ``real_numbers(value)``; raise ``InvalidInput`` with ``name`` and the value if it is not numeric."""
+    """Return ``value`` as a float64 array; raise ``InvalidInput`` with ``name`` and the value if it is not numeric."""
     try:
         return real_numbers(value)
     except ValueError as error:
@@ -518,7 +556,7 @@ def make_worlds(
         speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
         brake_rate_mps3: rate at which the acceleration in force falls to a lower command, m/s3, broadcast to [n, N];
             inf: at once.
-        release_rate_mps3: rate at which the acceleration in force rises to a higher command, likewise.
+        release_rate_mps3: rate at which it rises to a higher command, m/s3, broadcast to [n, N]; inf: at once.
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
         friction: friction of the road, broadcast to [n]; it limits capacities to ``friction * GRAVITY_MPS2``. None: no
             limit.
@@ -575,7 +613,18 @@ def _full(
     open_low: bool = False,
     finite: bool = True,
 ) -> Floats:
-    """Broadcast ``value`` to ``shape`` in new memory; raise ``InvalidInput`` unless it is in range and ``finite``."""
+    """Return a new array with ``value`` broadcast to ``shape``; raise ``InvalidInput`` for an entry out of range.
+
+    Args:
+        name: name of the field, for the message.
+        value: number or array.
+        shape: shape of the result.
+        low: least valid entry.
+        high: largest valid entry.
+        open_low: ``low`` itself is invalid.
+        finite: infinite entries are invalid.
+
+    """
     given = checked_numbers(name, value)
     try:
         full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")

@@ -1,4 +1,4 @@
-"""The motion within a segment as pieces of constant jerk, from which a figure can draw it exactly."""
+"""The motion within a segment (an interval of constant commands) as pieces of constant jerk, to draw it exactly."""
 
 from __future__ import annotations
 
@@ -21,10 +21,17 @@ _CAPACITY = 64
 
 @compiled
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
-    """Write time, gaps, speeds, accelerations and jerks at the start of each piece into ``rows``; return their number.
+    """Write the state at the start of each piece of constant jerk into ``rows``; return the number of pieces.
 
-    ``rows`` is [capacity, 1 + P + 3 N]; pieces that do not fit are only counted. The number is negative if a contact
-    was missed.
+    The state is time, gaps, speeds, accelerations and jerks. Pieces that do not fit into ``rows`` are only counted. The
+    number is negative if a contact was missed.
+
+    Args:
+        table: one world in the layout of ``physics.rows``; it is advanced.
+        restitution: coefficient of restitution of every impact.
+        duration: length of the segment, s.
+        rows: result, [capacity, 1 + P + 3 N].
+
     """
     vehicles, building = table.shape[1], builds_up(table)
     start_events(table, building)
@@ -55,15 +62,16 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
 
 
 def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
-    """Return the motion of each world until a time, under constant commands: one row per piece of constant jerk.
+    """Return the motion of each world until a time, under constant commands: a row per time interval of constant jerk.
 
     Args:
         worlds: n worlds of N vehicles; they are not changed.
         command_mps2: commanded accelerations, [n, N] m/s2.
         until_s: end of each segment, [n] s.
 
-    Returns for each world an array [k, 1 + N + 3 N]: absolute time at which the piece begins (s), distance that Vehicle
-    1 has travelled since the segment began (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
+    Returns one array [k, 1 + N + 3 N] per world, with a row per interval. Its columns: absolute time at which the
+    interval begins (s), distance that Vehicle 1 has travelled since the segment began (m), then N - 1 gaps (m), N
+    speeds (m/s), N accelerations (m/s2) and N jerks (m/s3).
 
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s

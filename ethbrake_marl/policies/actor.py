@@ -17,11 +17,15 @@ BLOCK_ROWS = 256  # worlds computed together, so that activations stay in the ca
 class Actor:
     """The deterministic policy: observation [n, F] float32 -> action [n, A] float32 in [-1, 1].
 
-    Of a mixture of experts only the selected expert is computed in a row.
+    In a mixture of experts only the selected expert is computed in a row. Inside, arrays are transposed: ``x`` [F,
+    rows] holds one observation per column.
     """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:
-        """Take the layers from ``tensors``, which must fit ``spec`` (see ``NetworkSpec.tensors``)."""
+        """Take the layers from ``tensors``, which must fit ``spec`` (see ``NetworkSpec.tensors``).
+
+        ``prefix`` stands before the tensors' names if this policy is part of a larger one, for example ``among_1.``.
+        """
         self.spec = spec
         self._networks = [layers_of(prefix + name, len(spec.policy_hidden), tensors) for name in spec.actors]
         self._gate = layers_of(f"{prefix}gate", len(spec.gate_hidden), tensors) if spec.networks > 1 else []
@@ -29,7 +33,10 @@ class Actor:
         self._among = [type(self)(each, tensors, f"among_{m}.") for m, each in enumerate(spec.among, 1)]
 
     def __call__(self, observation: Float32s) -> Float32s:
-        """Return the action of each row; raise ``InvalidInput`` for a wrong shape, dtype or a non-finite entry."""
+        """Return the action of each row, [n, A].
+
+        Raises ``InvalidInput`` for a wrong shape, dtype or non-finite entry.
+        """
         seen = self._check(observation)
         action = np.empty((seen.shape[0], self.spec.action_size), dtype=np.float32)
         for start in range(0, seen.shape[0], BLOCK_ROWS):
@@ -38,15 +45,21 @@ class Actor:
         return action
 
     def choose(self, x: Float32s) -> NDArray[np.int64]:
-        """Return the expert that the gating network selects for x [F, rows]: index from 0, [rows]."""
+        """Return the index (from 0) of the expert that the gating network selects for each observation, [rows].
+
+        ``x``: observations, [F, rows].
+        """
         chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the chosen actions, [1, rows], for x [F, rows].
+        """Return the action that each row's choice leads to, [1, rows].
 
-        ``number`` [rows] is the index of a choice: first the policies in ``NetworkSpec.among``, then the single
-        actions.
+        Args:
+            number: index of the choice in each row, [rows]. The first indices are the policies in
+                ``NetworkSpec.among``, whose action is computed; the others are fixed actions.
+            x: observations, [F, rows].
+
         """
         found = self._actions[np.newaxis, np.maximum(number - len(self._among), 0)]
         for m, member in enumerate(self._among):
@@ -56,7 +69,7 @@ class Actor:
         return found
 
     def _block(self, x: Float32s) -> Float32s:
-        """Return the actions [A, rows] for x [F, rows]."""
+        """Return the actions [A, rows] for observations x [F, rows]."""
         if len(self._networks) == 1:
             y = self._forward(self._networks[0], x)
             if self.spec.choices is not None:
@@ -73,7 +86,7 @@ class Actor:
         return y
 
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
-        """Return the outputs [outputs, rows] of one network for x [F, rows]."""
+        """Return the outputs [outputs, rows] of the network with these ``layers``, for inputs x [F, rows]."""
         for number, (weight, bias) in enumerate(layers, start=1):
             y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
             dense(weight, bias, x, y)

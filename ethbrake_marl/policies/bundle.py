@@ -1,4 +1,4 @@
-"""Read a policy bundle; refuse one that is damaged or observes features that no longer exist."""
+"""Read a policy bundle (a folder with manifest and weights); refuse a damaged one, and one with unknown features."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ def _read(path: Path) -> bytes:
 
 
 def _check_observed(path: Path, manifest: Manifest) -> None:
-    """Check that the features that the policy observes are the same today.
+    """Check that the features that a policy observes are the same today as when it was trained.
 
-    Raises ``InvalidInput`` for a registered feature that is missing or was changed; ``CorruptBundle`` for features that
-    this version does not have, or scales differently.
+    ``path``: its manifest file, for messages. Raises ``InvalidInput`` for a registered feature that is missing or was
+    changed; ``CorruptBundle`` for features that this version does not have, or scales differently.
     """
     seen = manifest.observation
     for was in seen.registered:

@@ -22,7 +22,10 @@ _SMALL = 1e-4  # below, x - x^3 / 3 is exact to double precision
 
 @compiled
 def squash(values: NDArray[np.float32]) -> None:
-    """Replace ``values`` [k, rows] by their hyperbolic tangents; error slightly above half a unit in the last place."""
+    """Replace every entry of ``values`` [k, rows] by its hyperbolic tangent, in place.
+
+    The error is slightly above half a unit in the last place.
+    """
     for j in range(values.shape[0]):
         row = values[j]
         for r in range(row.shape[0]):
@@ -49,11 +52,18 @@ def layers_of(name: str, hidden: int, tensors: Mapping[str, Float32s]) -> Layers
 
 @compiled
 def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
-    """Compute ``y = weight x + bias`` for weight [O, K], bias [O], x [K, rows], y [O, rows]; rows are independent.
+    """Compute one layer of a network, ``y = weight x + bias``, and write it into ``y``; rows are independent.
 
     Inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order, without fused or reordered
     operations (no fastmath). This halves the rounding error of a plain running sum, and the result does not depend on
     the other rows.
+
+    Args:
+        weight: [O, K] for K inputs and O outputs.
+        bias: [O].
+        x: inputs, [K, rows].
+        y: result, [O, rows].
+
     """
     inputs = weight.shape[1]
     whole = inputs - inputs % 4

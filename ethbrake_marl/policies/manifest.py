@@ -40,30 +40,30 @@ class _Strict(FileModel):
 
 
 class FeatureDefinition(_Strict):
-    """A registered feature as it was when the policy was trained."""
+    """Definition of a registered feature at the time when the policy was trained."""
 
-    name: Annotated[str, Field(max_length=64)]
-    of: Of
-    unit: str
-    scale: float
-    low: float
-    high: float
-    unknown: float
+    name: Annotated[str, Field(max_length=64)]  # name under which it was registered
+    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
+    unit: str  # unit of the value
+    scale: float  # the observed number is clip(value / scale, low, high)
+    low: float  # least observed number
+    high: float  # largest observed number
+    unknown: float  # value for an unknown neighbour, in ``unit``
     tried: Annotated[tuple[float, ...], Field(max_length=64)]  # its values in a few test worlds
 
 
 class ObservationSchema(_Strict):
     """The observation of the policy: neighbours on each side, feature names in order, and a hash of the scaling."""
 
-    front: Neighbours
-    rear: Neighbours
-    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]
-    scaling_sha256: Sha256
+    front: Neighbours  # number of observed neighbours ahead
+    rear: Neighbours  # number of observed neighbours behind
+    features: Annotated[tuple[str, ...], Field(min_length=1, max_length=4096)]  # full names, in order
+    scaling_sha256: Sha256  # hash of names, units, scales and bounds of the features
     registered: Annotated[tuple[FeatureDefinition, ...], Field(max_length=4096, exclude_if=not_)] = ()
 
     @classmethod
     def of(cls, spec: ObservationSpec) -> Self:
-        """Describe ``spec``, so that a later change of a name, unit, scale or bound is detected."""
+        """Describe the observation ``spec``, so that a later change of a name, unit, scale or bound is detected."""
         names = tuple(f.name for f in spec.features)
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
         return cls(
@@ -82,7 +82,7 @@ class ObservationSchema(_Strict):
 
     @property
     def spec(self) -> ObservationSpec:
-        """The observation that the environment builds from the names; raises ``UnknownName``."""
+        """The observation with these features; raises ``UnknownName`` if one of them does not exist any more."""
         return choose_observation(self.features)
 
 
@@ -93,19 +93,19 @@ class Manifest(_Strict):
     policies. Any other network keeps format 2, which earlier versions can read.
     """
 
-    format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 3, 4, 5] = 2
-    algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
-    network: NetworkSpec
-    observation: ObservationSchema
-    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"
-    learners: Annotated[tuple[str, ...], Field(min_length=1)]
-    scenario: dict[str, JsonValue]
-    reward: dict[str, JsonValue]
-    seeds: dict[str, int]
-    steps: Annotated[int, Field(ge=0)]
-    versions: dict[str, str]
-    weights_sha256: Sha256
+    format: Literal["ethbrake-policy"] = "ethbrake-policy"  # marks the file as a manifest
+    format_version: Literal[2, 3, 4, 5] = 2  # depends on the network, see above
+    algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]  # name of the training algorithm
+    network: NetworkSpec  # sizes and kind of the networks
+    observation: ObservationSchema  # features that the policy observes
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # meaning of an action
+    learners: Annotated[tuple[str, ...], Field(min_length=1)]  # vehicles that the policy learned to control
+    scenario: dict[str, JsonValue]  # scenario of the training, every value
+    reward: dict[str, JsonValue]  # reward of the training, every setting
+    seeds: dict[str, int]  # seeds of the training, by purpose
+    steps: Annotated[int, Field(ge=0)]  # decisions of learners in training
+    versions: dict[str, str]  # package -> version, at the time of training
+    weights_sha256: Sha256  # hash of the file with the tensors
     manifest_sha256: Sha256  # hash of all fields above, see ``content_sha256``
 
     @model_validator(mode="after")
@@ -139,9 +139,10 @@ class Manifest(_Strict):
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a manifest's plain content without its own hash: sorted keys, no spaces, ASCII.
+    """Return the SHA-256 of a manifest's plain content, leaving out the key ``manifest_sha256``.
 
-    It ties names, architecture and weights together and detects accidents and edits; it is not a signature.
+    The content is written as JSON with sorted keys, no spaces, ASCII. The hash ties names, architecture and weights
+    together and detects accidents and edits; it is not a signature.
     """
     hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
     return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -22,11 +22,11 @@ PerhapsHidden = Annotated[tuple[Width, ...], Field(max_length=8)]
 class TensorRow(NamedTuple):
     """Name and shape of a tensor in a bundle."""
 
-    name: str
-    shape: tuple[int, ...]
+    name: str  # such as ``policy.0.weight``
+    shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """Return the tensor as part of a larger policy, with ``part`` before its name."""
+        """Return the row of this tensor as part of a larger policy: the name becomes ``part.name``."""
         return self._replace(name=f"{part}.{self.name}")
 
 
@@ -46,16 +46,18 @@ class NetworkSpec(FileModel):
     policies, ``among``; their scores come before those of the actions, and all of them get the same observation.
     """
 
-    observation_size: Annotated[int, Field(ge=1, le=4096)]
-    action_size: Annotated[int, Field(ge=1, le=64)]
-    policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]
-    value_hidden: PerhapsHidden
-    activation: Activation
-    output: Literal["clip", "tanh", "choice"]
+    observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
+    action_size: Annotated[int, Field(ge=1, le=64)]  # A, length of an action
+    policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]  # width of each hidden layer of an actor
+    value_hidden: PerhapsHidden  # width of each hidden layer of the critic; empty: no critic
+    activation: Activation  # function between the layers
+    output: Literal["clip", "tanh", "choice"]  # what makes an action of the actor's outputs
+    # number of actions that output "choice" scores; None for other outputs
     choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
+    # number of actors; above 1: a mixture of experts
     networks: Annotated[int, Field(ge=1, le=16, exclude_if=lambda networks: networks == 1)] = 1
-    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()
-    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()
+    gate_hidden: Annotated[PerhapsHidden, Field(exclude_if=not_)] = ()  # hidden layers of the gating network
+    among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()  # policies that are scored
 
     @model_validator(mode="after")
     def _a_gate_between_several(self) -> NetworkSpec:
@@ -80,25 +82,28 @@ class NetworkSpec(FileModel):
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """Prefix of the tensor names of each actor."""
+        """First part of the tensor names of each actor: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
     def actions(self) -> Float32s:
-        """The actions from which output ``choice`` chooses, [choices]."""
+        """The actions that output ``choice`` scores, [choices], from -1 to 1."""
         found: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
         return found
 
     @property
     def format_version(self) -> Literal[2, 3, 4, 5]:
-        """Format version of a bundle with this network."""
+        """Format version that the manifest of a policy with this network has."""
         if self.choices is not None:
             return 5 if self.among else 4
         return 2 if self.networks == 1 else 3
 
     @property
     def tensors(self) -> tuple[TensorRow, ...]:
-        """Every tensor of a bundle, all float32. Weights are [outputs, inputs] as in ``y = W x + b``."""
+        """Name and shape of every tensor in a bundle with this network, all float32.
+
+        Weights are [outputs, inputs] as in ``y = W x + b``.
+        """
         actors = [row for name in self.actors for row in self._network(name, self.policy_hidden, self._outputs)]
         if self.networks > 1:
             return (*actors, *self._network("gate", self.gate_hidden, self.networks))
@@ -114,7 +119,7 @@ class NetworkSpec(FileModel):
 
     @property
     def _outputs(self) -> int:
-        """Number of outputs of each actor: actions, or scores."""
+        """Number of outputs of each actor: its actions, or with output ``choice`` its scores."""
         return self.action_size if self.choices is None else len(self.among) + self.choices
 
     def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:

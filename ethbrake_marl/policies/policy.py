@@ -44,8 +44,8 @@ class Policy:
 
     """
 
-    manifest: Manifest
-    tensors: Mapping[str, Float32s]
+    manifest: Manifest  # network, observation, training, versions and hashes
+    tensors: Mapping[str, Float32s]  # weights and biases by name, see ``NetworkSpec.tensors``
 
     def __repr__(self) -> str:
         told, scenario = self.manifest, self.manifest.scenario.get("name")
@@ -66,13 +66,13 @@ class Policy:
     def observation(self) -> ObservationSpec:
         """The observation that this policy takes, with the time step of the scenario that it was trained on.
 
-        It is built from the feature names on first use. Raises ``UnknownName``.
+        It is built from the feature names on first use. Raises ``UnknownName`` if a feature does not exist any more.
         """
         spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
         return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
 
     def policy_sha256(self) -> str:
-        """Return the hash in the manifest."""
+        """Return the hash of the policy (manifest and weights), as hexadecimal digits."""
         return self.manifest.manifest_sha256
 
     @property
@@ -82,17 +82,22 @@ class Policy:
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """Vehicle -> policy for each of its learners."""
+        """Vehicle -> policy for each vehicle that the policy learned to control: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
     def make(
         cls, tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
     ) -> Self:
-        """Make a policy from ``tensors`` and the fields of ``Manifest``, except hashes and format, which are computed.
+        """Make a policy from tensors and the fields of its manifest; hashes and format are computed.
 
-        ``versions`` defaults to the installed versions. Raises ``InvalidInput`` naming the tensor or field that does
-        not fit.
+        Args:
+            tensors: weights and biases by name, see ``NetworkSpec.tensors``.
+            observation: the observation that the networks take.
+            **manifest: the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
+
+        Raises ``InvalidInput`` naming the tensor or field that does not fit.
+
         """
         data = _serialise(tensors)
         seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
@@ -110,7 +115,7 @@ class Policy:
 
     @property
     def among(self) -> tuple[Policy, ...]:
-        """The policies that this policy chooses among; empty for most policies."""
+        """The policies that this policy's network chooses among (``NetworkSpec.among``); empty for most policies."""
         follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
         fields = self.manifest.model_dump(exclude=follows)
         found = []
@@ -122,7 +127,7 @@ class Policy:
 
     @staticmethod
     def stands_in(folder: Path) -> bool:
-        """Return whether ``folder`` contains the files of a bundle; they are not read."""
+        """Return whether ``folder`` contains the files of a policy bundle; they are not read."""
         return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
@@ -151,7 +156,11 @@ def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
 
 
 def checked_tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
-    """Check ``data`` against the table of tensors, then load it; raise ``ValueError`` naming the tensor."""
+    """Load the tensors of a policy from safetensors ``data``, after checking names and shapes against its ``manifest``.
+
+    The result maps names to read-only arrays. Raises ``ValueError`` naming the first tensor that does not fit or is not
+    finite.
+    """
     rows = [ArrayRow(row.name, "F32", row.shape) for row in manifest.network.tensors]
     check_arrays(safetensors_headers(data), rows, "tensor")
     try:

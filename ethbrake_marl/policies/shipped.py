@@ -20,17 +20,22 @@ _FOLDER = Path(__file__).resolve().parents[1] / "_policies"
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Return name -> folder of every shipped policy."""
+    """Return name -> folder of the bundle of every shipped policy."""
     return {path.parent.name: path.parent for path in sorted(_FOLDER.glob("*/policy"))}
 
 
 def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) -> str:
-    """Return the name of the policy of this kind for ``scenario``, preferring one trained for ``harm_count``.
+    """Return the name of the shipped policy that fits ``kind`` and ``scenario`` best.
 
-    ``universal`` is for all scenarios. ``ppo`` and ``sac`` are for the scenario that they were trained on, and
-    ``ppo-SCENARIO`` and ``sac-SCENARIO`` for the named one. The suffix ``-total`` means trained for total harm. Kind
-    ``policy`` means the policy whose name ends in the scenario's, which ships if ``universal`` does more harm there,
-    and ``universal`` otherwise. Raises ``InvalidInput`` with a list of the shipped policies.
+    ``ppo-SCENARIO`` and ``sac-SCENARIO`` are for one scenario; the suffix ``-total`` means trained for total harm.
+    Raises ``InvalidInput`` with a list of the shipped policies if none fits.
+
+    Args:
+        kind: ``universal``: the policy for all scenarios; ``ppo`` or ``sac``: one trained on this scenario; ``policy``:
+            the policy whose name ends in the scenario's, otherwise ``universal``.
+        scenario: scenario in which the policy will be used; None: any.
+        harm_count: preferred harm of the training: ``"first"`` impact of each pair, or ``"total"``.
+
     """
     names, here = shipped_policies(), None if scenario is None else scenario.name
     if kind == "policy":
@@ -54,7 +59,7 @@ def shipped_name(kind: str, scenario: Scenario | None, harm_count: HarmCount) ->
 
 
 def load_shipped(name: str) -> Policy:
-    """Load the shipped policy called ``name``; raise ``UnknownName`` with a suggestion."""
+    """Load the shipped policy called ``name``, such as ``universal``; raise ``UnknownName`` with a suggestion."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)
@@ -64,10 +69,17 @@ def load_shipped(name: str) -> Policy:
 def load_named_policy(
     path: str, kind: str = "ppo", scenario: Scenario | None = None, harm_count: HarmCount = "first"
 ) -> Policy:
-    """Load the policy at ``path``: a run or a bundle, ``shipped`` (the one for kind and scenario), or ``shipped/NAME``.
+    """Load a policy: from a folder, or a shipped one.
 
-    A folder of that name is written ``./shipped``. Raises what ``load_policy``, ``load_shipped`` and ``shipped_name``
-    raise.
+    Args:
+        path: a run or a bundle, ``shipped/NAME``, or ``shipped``: the one that ``shipped_name`` selects. A folder of
+            that name is written ``./shipped``.
+        kind: see ``shipped_name``; used only for ``shipped``.
+        scenario: see ``shipped_name``.
+        harm_count: see ``shipped_name``.
+
+    Raises what ``load_policy``, ``load_shipped`` and ``shipped_name`` raise.
+
     """
     head, slash, name = path.partition("/")
     if head != SHIPPED:

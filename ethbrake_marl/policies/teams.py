@@ -15,9 +15,9 @@ from ethbrake_marl.policies.policy import MANIFEST, Policy
 
 @dataclass(frozen=True)
 class PolicyTeam:
-    """One policy for each learner, by the vehicle's name, front to rear."""
+    """Policies of learners that were trained together, one for each."""
 
-    drivers: Mapping[str, Policy]
+    drivers: Mapping[str, Policy]  # vehicle -> policy, front to rear: ``{"vehicle_2": policy, ...}``
 
     @property
     def steps(self) -> int:
@@ -25,7 +25,10 @@ class PolicyTeam:
         return next(iter(self.drivers.values())).steps
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-        """Write a folder with one bundle per learner, ``vehicle_i/``, each as by ``Policy.save``."""
+        """Write a folder with one bundle per learner, in ``vehicle_2/`` and so on, each as by ``Policy.save``.
+
+        Raises ``AlreadyExists`` if the folder exists; with ``replace`` it is deleted once the new one is written.
+        """
         with new_folder(Path(folder), replace=replace) as partial:
             for name, policy in self.drivers.items():
                 policy.save(partial / name)
@@ -35,7 +38,10 @@ Trained = Policy | PolicyTeam  # result of a training: one policy for all learne
 
 
 def read_trained(folder: Path) -> Trained:
-    """Read what ``save`` of a policy or team wrote; raise ``CorruptBundle``, and what ``load_policy`` raises."""
+    """Read the policy or team that ``save`` wrote into ``folder``.
+
+    Raises ``CorruptBundle`` if there is neither, and what ``load_policy`` raises.
+    """
     if (folder / MANIFEST).exists():
         return load_policy(folder)
     names = sorted((path.name for path in folder.glob("vehicle_*")), key=lambda name: int(name.split("_")[1]))

@@ -1,4 +1,4 @@
-"""The catalogue of scenarios: shipped ones and those of registered folders, found by name, and files, found by path."""
+"""The catalogue of scenarios. Shipped and registered scenarios are found by name, other files by path."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
-    """Return the folder of the shipped scenarios (or recipes, for ``train``), in the checkout or the installed package.
+    """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    Raises ``InvalidInput`` if neither folder exists: the installation is damaged.
+    It lies in the checkout or in the installed package. Raises ``InvalidInput`` if neither folder exists: the
+    installation is damaged.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
@@ -44,9 +45,9 @@ FOLDERS: dict[str, Path] = {}  # path as text -> registered folder
 class CatalogueEntry:
     """Name, title and file of a shipped or registered scenario."""
 
-    name: str
-    title: str
-    path: Path
+    name: str  # name of the scenario
+    title: str  # one line for lists and figures
+    path: Path  # its file
     origin: str = "shipped"  # ``shipped``, or the path of the registered folder
 
     @property
@@ -94,7 +95,7 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
 
 
 def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
-    """Return the file of a scenario. The file of a path need not exist.
+    """Return the path of a scenario's file. If ``name_or_path`` is a path, the file need not exist.
 
     Text that ends in ``.yaml`` or ``.yml`` is a path. A shipped scenario is found by name, ``stress-wide``; if its name
     begins with the name of its folder, ``stress/wide`` means the same, unless such a file exists. A registered scenario
@@ -128,7 +129,7 @@ BENCHMARK = (  # each ships with a table of best known harm, the basis of shares
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Return the scenarios of a group: ``benchmark``, or a folder of shipped scenarios such as ``standards``.
+    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped ones such as ``standards``.
 
     The list is empty for any other name.
     """
@@ -186,9 +187,9 @@ def _load(path: Path) -> Scenario:
 
 
 def _with_members(document: Document, folder: Path) -> Document:
-    """Return the document with the content of other files inserted: members of a mixture, and rows of tables.
+    """Return the document with the content of other files inserted: scenarios of a mixture, and rows of tables.
 
-    Paths are relative to ``folder``.
+    Paths in the document are relative to ``folder``.
     """
     content = _with_rows(document, (), document.content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
@@ -206,7 +207,15 @@ def _with_members(document: Document, folder: Path) -> Document:
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
-    """Return the content of a scenario, with the rows of its table read from the table's file."""
+    """Return the content of one scenario, with the rows of its table read from the table's file.
+
+    Args:
+        document: file that contains the scenario, for messages.
+        at: path of the scenario inside the document; ``()``: all of it.
+        content: the scenario's content.
+        folder: folder that the path of the table's file starts from.
+
+    """
     table = content.get("table") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:
         return content
@@ -242,7 +251,10 @@ _HEAD = """\
 
 
 def check_file_name(kind: str, name: str) -> None:
-    """Raise ``InvalidInput`` for an invalid name of a scenario or recipe, which is also the name of its file."""
+    """Raise ``InvalidInput`` unless ``name`` is valid for a scenario or recipe, and so for its file.
+
+    ``kind`` is ``"scenario"`` or ``"recipe"``, for the message.
+    """
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
             f"{kind} name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
@@ -251,10 +263,10 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
-    """Return a commented YAML file for a new scenario ``name`` with the values of ``based_on``, all keys written out.
+    """Return a commented YAML file for a new scenario ``name`` with the values of the scenario ``based_on``.
 
-    A key for another way to declare gaps or speeds is included as a comment with an example. Save the text as
-    ``<name>.yaml``. Raises ``InvalidInput`` for an invalid name or an unknown ``based_on``.
+    All keys are written out. A key for another way to declare gaps or speeds is included as a comment with an example.
+    Save the text as ``<name>.yaml``. Raises ``InvalidInput`` for an invalid name or an unknown ``based_on``.
     """
     check_file_name("scenario", name)
     base = load_scenario(based_on)
@@ -286,7 +298,7 @@ _EXAMPLES = {
 
 
 def _line(key: str, values: Mapping[str, object]) -> str:
-    """Return ``key: value``; a key that only belongs to an alternative declaration is commented out."""
+    """Return the line ``key: value`` of a scenario file, or a comment with an example if ``values`` lacks the key."""
     if key in values:
         return f"{key}:{_value(values[key])}"
     if key in QUANTITY.declared:
@@ -296,7 +308,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return a member of a mixture with only its name, if a shipped scenario has the same content."""
+    """Return an entry of a mixture's list with a shorter ``scenario``: only the name, if it equals a shipped one."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry
@@ -313,7 +325,7 @@ def _comment(key: str) -> str:
 
 
 def _value(value: object) -> str:
-    """Format a value on the line of its key; roles get one line each."""
+    """Format a value for the line of its key; a mapping of texts, such as roles, becomes one line per entry."""
     if isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values()):
         return "".join(f"\n  {key}: {flow_text(entry)}" for key, entry in value.items())
     return f" {flow_text(value)}"

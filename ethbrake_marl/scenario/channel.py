@@ -6,7 +6,7 @@ vehicle j to vehicle i, i can use it from this time on:
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act        (T the message period)
 
 ``U(0, T)`` is the wait for the next message. ``k`` is the number of periods lost to a burst (Gilbert-Elliott channel:
-``P(k >= m) = p / (p + r) (1 - r)^(m - 1)``). On the share ``lost`` of the links no message ever arrives. Sensors see
+``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)``). On the share ``lost`` of the links no message ever arrives. Sensors see
 the direct neighbours, with a delay of ``sensing_s``, called a hop. Vehicle i can react from
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
@@ -65,14 +65,17 @@ class Equipage(FileModel):
 
 
 class Equipped(NamedTuple):
-    """V2X equipment of the vehicles in n worlds, or, with n = 1, what is certain in every possible world."""
+    """V2X equipment of the vehicles in n worlds.
 
-    sends: Bools  # [n, N]
-    hears: Ints  # [n, N] index into the words of ``Hears``
+    It has a single row (n = 1) if all worlds share it, or if it says what every vehicle has at least in all worlds.
+    """
+
+    sends: Bools  # [n, N] whether vehicle i sends messages
+    hears: Ints  # [n, N] whose messages vehicle i gets: 0 everybody's, 1 only those from ahead, 2 nobody's
 
     @classmethod
     def of(cls, equipage: Sequence[Equipage]) -> Equipped:
-        """Return one world of vehicles with this equipment, [1, N]."""
+        """Return the equipment of one world whose vehicle i has ``equipage[i]``, [1, N]."""
         hears = [get_args(Hears).index(each.hears) for each in equipage]
         return cls(np.array([[each.sends for each in equipage]]), np.array([hears]))
 
@@ -86,14 +89,16 @@ class Equipped(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """All settings that decide what each vehicle knows, and when."""
+    """All settings that decide what each vehicle knows, and when; symbols as at the top of this file."""
 
-    timing: Literal["latency", "fixed", "messages"]  # tau: own latency, link_latency_s, or the formula above
-    hears: Hears = "all"  # whose messages a vehicle receives: everyone's, those of vehicles ahead, nobody's
+    # delay tau of a link: "latency": none beyond the receiver's own latency; "fixed": link_latency_s; "messages": drawn
+    # from the settings of messages and losses below
+    timing: Literal["latency", "fixed", "messages"]
+    hears: Hears = "all"  # whose messages a vehicle receives: everybody's, only from vehicles ahead, nobody's
     senses: Senses = "both"  # which direct neighbours are in sight
-    link_latency_s: float = 0.0  # tau for timing "fixed"
-    loss_begins: float = 0.0  # p, per message period
-    loss_ends: float = 1.0  # r, per message period; mean burst 1 / r
+    link_latency_s: float = 0.0  # delay tau of every link for timing "fixed" (s)
+    loss_begins: float = 0.0  # p, probability per message period that a burst of losses begins
+    loss_ends: float = 1.0  # r, probability per message period that it ends; mean burst 1 / r periods
     lost: float = 0.0  # share of links on which no message ever arrives
     message_period_s: float = 0.1  # T
     radio_s: float = 0.02  # L_radio
@@ -120,7 +125,10 @@ class Channel(NamedTuple):
         return self.link_latency_s if self.timing == "fixed" else math.inf
 
     def samples(self, time_step_s: float) -> int:
-        """Return how many samples of its state a vehicle stores for delayed messages; 0 without periodic messages."""
+        """Return how many samples of its state a vehicle stores for delayed messages; 0 without periodic messages.
+
+        ``time_step_s``: time between two samples, which is the time between two decisions (s).
+        """
         return Messages.ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
 
@@ -185,7 +193,7 @@ class _TellsSchema:
 
 
 class V2X(FileModel):
-    """A preset and the settings that differ from it; see ``docs/v2x.md``.
+    """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/v2x.md``.
 
     In YAML it is written as the preset's name alone, or as a mapping.
     """
@@ -272,7 +280,10 @@ class V2X(FileModel):
         return self
 
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
-        """Raise an error for the first of the keys ``names`` that is given, because it would have no effect."""
+        """Raise an error for the first of the keys ``names`` that is given, because it would have no effect.
+
+        ``why`` says the reason in the message.
+        """
         for name in names:
             self._require(getattr(self, name) is None, name, f"{why}; leave it out")
 
@@ -295,7 +306,7 @@ class V2X(FileModel):
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule: a vehicle knows everything from its own latency on."""
+        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency."""
         return self.channel != CHANNELS["paper"]
 
     @property
@@ -314,11 +325,11 @@ class V2X(FileModel):
         return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
 
     def latest_reaction_s(self, own_latency_s: Floats, equipped: Equipped) -> Floats:
-        """Return an upper bound of each vehicle's latency, [N] s.
+        """Return an upper bound of the time at which each vehicle can react, [N] s.
 
         Args:
-            own_latency_s: upper bounds of the own parts of the latencies, [N] s.
-            equipped: equipment that is certain in every world.
+            own_latency_s: upper bounds of the vehicles' own latencies, without the channel, [N] s.
+            equipped: equipment that the vehicles have at least in every world, [1, N].
 
         """
         channel, latest = self.channel, own_latency_s.copy()
@@ -333,13 +344,19 @@ class V2X(FileModel):
 
     @staticmethod
     def width(vehicles: int) -> int:
-        """Return how many uniform numbers the links of a line need."""
+        """Return how many uniform numbers the links of a line of ``vehicles`` vehicles need per world."""
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return these vehicles with latencies and news of the channel, drawn with ``u`` [n, N * N * PER_LINK].
+        """Return these vehicles with the latencies, and the times of first knowledge, that the channel gives them.
 
-        ``u`` is in [0, 1). The previous latencies, which must be without a channel, become ``own_latency_s``.
+        The previous latencies, which must be without a channel, become ``own_latency_s``.
+
+        Args:
+            vehicles: parameters of n worlds.
+            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            equipped: V2X equipment, of each world or one for all.
+
         """
         (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], self.channel), self.heard_and_seen(u, equipped)
         latency = vehicles.latency_s.copy()
@@ -355,6 +372,11 @@ class V2X(FileModel):
         """Return when vehicle i can use the first message of vehicle j, and when i sees j, [n, N, N] s each.
 
         Infinite means never.
+
+        Args:
+            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            equipped: V2X equipment, of each world or one for all.
+
         """
         N = equipped.sends.shape[1]
         channel, links = self.channel, u.reshape(len(u), N, N, PER_LINK)
@@ -369,10 +391,10 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return these worlds, at the alert, with their news and, for periodic messages, the columns of the messages.
+        """Return these worlds with what each vehicle knows when, and the columns of periodic messages.
 
         Args:
-            worlds: worlds without a channel.
+            worlds: worlds without a channel, at the alert (time 0).
             u: uniform numbers for the links, [n, N * N * PER_LINK] in [0, 1).
             key: seed of each world's later losses, [n] in [0, 1).
             time_step_s: time between two decisions, at which vehicles sample their states.
@@ -393,10 +415,14 @@ class V2X(FileModel):
         return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
-        """Return worlds from the user with this channel.
+        """Return worlds from the user with this channel; raise ``InvalidInput`` if the channel is random.
 
-        Raise ``InvalidInput`` if the channel leaves something to chance. ``equipped``: V2X equipment of the vehicles;
-        None: the scenario draws it.
+        Args:
+            worlds: worlds without a channel.
+            time_step_s: time between two decisions, s.
+            where: source of the worlds, for the message.
+            equipped: V2X equipment of the vehicles, one row for all worlds; None: the scenario draws it.
+
         """
         if not self.by_link:
             return worlds
@@ -410,10 +436,16 @@ class V2X(FileModel):
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
-    """Return the number k of message periods lost to a burst, in the shape of the uniform numbers ``u`` in [0, 1).
+    """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    ``k >= m`` exactly if ``u < p / (p + r) (1 - r)^(m - 1)``: the inverse distribution function of the stationary
+    ``k >= m`` exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``: the inverse distribution function of the stationary
     Gilbert-Elliott channel. It uses multiplication only, so every machine gets the same k.
+
+    Args:
+        u: uniform numbers in [0, 1).
+        loss_begins: probability p per message that a good channel turns bad.
+        loss_ends: probability r per message that a bad channel turns good again.
+
     """
     bound = loss_begins / (loss_begins + loss_ends)
     bounds = []
@@ -426,9 +458,14 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 def link_delays(channel: Channel, u: Floats) -> Floats:
-    """Return the delay tau (s) of each link from its uniform numbers ``u`` [..., PER_LINK]; infinite: nothing arrives.
+    """Return the delay tau (s) of each link, [...]; infinite: no message arrives.
 
     Minus infinity for timing ``latency``, where only the receiver's own latency counts.
+
+    Args:
+        channel: settings of the channel.
+        u: uniform numbers in [0, 1) of each link, [..., PER_LINK].
+
     """
     delay = np.full(u.shape[:-1], -np.inf if channel.timing == "latency" else channel.link_latency_s)
     if channel.timing == "messages":

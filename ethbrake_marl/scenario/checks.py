@@ -22,7 +22,7 @@ MOST_SAMPLES = 1_000  # longest history of samples that delayed messages may nee
 
 
 def check_whole(scenario: ScenarioFields) -> None:
-    """Check fields that depend on each other.
+    """Check the fields of a scenario that depend on each other; raise pydantic's error for the first defect.
 
     These are: quantities declared twice, time step, horizon, latency, channel, speeds, gaps, obstacle and scripts.
     """
@@ -65,7 +65,7 @@ def check_whole(scenario: ScenarioFields) -> None:
 
 
 def _check_reactions(scenario: ScenarioFields) -> None:
-    """Check that every vehicle can act before the horizon, however late its news is."""
+    """Raise an error unless every vehicle can act before the horizon, however late its news is."""
     for name in scenario.v2x.vehicles or ():
         right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
         require(name in scenario.vehicle_names, ("v2x", "vehicles", name), UNSHOWN, right)
@@ -114,7 +114,7 @@ def _check_speeds(scenario: ScenarioFields) -> None:
 
 
 def _check_derived(scenario: ScenarioFields) -> None:
-    """Check that gaps derived from time gaps, and an obstacle's distance derived from its margin, are in range."""
+    """Raise an error if a gap from a time gap, or an obstacle's distance from its margin, is out of range."""
     largest = QUANTITY.usual["gaps_m"].high
     for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
         right = f"is up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
@@ -129,9 +129,9 @@ def _check_derived(scenario: ScenarioFields) -> None:
 
 
 def _check_scripts(scenario: ScenarioFields) -> None:
-    """Check that constant commands are within capacity.
+    """Raise an error for a script with a command beyond capacity, or if vehicle_1 learns without an obstacle ahead.
 
-    If early impacts are rejected, also check that no script depends on the state.
+    If early impacts are rejected, also for a script that depends on the state.
     """
     for i, script in scenario.scripts.items():
         deceleration = ScriptSpec.parse(script).hardest_mps2 or 0.0

@@ -22,12 +22,12 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds, as_road_allows
 from ethbrake_marl.scenario.channel import V2X, Equipage, Equipped
 from ethbrake_marl.scenario.distributions import LEAVE_OUT, AnyQuantity, AnyTypeQuantity, Quantity, TableColumn, support
 from ethbrake_marl.scenario.fields import ALSO, MEANING, QUANTITY, Entry, columns_of_table, is_tabled
+from ethbrake_marl.scenario.member import Member
 from ethbrake_marl.scenario.roles import LEARNER, Role, Roles, ScriptSpec
 from ethbrake_marl.scenario.vehicle_types import (
     ANY,
     LEFT_OUT,
     ListedByVehicle,
-    Member,
     ObjectiveName,
     PerVehicle,
     Table,
@@ -122,7 +122,10 @@ class ScenarioFields(FileModel):
 
     @classmethod
     def of_dump(cls, content: Mapping[str, Any]) -> Self:
-        """Rebuild a scenario from ``model_dump``, which also writes keys with default values. Raises ``ValueError``."""
+        """Rebuild a scenario from the result of ``model_dump``, which also writes keys with default values.
+
+        Raises ``ValueError`` if the content is not a scenario.
+        """
         usual = {key: (None, field.default) for key, field in cls.model_fields.items()}
 
         def given(part: Any) -> Any:
@@ -145,14 +148,17 @@ class ScenarioFields(FileModel):
     )
     @classmethod
     def _given(cls, value: Any) -> Any:
-        """Refuse ``null``: a key that is not used must be left out."""
+        """Refuse ``null`` as the value of a quantity: a key that is not used must be left out."""
         require(value is not None, (), value, LEAVE_OUT)
         return value
 
     @field_validator(*QUANTITY.needed, mode="before")
     @classmethod
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        """Require a value unless every vehicle type or the table gives it, or the scenario is a mixture."""
+        """Require a value for a quantity without default, unless every vehicle type or the table gives it.
+
+        A mixture needs none either.
+        """
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
         without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
@@ -295,29 +301,35 @@ class ScenarioFields(FileModel):
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """Return these worlds with the pieces of ``profile`` scripts, except for vehicles in ``driven``."""
+        """Return these worlds with the pieces of ``profile`` scripts: braking by a fixed sequence of commands.
+
+        ``driven``: indices (from 0) of controlled vehicles, which follow no script.
+        """
         return worlds.play_pieces({i: ScriptSpec.parse(s).pieces for i, s in self.scripts.items() if i not in driven})
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether there is an obstacle ahead of Vehicle 1; for a mixture: in some member."""
+        """Whether there is an obstacle ahead of Vehicle 1; for a mixture: in one of its scenarios or more."""
         if self.members:
             return any(member.has_obstacle for member in self.members)
         return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
 
     @property
     def has_friction(self) -> bool:
-        """Whether the friction of the road is declared; for a mixture: in some member."""
+        """Whether the friction of the road is declared; for a mixture: in one of its scenarios or more."""
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
     @property
     def builds_up(self) -> bool:
-        """Whether brakes may build up; for a mixture: in some member."""
+        """Whether brakes may build up (have a finite rate); for a mixture: in one of its scenarios or more."""
         own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
         return own or any(member.builds_up for member in self.members)
 
     def declares(self, field: str) -> bool:
-        """Return whether the scenario declares a quantity under its key, in a vehicle type, or fully in its table."""
+        """Return whether the scenario declares the quantity ``field``, for example ``"mass_t"``.
+
+        It may do so under the key itself, in a vehicle type, or for all vehicles in its table.
+        """
         kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
         return (
             getattr(self, field) is not None
@@ -327,23 +339,26 @@ class ScenarioFields(FileModel):
 
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
-        """Columns of the table by the entry (quantity and index) that they give; empty without a table."""
+        """Columns of the scenario's table, ``{("gaps_m", 0): column}`` by quantity and index; empty without one."""
         return self._columns
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule (``V2X.by_link``); for a mixture: in some member."""
+        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency.
+
+        For a mixture: in one of its scenarios or more.
+        """
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
     @property
     def types_of_line(self) -> TypesOfLine | None:
-        """Which vehicle types are possible at each place; None without types."""
+        """The vehicle types that are possible at each place of the line, and their weights; None without types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
-        """Return the V2X equipment of worlds with these vehicle ``types`` [n, N].
+        """Return the V2X equipment of the vehicles in worlds with these vehicle ``types`` (indices, [n, N]).
 
-        Without ``types``: the equipment that every vehicle has in all possible worlds, [1, N].
+        Without ``types``: one row, [1, N], with the equipment that every vehicle has at least, whatever its type.
         """
         line, each = self.types_of_line, []
         own = self.v2x.vehicles or {}
@@ -361,9 +376,11 @@ class ScenarioFields(FileModel):
         return Equipped(np.stack(sends, axis=1), np.stack(hears, axis=1))
 
     def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
-        """Return ``quantities`` by vehicle type: one mapping per entry, type (index; 0 without types) -> quantity.
+        """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
 
-        A type that does not declare the quantity gets the declaration outside the types. Raises like ``quantities``.
+        For example ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys are indices of the types that are possible
+        there; without types the only one is 0. A type that does not declare the quantity gets the declaration outside
+        the types. Raises like ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
@@ -378,7 +395,10 @@ class ScenarioFields(FileModel):
         return tuple(found)
 
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
-        """Return smallest and largest value of each entry of ``quantities``, over all possible vehicle types."""
+        """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
+
+        All vehicle types that are possible are considered.
+        """
         found = []
         for each in self.possible_quantities(field):
             lows, highs = zip(*(support(quantity) for quantity in each.values()), strict=True)
@@ -386,7 +406,7 @@ class ScenarioFields(FileModel):
         return tuple(found)
 
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
-        """Return the declaration of a quantity, one entry per vehicle, per pair or per world.
+        """Return the declaration of the quantity ``field``: a number or distribution for each vehicle, pair or world.
 
         Gaps have one entry per pair; restitution and line speed have one per world. Raises ``InvalidInput`` for a key
         that this scenario does not use, for example ``gaps_m`` if ``time_gaps_s`` is given.
@@ -401,9 +421,12 @@ class ScenarioFields(FileModel):
         return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Return smallest and largest value of each entry of ``gaps_m``, ``speeds_mps``, ..., however it is declared.
+        """Return (smallest, largest) value of a quantity, for each vehicle, pair or world, however it is declared.
 
-        Capacities are limited by the friction of the road; ``dry``: capacities on a dry road.
+        Args:
+            field: key of the quantity as a world has it: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
+            dry: do not limit braking and driving capacities by the friction of the road.
+
         """
         found = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
         at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # for members that declare no rate
@@ -412,7 +435,7 @@ class ScenarioFields(FileModel):
 
     @property
     def farthest_obstacle_m(self) -> float:
-        """Upper bound of the distance to an obstacle that is declared by its margin."""
+        """Largest possible distance (m) from Vehicle 1 to an obstacle that is declared by ``obstacle_margin_m``."""
         found = on_road(world_quantities(self, _supports_of(self)))
         low, high = ({key: bounds[[row]] for key, bounds in found.items()} for row in (0, 1))
         slowest = high | {key: low[key] for key in ("braking_capacity_mps2", "brake_rate_mps3") if key in low}
@@ -422,10 +445,15 @@ class ScenarioFields(FileModel):
 
 
 def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
-    """Return every quantity of k worlds, [k, entries] each; ``declared(key)`` returns the values of a declared key.
+    """Return every quantity of k worlds, [k, entries] each, from the declared ones.
 
     Derived quantities are ``speed = line speed + own deviation`` and ``gap = time gap x speed of the pair's rear
     vehicle``. Both increase with their inputs, so bounds of the declared values give bounds of the derived ones.
+
+    Args:
+        scenario: the scenario that declares the quantities.
+        declared: function of a key such as ``"time_gaps_s"`` that returns its values in the k worlds, [k, entries].
+
     """
     other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
     found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
@@ -442,17 +470,27 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return the quantities of worlds with capacities limited by friction: at most friction times gravity."""
+    """Return the quantities of worlds with capacities limited by friction: at most friction times gravity.
+
+    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. Without friction
+    nothing is limited.
+    """
     return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 
 
 def obstacle_gap(
     scenario: ScenarioFields, found: Mapping[str, Floats], declared: Callable[[str], Floats]
 ) -> Floats | None:
-    """Return the distance from Vehicle 1 to the obstacle ahead, [k], for worlds with the quantities ``found``.
+    """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
     The distance is declared, or it is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin beyond the point where
-    Vehicle 1 stops by full braking. None if the scenario has no obstacle.
+    Vehicle 1 stops by full braking.
+
+    Args:
+        scenario: the scenario that declares the obstacle.
+        found: other quantities of these worlds, [k, entries] by key.
+        declared: function of ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` that returns its value in each world, [k].
+
     """
     if scenario.declares("obstacle_gap_m"):
         return declared("obstacle_gap_m")
@@ -464,5 +502,5 @@ def obstacle_gap(
 
 
 def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Return a function of a key: smallest and largest value of each of its entries, [2, entries]."""
+    """Return a function: key of a quantity -> smallest and largest value for each vehicle or pair, [2, entries]."""
     return lambda key: np.array(scenario.supports(key)).T

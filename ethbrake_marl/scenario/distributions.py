@@ -32,7 +32,11 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 
 
 class _Distribution(FileModel):
-    """Base class of the ways to draw a quantity."""
+    """Base class of the distributions, such as ``Uniform``, that a scenario file may name for a quantity.
+
+    A subclass declares its parameters as fields, and defines two members: the property ``support``, which is the
+    smallest and largest possible value; and ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    """
 
 
 class Uniform(_Distribution):
@@ -51,9 +55,9 @@ class Uniform(_Distribution):
         return self.uniform
 
     def value(self, u: Floats) -> Floats:
-        """Return ``low + (high - low) u`` for ``u`` in [0, 1), in the same shape.
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low + (high - low) u``.
 
-        The result is never above high: u is at most 1 - 2^-53, so (high - low) u rounds to less than the rounded high -
+        A value is never above high: u is at most 1 - 2^-53, so (high - low) u rounds to less than the rounded high -
         low.
         """
         low, high = self.uniform
@@ -78,7 +82,7 @@ class LogUniform(_Distribution):
         return self.loguniform
 
     def value(self, u: Floats) -> Floats:
-        """Return ``low (high / low)^u`` for ``u`` in [0, 1), in the same shape."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low (high / low)^u``."""
         low, high = self.loguniform
         return np.clip(low * exp_each((u * log(high / low)).ravel()).reshape(u.shape), low, high)
 
@@ -86,16 +90,16 @@ class LogUniform(_Distribution):
 class NormalShape(_Distribution):
     """Mean and standard deviation of a normal distribution before truncation, and the bounds of the truncation."""
 
-    mean: Number
-    sd: Number
-    low: Number
-    high: Number
+    mean: Number  # before truncation
+    sd: Number  # standard deviation before truncation
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class Normal(_Distribution):
     """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
 
-    normal: NormalShape
+    normal: NormalShape  # its parameters
 
     @model_validator(mode="after")
     def _possible(self) -> Normal:
@@ -107,7 +111,7 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Return the probabilities of being below low and below high, before truncation."""
+        """Return the probabilities that the untruncated distribution is below low, and below high."""
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
@@ -118,7 +122,11 @@ class Normal(_Distribution):
         return self.normal.low, self.normal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return ``mean + sd Q(p_low + (p_high - p_low) u)``, Q the normal quantile; same shape as ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``; Q is the normal quantile, p_low and p_high are the
+        probabilities of being below the bounds.
+        """
         shape = self.normal
         below, above = self._bounds()
         quantile = normal_quantile_each((below + (above - below) * u).ravel()).reshape(u.shape)
@@ -128,17 +136,17 @@ class Normal(_Distribution):
 class LogNormalShape(_Distribution):
     """Median and standard deviation of the logarithm, before truncation, and the bounds of the truncation."""
 
-    median: Number
-    sigma: Number
-    low: Number
-    high: Number
+    median: Number  # before truncation
+    sigma: Number  # standard deviation of the logarithm, before truncation
+    low: Number  # smallest possible value
+    high: Number  # largest possible value
 
 
 class LogNormal(_Distribution):
     """``{lognormal: {median, sigma, low, high}}``: the logarithm is normal; truncated to [low, high]."""
 
-    lognormal: LogNormalShape
-    _of_logarithm: Normal = PrivateAttr()
+    lognormal: LogNormalShape  # its parameters
+    _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm
 
     @model_validator(mode="after")
     def _possible(self) -> LogNormal:
@@ -159,7 +167,10 @@ class LogNormal(_Distribution):
         return self.lognormal.low, self.lognormal.high
 
     def value(self, u: Floats) -> Floats:
-        """Return ``exp`` of the normally distributed logarithm for ``u`` in [0, 1), in the same shape."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        A value is ``exp(x)``; x has the truncated normal distribution of the logarithm.
+        """
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 
@@ -167,8 +178,8 @@ class LogNormal(_Distribution):
 class Choice(_Distribution):
     """``{choice: [a, b, ...]}``: one of these values, with equal probability or in proportion to ``weights: [...]``."""
 
-    choice: Numbers
-    weights: Numbers | None = None
+    choice: Numbers  # the possible values
+    weights: Numbers | None = None  # weight of each value; None: equal
 
     @model_validator(mode="after")
     def _weighted(self) -> Choice:
@@ -185,7 +196,10 @@ class Choice(_Distribution):
         return min(self.choice), max(self.choice)
 
     def value(self, u: Floats) -> Floats:
-        """Return the first entry whose cumulative weight is above ``u``, for ``u`` in [0, 1), in the same shape."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the first entry whose cumulative weight (of a total of 1) is above u.
+        """
         cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
         cumulative /= cumulative[-1]
         return np.asarray(self.choice)[np.searchsorted(cumulative, u, side="right")]
@@ -193,10 +207,10 @@ class Choice(_Distribution):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TableColumn:
-    """A column of a scenario's table; every world takes the value in its row."""
+    """A column of a scenario's table of measured values; every world takes one row of the table, by weight."""
 
-    name: str
-    rows: Floats = data_field(compare=False)  # [rows]
+    name: str  # name of the column, such as ``gap_1_m``
+    rows: Floats = data_field(compare=False)  # [rows] value in each row of the table
     cumulative: Floats = data_field(compare=False)  # [rows] cumulative weight of the rows, up to 1
 
     def __repr__(self) -> str:
@@ -209,19 +223,25 @@ class TableColumn:
 
     @property
     def middle(self) -> TableColumn:
-        """Column with the weighted median as its only row."""
+        """Column whose only row is the weighted median of this column."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
 
     def value(self, u: Floats) -> Floats:
-        """Return the value of the first row whose cumulative weight is above ``u``; same shape as ``u`` in [0, 1)."""
+        """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
+
+        It is the value of the first row whose cumulative weight is above u.
+        """
         found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
         return found
 
 
 def _kind(value: object) -> str | None:
-    """Return the tag of the member of ``Quantity`` that a value means; it decides which error messages are shown."""
+    """Return the tag of the kind of ``Quantity`` that a value from a file means, such as ``"#uniform"``.
+
+    None for a list, or a mapping without a known distribution. The tag decides which error messages are shown.
+    """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"
     if isinstance(value, dict):
@@ -246,7 +266,7 @@ Quantity = Annotated[
 class WithLoad(_Distribution):
     """``{with_load: [empty, full]}``, in a vehicle type only: a linear function of the vehicle's load, from 0 to 1.
 
-    ``spread`` is a random amount that each vehicle adds.
+    ``spread`` is a distribution around 0 of a random amount that each vehicle adds.
     """
 
     with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
@@ -266,9 +286,9 @@ class WithLoad(_Distribution):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return ``empty + (full - empty) load`` plus the spread at ``u``.
+        """Return ``empty + (full - empty) load``, plus the random amount that the uniform numbers ``u`` give.
 
-        ``load`` in [0, 1] and ``u`` in [0, 1) have the same shape.
+        ``load`` in [0, 1] and ``u`` in [0, 1) have the same shape, as has the result.
         """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
@@ -281,10 +301,10 @@ AnyTypeQuantity = AnyQuantity | WithLoad
 
 
 def support(quantity: AnyTypeQuantity) -> tuple[float, float]:
-    """Return the smallest and largest possible value of a quantity."""
+    """Return the smallest and largest value that ``quantity`` can have."""
     return (quantity, quantity) if isinstance(quantity, float) else quantity.support
 
 
 def values(quantity: AnyQuantity, u: Floats) -> Floats:
-    """Return the quantity's values for uniform numbers ``u`` in [0, 1), in the same shape."""
+    """Return the values of ``quantity`` drawn by uniform numbers ``u`` in [0, 1), in the shape of ``u``."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)

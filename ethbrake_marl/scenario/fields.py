@@ -42,16 +42,16 @@ class QuantityRule:
 
     name: str  # key in a scenario, field of Worlds or Vehicles
     unit: str  # key of UNITS, or "" for a plain number
-    per: Literal["vehicle", "pair", "world"]
+    per: Literal["vehicle", "pair", "world"]  # what has one value each
     high: float  # largest allowed value
     positive: bool  # whether 0 is refused
-    slot: int  # column inside a vehicle's block of uniform numbers
-    column: str  # name in a table of initial states
-    meaning: str
-    example: str
+    slot: int  # column of its uniform number inside the block of BLOCK numbers that each vehicle has
+    column: str  # column name in a table of initial states, such as ``gap_{}_m``; "": no column
+    meaning: str  # what it is, in words
+    example: str  # an example of its value in a scenario file
     low: float = 0.0  # smallest allowed value
-    block: int = 0  # vehicle (from 0) whose block of uniform numbers holds entry 0
-    stream: tuple[int, ...] = ()  # separate stream of uniform numbers with column ``slot``; (): main stream
+    block: int = 0  # vehicle (from 0) in whose block the number of entry 0 is; entry i is in block ``block + i``
+    stream: tuple[int, ...] = ()  # stream of uniform numbers that contains the blocks; (): the main stream
 
     @property
     def symbol(self) -> str:
@@ -60,14 +60,14 @@ class QuantityRule:
 
     @property
     def label(self) -> str:
-        """Name in words with the unit, as an axis label: ``braking capacity (m/s²)``."""
+        """Name in words with the unit, as the label of an axis: ``braking capacity (m/s²)``."""
         return self.name.removesuffix(f"_{self.unit}").replace("_", " ") + (
             f" ({self.symbol.replace('s2', 's²').replace('s3', 's³')})" if self.unit else ""
         )
 
     @property
     def interval(self) -> str:
-        """Allowed range with its unit, as messages write it."""
+        """Allowed range with its unit, as error messages write it: ``finite and in (0, 1000] t (tonnes)``."""
         unit = f" {self.symbol} ({UNITS[self.unit]})" if self.unit else ""
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
@@ -76,24 +76,27 @@ class QuantityRule:
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def count(self, vehicles: int) -> int:
-        """Return how many values a world with ``vehicles`` vehicles has."""
+        """Return how many values a world with this number of ``vehicles`` has: one per vehicle, one per pair, or 1."""
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return which of a world's uniform numbers draws entry ``index`` (from 0)."""
+        """Return the place of the uniform number that draws entry ``index`` (from 0): (stream, column in it)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Return the column name of entry ``index`` (from 0) in a table of initial states."""
+        """Return the column name of entry ``index`` (from 0) in a table of initial states, such as ``gap_1_m``."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """Return the vehicle or pair of entry ``index`` (from 0), in words; empty for a value of the whole world."""
+        """Return the vehicle or pair of entry ``index`` (from 0): ``vehicle_1``, or ``vehicle_1 to vehicle_2``.
+
+        Empty for a value of the whole world.
+        """
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
     def of(self, worlds: Worlds) -> Floats:
-        """Return the values in these worlds, [n, entries]: one entry per vehicle, pair or world.
+        """Return the values of this quantity in ``worlds``, [n, entries]: one entry per vehicle, pair or world.
 
         Capacities are those on a dry road, as a scenario declares them, if every world has a friction. A distance to an
         obstacle is NaN in a world without one.
@@ -110,19 +113,20 @@ class QuantityRule:
 
 
 class Quantities(NamedTuple):
-    """All quantities by their keys."""
+    """All quantities that a scenario can declare: key, such as ``gaps_m`` -> rule, in several groups."""
 
     usual: dict[str, QuantityRule]  # quantities that every world has
     otherwise: dict[str, QuantityRule]  # other ways to declare speeds, gaps and an obstacle
     optional: dict[str, QuantityRule]  # quantities that a world may lack; drawn from streams of their own
-    # Pairs of which a scenario declares exactly one, or at most one if the quantity is optional.
+    # usual or optional key -> the key in ``otherwise`` that may replace it: {"gaps_m": "time_gaps_s", ...}; a scenario
+    # never declares both
     alternatives: dict[str, str]
     of_a_type: tuple[str, ...]  # keys that a vehicle type may declare
     needed: tuple[str, ...]  # keys without a default, which every vehicle needs
     declared: dict[str, QuantityRule]  # every key that declares a quantity
 
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
-        """Return the quantities that these worlds have; friction only if all worlds have it.
+        """Return key -> rule of the quantities that ``worlds`` have; friction only if all worlds have it.
 
         The distance to an obstacle and the brake rates are included if some world has them.
         """
@@ -247,13 +251,22 @@ Entry = tuple[str, int]  # quantity and index (from 0) of the vehicle or pair
 
 
 def columns_of_table(rules: Mapping[str, QuantityRule], vehicles: int) -> dict[str, Entry]:
-    """Return column name -> entry (quantity and index) of a table with these quantities."""
+    """Return column name -> (quantity, index) of a table with these quantities: ``{"gap_1_m": ("gaps_m", 0), ...}``.
+
+    Args:
+        rules: the quantities, by key.
+        vehicles: number of vehicles in the line.
+
+    """
     named = {key: rule for key, rule in rules.items() if rule.column}
     return {rule.column_of(i): (key, i) for key, rule in named.items() for i in range(rule.count(vehicles))}
 
 
 def is_tabled(data: Mapping[str, Any], key: str) -> bool:
-    """Return whether the table in a scenario's fields has every entry of a quantity."""
+    """Return whether a scenario's table gives the quantity ``key`` for every vehicle, pair or world.
+
+    ``data``: fields of the scenario, as far as they are checked; ``table`` and ``vehicles`` are read.
+    """
     table, rule = data.get("table"), QUANTITY.declared[key]
     if table is None or "vehicles" not in data or not rule.column:
         return False

@@ -1,4 +1,7 @@
-"""Mixtures of scenarios: each world is drawn from one member, by weight, and equals that member's own world."""
+"""Mixtures of scenarios: each world is drawn from one of them, the *members*, and equals this member's own world.
+
+The member is drawn by weight.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from ethbrake_marl.files.yaml import Document, flow_text
 from ethbrake_marl.physics.messages import USUAL_PIECES
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.fields import QUANTITY
-from ethbrake_marl.scenario.vehicle_types import Member
+from ethbrake_marl.scenario.member import Member
 
 WORDS = ("title", "description", "source")
 
@@ -24,9 +27,10 @@ AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a scenario with changed values.
+    """Return ``content`` of a scenario file with the keys and values of ``changes``.
 
-    A new way to declare gaps or speeds replaces the old one.
+    A new way to declare gaps or speeds replaces the old one: with ``time_gaps_s`` in the changes, ``gaps_m`` is
+    dropped.
     """
     old = {key for pair in QUANTITY.alternatives.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:
@@ -37,10 +41,16 @@ def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> d
 def build_members(
     document: Document, build: Callable[[Document], AnyScenario]
 ) -> tuple[Document, tuple[AnyScenario, ...]]:
-    """Return the document with what follows from its members, and the members that its ``mixture`` lists.
+    """Build the scenarios that the ``mixture`` of a file lists; return the completed document and these scenarios.
 
-    Keys next to ``mixture`` replace those of every member. An invalid list is left for the schema to refuse. Raises
-    ``InvalidInput`` naming the invalid member, or the key in which two members differ.
+    Keys next to ``mixture`` replace those of every listed scenario. Keys in which all scenarios agree are added to the
+    document. An invalid list gives the document unchanged and no scenarios; the schema refuses it later. Raises
+    ``InvalidInput`` naming the invalid scenario, or the key in which two of them differ.
+
+    Args:
+        document: parsed file with a key ``mixture``.
+        build: function that builds one scenario from a document.
+
     """
     listed, content = document.content["mixture"], document.content
     if not (isinstance(listed, list | tuple) and listed and all(_is_whole(entry) for entry in listed)):
@@ -62,13 +72,24 @@ def _is_whole(entry: Any) -> bool:
 
 
 def member_content(member: ScenarioFields) -> dict[str, Any]:
-    """Return what determines a member's worlds, as plain data: declared values and shared settings, without texts."""
+    """Return everything that determines the worlds of one scenario of a mixture, as plain data.
+
+    These are declared values and shared settings, without title, description and source.
+    """
     declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
     return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
 
 
 def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
-    """Return the content of one member without texts, updated with the keys next to the mixture, with line numbers."""
+    """Return the document of one scenario of a mixture, without texts, with its line numbers.
+
+    Args:
+        document: parsed file of the mixture.
+        i: position of the scenario in its list.
+        entry: the list's entry at this position.
+        beside: keys next to the mixture, which replace those of the scenario.
+
+    """
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
     inside = {path[3:]: line for path, line in document.lines.items() if path[:3] == ("mixture", i, "scenario")}
     own = {**{key: document.content[key] for key in ("vehicles",) if key in document.content}, **own}
@@ -78,7 +99,11 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 
 
 def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
-    """Refuse nested mixtures, repeated names, and members that cannot share one batch."""
+    """Raise ``InvalidInput`` if the scenarios ``members`` of a mixture cannot be drawn together.
+
+    None may be a mixture, their names must differ, and they must fit into one batch. ``document``: the mixture's file,
+    for messages.
+    """
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]
     if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:

@@ -30,16 +30,20 @@ _UNUSED = 0.5  # value of uniform numbers without effect
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """The numbers that a scenario draws: their names, and the place of each among a world's uniform numbers."""
+    """The numbers that a scenario draws, as coordinates of a unit cube: names and places."""
 
-    scenario: ScenarioFields
-    names: tuple[str, ...]
-    places: tuple[Place, ...]
+    scenario: ScenarioFields  # the scenario that draws them
+    names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
+    places: tuple[Place, ...]  # stream and column of each coordinate among a world's uniform numbers
 
     def sample(self, points: Floats) -> tuple[Sample, Bools]:
-        """Return the worlds at ``points`` [n, coordinates] in [0, 1), and whether the scenario accepts each, [n].
+        """Return the worlds at ``points`` of the unit cube, and whether the scenario accepts each, [n].
 
         A scenario that rejects early impacts does not accept a world that has one.
+
+        Args:
+            points: coordinates in [0, 1) in the order of ``names``, [n, coordinates].
+
         """
         n, vehicles = len(points), self.scenario.vehicles
         widths = {(): BLOCK * vehicles, TYPES: PER_TYPE * vehicles, OBSTACLE: OF_WORLD, SURROUNDINGS: OF_WORLD}
@@ -54,7 +58,7 @@ class Ranges:
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return name -> place of every quantity that is drawn."""
+    """Return name -> (stream, column) of the uniform number of every quantity that the scenario draws."""
     used: list[str] = []
 
     def note(key: str) -> Floats:
@@ -75,7 +79,10 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return name -> place of each vehicle's type and load, if its type is drawn or a quantity depends on its load."""
+    """Return name -> (stream, column) of the uniform numbers of each vehicle's type and load.
+
+    Only of those that have an effect: a type that is drawn, and a load on which some quantity depends.
+    """
     if scenario.types_of_line is None:
         return {}
     places: dict[str, Place] = {}
@@ -99,10 +106,10 @@ def _name(key: str, index: int) -> str:
 
 
 def ranges(scenario: ScenarioFields) -> Ranges:
-    """Return every number that the scenario draws.
+    """Return every number that the scenario draws, as coordinates of a unit cube.
 
     Raises ``InvalidInput`` for a scenario that draws nothing, for a mixture, and for a channel other than ``paper``,
-    because the worlds of these cannot be given one by one.
+    because a point of the cube would not determine a world of these.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)

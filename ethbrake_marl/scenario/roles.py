@@ -30,8 +30,8 @@ _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 class ScriptSpec(NamedTuple):
     """``name[:argument]``, for example ``constant:3.5``: the name of an agent in a scenario or on the command line."""
 
-    name: str
-    argument: str | None
+    name: str  # name of the agent, such as ``constant``
+    argument: str | None  # text after the colon, such as ``3.5``; None: no colon
 
     def __str__(self) -> str:
         return self.name if self.argument is None else f"{self.name}:{self.argument}"
@@ -39,7 +39,7 @@ class ScriptSpec(NamedTuple):
     @staticmethod
     @lru_cache(maxsize=256)
     def parse(spec: str) -> ScriptSpec:
-        """Parse ``name[:argument]``.
+        """Parse ``spec``, a text ``name[:argument]``.
 
         Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. A Python
         file is refused too: a scenario from somebody else must not run code.
@@ -75,9 +75,10 @@ class ScriptSpec(NamedTuple):
 
     @property
     def pieces(self) -> tuple[tuple[float, float], ...]:
-        """Pieces (s after the latency, m/s2 of braking) of a ``profile``; empty for any other script.
+        """Pieces of a ``profile``, as (start in s after the latency, braking in m/s2); empty for any other script.
 
-        Raises ``InvalidInput`` unless times start at 0 and increase, and no braking is negative.
+        A piece is a time interval of constant braking. Raises ``InvalidInput`` unless times start at 0 and increase,
+        and no braking is negative.
         """
         if self.name != _PROFILE:
             return ()
@@ -105,11 +106,11 @@ class ScriptSpec(NamedTuple):
     def command(
         self, braking_capacity_mps2: ArrayLike, driving_capacity_mps2: ArrayLike | None = None
     ) -> Floats | None:
-        """Return the command (m/s2) of a script that needs no state, in the shape of the capacity.
+        """Return the command (m/s2) of a script that needs no state, in the shape of ``braking_capacity_mps2``.
 
-        None for any other script. ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, ``profile`` -> its
-        first piece. Raises ``InvalidInput`` if a, or a piece, exceeds the braking capacity of some vehicle, or -a the
-        driving capacity, if given.
+        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, ``profile`` -> its first piece; None for any
+        other script. Raises ``InvalidInput`` if a, or a piece, exceeds the braking capacity of some vehicle, or -a the
+        ``driving_capacity_mps2``, if given.
         """
         capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
         if not self.is_state_free():
@@ -127,7 +128,10 @@ class ScriptSpec(NamedTuple):
 
 
 def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
-    """Return the pieces of a ``profile``, [[s, m/s2], ...], after checking them; raise ``InvalidInput`` if invalid."""
+    """Return the pieces of a ``profile``, ``((s, m/s2), ...)``, after checking them; raise ``InvalidInput`` if invalid.
+
+    ``given``: a list ``[[s after the latency, m/s2 of braking], ...]``, from a file and so of any type.
+    """
     right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
     if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
         raise InvalidInput(right)
@@ -155,7 +159,10 @@ def _role_text(role: object) -> object:
 
 
 def _role_content(role: str) -> str | dict[str, list[list[float]]]:
-    """Convert a role to the form in a scenario file."""
+    """Convert a role to its form in a scenario file: ``profile:0=3`` to ``{"profile": [[0.0, 3.0]]}``.
+
+    Other roles stay as they are.
+    """
     pieces = ScriptSpec.parse(role).pieces
     return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
 
@@ -199,9 +206,10 @@ class Roles(dict[str, str]):
 
     @staticmethod
     def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
-        """Return a role for every vehicle in order: full braking if none is given.
+        """Return a role for each of ``vehicles`` vehicles: ``learner`` or the name of a script.
 
-        Without ``given``, vehicle_2 learns.
+        ``given`` maps names such as ``vehicle_2`` to roles; a vehicle that it leaves out brakes fully. None: vehicle_2
+        learns and the others brake fully.
         """
         roles = {"vehicle_2": LEARNER} if given is None else given
         names = [f"vehicle_{i + 1}" for i in range(vehicles)]

@@ -15,13 +15,12 @@ _Texts = NDArray[np.str_]
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Worlds at the alert, with their numbers in the list.
+    """Worlds at the alert (time 0), with their numbers in the list.
 
     >>> import ethbrake_marl as eb
     >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
     >>> sample.index, sample.worlds.gaps_m.round(2)
     (array([0, 1]), array([[6.62, 8.49], [5.33, 7.79]]))
-
     """
 
     worlds: Worlds  # at t = 0
@@ -35,14 +34,18 @@ class Sample:
         return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
     def take(self, rows: ArrayLike) -> Sample:
-        """Return the selected worlds, by row or mask; always a copy, with ``rejected`` 0."""
+        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy, with ``rejected`` 0."""
         some = np.asarray(rows)
         types, scenarios = (None if each is None else each[some] for each in (self.types, self.scenarios))
         return Sample(self.worlds.take(some), self.index[some], 0, types, scenarios)
 
     @staticmethod
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
-        """Join samples in the order of their world numbers; either all have types (or scenarios) or none has."""
+        """Join samples into one, in the order of their world numbers.
+
+        Either all parts have types (or scenarios) or none has. ``rejected``: number of rejected draws to note in the
+        result.
+        """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
         joined: dict[str, _Texts] = {}
@@ -54,13 +57,16 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns ``scenario`` (of a mixture) and ``vehicle_K_type``, [n] each; only those that the worlds have."""
+        """Columns of text, [n] each: ``scenario`` of a mixture, and ``vehicle_1_type`` and so on if there are types."""
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
         types = () if self.types is None else self.types.T
         return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 
     def count_kinds(self) -> str:
-        """Return a text that counts each scenario of a mixture and each vehicle type; empty without them."""
+        """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type.
+
+        For example ``"; vehicle_1_type: car 7, truck 3"``; empty without mixture and types.
+        """
         told = ""
         for kind, column in self.kinds.items():
             names, counts = np.unique(column, return_counts=True)

@@ -47,12 +47,20 @@ _NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
     """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
 
-    World k has the same bits for every ``n`` and ``first``. The channels ``"list"`` (evaluation) and ``"training"`` are
-    independent of each other. Raises ``InvalidInput`` for a negative seed or ``first``, for ``n < 1``, or if early
-    impacts are rejected and (almost) every draw has one.
+    World k has the same bits for every ``n`` and ``first``. World k of a mixture is drawn from one of its scenarios, by
+    weight, and equals that scenario's own world k under the same seed, bit for bit. So results on a mixture can be
+    compared with results on its scenarios, world by world.
 
-    World k of a mixture is drawn from one member, by weight, and equals that member's own world k under the same seed,
-    bit for bit. So results on a mixture can be compared with results on its members, world by world.
+    Args:
+        scenario: the scenario to draw from.
+        n: number of worlds.
+        seed: seed of the list, a whole number of at least 0.
+        first: number of the first world in the list, from 0.
+        channel: ``"list"`` for evaluation, ``"training"`` for training: two independent lists per seed.
+
+    Raises ``InvalidInput`` for a negative seed or ``first``, for ``n < 1``, or if early impacts are rejected and
+    (almost) every draw has one.
+
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
         check_whole_number(name, value, least)
@@ -77,9 +85,9 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 
 
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
-    """Return the member of a mixture from which each world is drawn, as an index into ``members``, [n].
+    """Return the scenario of a mixture from which each world is drawn, as an index into ``scenario.members``, [n].
 
-    The index is 0 without a mixture.
+    The index is 0 without a mixture. Arguments are the same as in ``sample``.
     """
     cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
     u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
@@ -87,16 +95,21 @@ def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, c
 
 
 def middle_world(scenario: ScenarioFields) -> Worlds:
-    """Return the world (n = 1) in which every number is the median of its distribution."""
+    """Return one world (n = 1) in which every quantity that ``scenario`` draws is the median of its distribution."""
     alone = scenario.model_copy()
     alone._columns = {entry: column.middle for entry, column in scenario.table_entries.items()}
     return sample_by(alone, lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
 
 
 def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """Return the worlds for given uniform numbers; early impacts are not rejected.
+    """Return the worlds that given uniform numbers produce; early impacts are not rejected.
 
-    ``numbers(width, of)`` returns uniform numbers [n, width] of the stream ``of``; ``()`` is the main stream.
+    Args:
+        scenario: the scenario to draw from; not a mixture.
+        numbers: function (width, stream) -> uniform numbers in [0, 1), [n, width]; the stream is a tuple such as
+            ``fields.TYPES``, or ``()`` for the main stream.
+        index: number of each world in its list, [n], to be noted in the sample.
+
     """
     line, typed = scenario.types_of_line, None
     if line is not None:
@@ -122,10 +135,12 @@ def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]]
 def drawn_quantities(
     scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], typed: tuple[Ints, Floats] | None
 ) -> Callable[[str], Floats]:
-    """Return a function of a declared key: its values in n worlds, [n, entries].
+    """Return a function that maps the key of a declared quantity to its values in n worlds, [n, entries].
+
+    There is one entry per vehicle, per pair or per world, as ``QUANTITY`` says for the key.
 
     Args:
-        scenario: the scenario that declares them.
+        scenario: the scenario that declares the quantities.
         numbers: source of uniform numbers, as for ``sample_by``.
         typed: type (index) and load of every vehicle, both [n, N]; None without types.
 
@@ -158,10 +173,20 @@ def drawn_quantities(
 def uniform_numbers(
     seed: int, channel: Channel, attempt: int, first: int, n: int, width: int, *, of: tuple[int, ...] = ()
 ) -> Floats:
-    """Return uniform numbers in [0, 1) for worlds ``first`` to ``first + n - 1``: [n, width], width a multiple of 4.
+    """Return uniform numbers in [0, 1) for worlds ``first`` to ``first + n - 1``, [n, width].
 
-    Row k depends only on (seed, channel, attempt, of, first + k, width). ``of`` selects a separate stream, such as
-    ``V2X_NEWS``. A number is the upper 53 bits of a Philox integer.
+    Row k depends only on (seed, channel, attempt, of, first + k, width). A number is the upper 53 bits of a Philox
+    integer.
+
+    Args:
+        seed: seed of the list.
+        channel: ``"list"`` or ``"training"``.
+        attempt: number of the draw, from 0; a world that is rejected is drawn again with the next attempt.
+        first: number of the first world in the list, from 0.
+        n: number of worlds.
+        width: numbers per world, a multiple of 4.
+        of: a separate stream of numbers, such as ``fields.V2X_NEWS``; ``()``: the main stream.
+
     """
     sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt, *of))
     key = sequence.generate_state(2, np.uint64)
@@ -172,7 +197,10 @@ def uniform_numbers(
 
 
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
-    """Return the worlds with these numbers (ascending) of the scenario's list, rejecting early impacts if required."""
+    """Return the worlds with the ascending numbers ``index`` [n] of the scenario's list.
+
+    Early impacts are rejected if the scenario says so. Other arguments are the same as in ``sample``.
+    """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
@@ -183,10 +211,10 @@ def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Cha
 
 
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
-    """Return which worlds have an impact before, or just when, the first learner can act, [n].
+    """Return whether each world has an impact before, or just when, the first learner can act, [n].
 
-    Scripted vehicles follow their scripts, which must not depend on the state, and learners coast; no learner can
-    change this earlier. The scenario must have a learner.
+    Until then scripted vehicles follow their scripts, which must not depend on the state, and learners coast; so no
+    learner can prevent this impact. The scenario must have a learner.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
@@ -203,7 +231,16 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
 
 
 def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample, early: Bools) -> Sample:
-    """Draw rejected worlds again, attempt by attempt, until all are accepted."""
+    """Draw rejected worlds again, attempt by attempt, until all are accepted; return the complete sample.
+
+    Args:
+        scenario: the scenario to draw from.
+        seed: seed of the list.
+        channel: ``"list"`` or ``"training"``.
+        drawn: worlds of the first attempt.
+        early: whether each of them is rejected for an early impact, [n].
+
+    """
     parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
     for attempt in range(1, MOST_ATTEMPTS):
         if attempt == _PATIENCE and len(pending) > 1:
@@ -220,7 +257,11 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 
 
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
-    """Try one world up to the last attempt; raise the error if it fails, so that a hopeless list fails early."""
+    """Raise ``InvalidInput`` if all remaining attempts to draw world number ``index`` [1] are rejected.
+
+    Testing one world first makes a list whose draws are all rejected fail early. Other arguments are the same as in
+    ``sample``.
+    """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
             return
@@ -237,7 +278,11 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Draw the worlds with these numbers (ascending) once, with the random numbers of this attempt."""
+    """Draw the worlds with the ascending numbers ``index`` [n] once; early impacts are not rejected.
+
+    ``attempt``: number of the draw, from 0, which selects the random numbers. Other arguments are the same as in
+    ``sample``.
+    """
     first, last = int(index[0]), int(index[-1])
 
     def numbers(width: int, of: tuple[int, ...] = ()) -> Floats:

@@ -34,7 +34,10 @@ class ScenarioWording(Wording):
     """Wording of the error messages about a scenario, or part of one."""
 
     def instead(self, key: str) -> str:
-        """Suggest what the model offers for a common unknown key: other words for friction, and slopes."""
+        """Return a hint for an unknown key that people often try: other words for friction, and slopes.
+
+        Empty for any other key.
+        """
         if "friction" in key or key == "mu":
             return "friction is that of the road, one for the whole line, for instance friction: 0.5"
         if key in ("grade", "slope"):
@@ -42,7 +45,7 @@ class ScenarioWording(Wording):
         return ""
 
     def needed(self, path: YamlPath) -> str:
-        """Return what is needed at ``path``, with an example."""
+        """Return a sentence on what is needed at ``path`` (keys and indices inside the file), with an example."""
         key = path[-1]
         if path[0] == "mixture":
             return "it is needed, for instance {scenario: paper-random, weight: 2}"
@@ -66,12 +69,18 @@ class ScenarioWording(Wording):
         return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair that a value at ``path`` belongs to; empty for anything else."""
+        """Return the vehicle or pair that the value at ``path`` belongs to, such as ``vehicle_2``; else an empty text.
+
+        ``path``: keys and indices inside the file, for example ``("speeds_mps", 1)``.
+        """
         rule = QUANTITY.declared.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return what a quantity must be, with a suggestion for a misspelt distribution; empty for other values."""
+        """Return what a quantity must be, with a suggestion for a misspelt distribution; empty for other values.
+
+        ``detail``: one mistake, as pydantic reports it.
+        """
         if detail["type"] == "quantity":
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
         if detail["type"] == "float_type" and detail["loc"][-1] == "#number":
@@ -140,7 +149,11 @@ class Scenario(ScenarioFields):
         return Sheet(f"Scenario {self.name}: {self.title or 'no title'}", ("Key", "Value"), rows).html()
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-        """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``; see ``sampling.sample``."""
+        """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
+
+        World k of a seed is always the same, bit for bit. ``channel``: ``"list"`` for evaluation, ``"training"`` for
+        training; the two are independent. Raises ``InvalidInput`` for an invalid number. See ``sampling.sample``.
+        """
         return sample(self, n, seed, first=first, channel=channel)
 
     def declared(self) -> dict[str, Any]:
@@ -150,7 +163,7 @@ class Scenario(ScenarioFields):
     def content(self, without: Collection[str]) -> dict[str, Any]:
         """Return every value, including defaults, as plain data, except the keys ``without``.
 
-        For a mixture this includes the values of its members, without their texts.
+        For a mixture this includes the values of its scenarios, without their titles, descriptions and sources.
         """
         content = self.model_dump(mode="json", exclude=set(without))
         if self.mixture is not None and self.members:
@@ -161,9 +174,9 @@ class Scenario(ScenarioFields):
         return content
 
     def replace(self, **changes: Any) -> Scenario:
-        """Return the scenario with changed values, checked again.
+        """Return the scenario with changed values, for example ``replace(mass_t=2.0)``, checked again.
 
-        A new way to declare gaps or speeds replaces the old one. In a mixture the values change in every member.
+        A new way to declare gaps or speeds replaces the old one. In a mixture the values change in every scenario.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
@@ -195,7 +208,7 @@ class Scenario(ScenarioFields):
 
 
 def as_scenario(game: Game) -> Scenario:
-    """Return a game that is a scenario; raise ``InvalidInput`` for any other game."""
+    """Return ``game`` itself if it is a ``Scenario``; raise ``InvalidInput`` for any other game."""
     if not isinstance(game, Scenario):
         raise InvalidInput(f"game {game.name!r}: is a {type(game).__name__}; a Scenario is needed here")
     return game
@@ -228,7 +241,15 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the schema of a quantity's range, for a number and for the values of a distribution or list."""
+    """Return the JSON schema of a quantity's range, for a number and for the numbers in a distribution or list.
+
+    Args:
+        key: key of the quantity.
+        low: smallest allowed value.
+        high: largest allowed value.
+        positive: ``low`` itself is not allowed.
+
+    """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
     above = {"exclusiveMinimum": 0}
     inside = dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), _reference(key))
@@ -238,7 +259,7 @@ def _range(key: str, low: float, high: float, positive: bool = False) -> dict[st
 
 
 def _build(scenario: Scenario, document: Document) -> None:
-    """Validate the document's content into ``scenario``."""
+    """Check the content of ``document`` and fill the new, empty ``scenario`` with it."""
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
     members: tuple[Scenario, ...] = ()
@@ -252,7 +273,10 @@ def _build(scenario: Scenario, document: Document) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Convert numpy numbers and arrays to Python's, which the strict schema accepts, and scenarios to their content."""
+    """Convert numpy numbers and arrays in ``value`` to Python's, which the strict schema accepts.
+
+    Scenarios become their content; mappings and lists are converted inside.
+    """
     if isinstance(value, Scenario):
         return value.declared()
     if isinstance(value, np.ndarray | np.generic):

@@ -29,10 +29,10 @@ _ALWAYS_IN_A_TABLE = ("gaps_m", "speeds_mps")
 
 @dataclass(frozen=True, slots=True)
 class _Naming:
-    """How messages name a value: by column and row of a table, or by key and index of a state."""
+    """How error messages name a value: by column and row of a table, or by key and index of a state."""
 
-    where: str
-    kind: Literal["file", "table", "state"]
+    where: str  # the file, or what else was given, such as ``initial states``
+    kind: Literal["file", "table", "state"]  # CSV file, columns in memory, or one state by key
     lines: Sequence[int] = ()  # of a file: line on which each row begins
 
     def entry(self, entry: Entry) -> str:
@@ -49,7 +49,7 @@ class _Naming:
 
 
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
-    """Return the quantities that a world of this scenario has."""
+    """Return key -> rule of the quantities that every world of this scenario has."""
     there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
     return QUANTITY.usual | {
         key: rule for key, rule in QUANTITY.optional.items() if there.get(key, scenario.declares(key))
@@ -57,7 +57,14 @@ def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
 
 
 def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
-    """Build worlds from checked columns, [n] each, and the scenario's fixed numbers for the rest."""
+    """Build worlds from checked columns; take quantities without a column from the scenario, where they must be fixed.
+
+    Args:
+        given: values of each column, [n], by quantity and index.
+        scenario: the scenario that the worlds belong to.
+        naming: how messages name a value.
+
+    """
     if scenario.members:
         raise InvalidInput(
             f"{naming.where}: scenario {scenario.name!r} is a mixture, and nothing says which of its scenarios a world"
@@ -90,10 +97,17 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
 
 
 def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
-    """Return the scenario's fixed value of this entry, [n] or [1]; None if it is random.
+    """Return the scenario's fixed value of one entry of a quantity, [n] or [1]; None if it is random.
 
     A time gap is converted with the speeds in ``full``; an obstacle's margin counts from where Vehicle 1 stops with the
     values in ``full``.
+
+    Args:
+        scenario: the scenario that declares the quantity.
+        field: key of the quantity, such as ``"gaps_m"``.
+        index: vehicle or pair, from 0.
+        full: quantities of the n worlds that are known already, [n, entries] by key.
+
     """
     if field == "obstacle_gap_m":
         low, high = support(scenario.quantities(field if scenario.declares(field) else "obstacle_margin_m")[0])
@@ -118,14 +132,26 @@ def _check_together(full: Mapping[str, Floats], scenario: ScenarioFields, naming
 
 
 def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, right: str) -> None:
-    """Raise ``InvalidInput`` for the first world in which ``good`` is False."""
+    """Raise ``InvalidInput`` for the first world in which ``good`` [n] is False.
+
+    Args:
+        good: whether the value is valid in each world, [n].
+        naming: how messages name a value.
+        entry: quantity and index of the value.
+        column: the values, [n].
+        right: what would be valid, for the message.
+
+    """
     if not good.all():
         row = int(np.argmin(good))
         raise InvalidInput(f"{naming.value(entry, row)} = {column[row]:.12g}: {right}")
 
 
 def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> list[Entry]:
-    """Return the entry of each column; raise ``InvalidInput`` for unknown, repeated and missing columns."""
+    """Return quantity and index of each column of a table with this header.
+
+    Raises ``InvalidInput``, with ``where`` in its text, for unknown, repeated and missing columns.
+    """
     known = table_columns(scenario)
     if twice := [name for name, times in Counter(header).items() if times > 1]:
         raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
@@ -148,7 +174,10 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
 
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return header, rows (at least one) and first line of each row of a CSV file, with values unchecked."""
+    """Return the header of a CSV file, its rows (at least one), and the line number at which each row begins.
+
+    Values are texts and are not checked.
+    """
     rows: list[list[str]] = []
     lines: list[int] = []
     data = read_plain(file, SIZE_LIMIT)
@@ -171,7 +200,16 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
 
 
 def _number_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float:
-    """Return the number in one column of a CSV row."""
+    """Return the number in one column of a CSV row; raise ``InvalidInput`` if it is not a number.
+
+    Args:
+        file: the file, for messages.
+        header: names of the columns.
+        row: texts of the row.
+        line: line on which the row begins, for messages.
+        column: name of the column to read.
+
+    """
     if len(row) != len(header):
         raise InvalidInput(f"{file}, line {line}: {len(row)} values, but the header has {len(header)} columns")
     text = row[header.index(column)]
@@ -182,7 +220,10 @@ def _number_at(file: Path, header: list[str], row: list[str], line: int, column:
 
 
 def table_columns(scenario: ScenarioFields) -> dict[str, Entry]:
-    """Return the columns that a table of initial states may have for this scenario (``gap_1_m``, ``speed_1_mps``)."""
+    """Return name -> (quantity, index) of the columns that a table of initial states may have for this scenario.
+
+    For example ``{"gap_1_m": ("gaps_m", 0), "speed_1_mps": ("speeds_mps", 0)}``.
+    """
     return columns_of_table(_quantities(scenario), scenario.vehicles)
 
 
@@ -203,9 +244,16 @@ def read_worlds(scenario: ScenarioFields, path: str | Path) -> Worlds:
 
 
 def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
-    """Return the rows of a scenario's table, and their weights, from the given columns of a CSV file.
+    """Read the rows of a scenario's table, and their weights, from a CSV file.
 
-    Raises ``InvalidInput`` naming file, line and column.
+    Returns ``{"rows": [[7.0, 8.0], ...]}``, with ``"weights": [1.0, ...]`` if weights are given. Raises
+    ``InvalidInput`` naming file, line and column.
+
+    Args:
+        file: the CSV file, with a header line.
+        columns: names of the columns to read, from the scenario file (unchecked).
+        weights: name of the column with the weight of each row; None: no weights.
+
     """
     header, rows, lines = _read_csv(file)
     weights_of = [] if weights is None else [weights]
@@ -224,12 +272,12 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
 
 
 def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]) -> Worlds:
-    """Build worlds from columns of equal length n: ``gap_1_m`` ..., ``speed_1_mps`` ..., and optional ones.
+    """Build worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
-    Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``,
-    ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` if the scenario has an
-    obstacle. A column that is left out is taken from the scenario, where it must be a fixed number. Raises
-    ``InvalidInput`` naming the column and the row (from 0).
+    Gaps and speeds are needed. Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``,
+    ``mass_1_t``, ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` if the
+    scenario has an obstacle. A column that is left out is taken from the scenario, where it must be a fixed number.
+    Raises ``InvalidInput`` naming the column and the row (from 0).
     """
     entries = _known_columns(list(columns), scenario, "initial states")
     given = {
@@ -244,10 +292,10 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
 
 
 def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]) -> Worlds:
-    """Build the one world of ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; keys are a scenario's quantities.
+    """Build one world (n = 1) from a state ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``.
 
-    A single number applies to every vehicle. A key that is left out is taken from the scenario, where it must be a
-    fixed number. Raises ``InvalidInput`` naming the key and the entry.
+    Keys are a scenario's quantities. A single number applies to every vehicle. A key that is left out is taken from the
+    scenario, where it must be a fixed number. Raises ``InvalidInput`` naming the key and the entry.
     """
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")

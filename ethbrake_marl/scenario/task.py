@@ -11,14 +11,14 @@ from ethbrake_marl.scenario.schema import Scenario
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """The task of controlling some vehicles of a scenario; all others follow its scripts.
+    """The task of controlling some vehicles of a scenario; all others follow the scenario's scripts.
 
     Raises ``InvalidInput`` for an index without a vehicle, a repeated index, or an unknown harm count.
     """
 
-    scenario: Scenario
+    scenario: Scenario  # the scenario that the worlds are drawn from
     vehicles: tuple[int, ...]  # indices of the controlled vehicles (0 = front), in the order of their commands
-    harm_count: HarmCount = "first"  # harm to be minimised; results under both counts do not depend on it
+    harm_count: HarmCount = "first"  # harm to be minimised: of each pair's ``"first"`` impact, or ``"total"``
 
     def __post_init__(self) -> None:
         check_harm_count(self.harm_count)

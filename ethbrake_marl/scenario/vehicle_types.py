@@ -110,7 +110,14 @@ Types = Annotated[
 
 
 class TypesOfLine:
-    """The possible types at each place of a line, and their probabilities."""
+    """The possible vehicle types at each place of a line, and their probabilities.
+
+    Args:
+        kinds: declaration of each type, by name; their order gives the indices of the types.
+        types: types that are possible at each place; None: all, in proportion to their weights.
+        vehicles: number of vehicles in the line.
+
+    """
 
     def __init__(self, kinds: Mapping[str, VehicleType], types: Types | None, vehicles: int) -> None:
         self.names = tuple(kinds)
@@ -120,11 +127,14 @@ class TypesOfLine:
         self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in given])
 
     def possible(self, vehicle: int) -> list[int]:
-        """Return the indices of the types that are possible for this vehicle."""
+        """Return the indices of the types that are possible for ``vehicle`` (index from 0)."""
         return np.flatnonzero(self.weights[vehicle] > 0.0).tolist()
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
-        """Return type (index) and load of every vehicle, both [n, N], from uniform numbers ``u`` [n, N, >= 2]."""
+        """Return type (index) and load (0 empty to 1 full) of every vehicle, both [n, N].
+
+        ``u``: uniform numbers in [0, 1), [n, N, 2 or more]; the first draws the type, the second the load.
+        """
         n, vehicles = u.shape[:2]
         types, load = np.zeros((n, vehicles), np.int64), np.zeros((n, vehicles))
         for i in range(vehicles):
@@ -151,7 +161,10 @@ PerVehicle = Annotated[
 
 
 class _ObjectiveSchema:
-    """JSON schema of an objective: the objectives that are registered when it is generated."""
+    """Annotation of a text field that holds an objective: its JSON schema lists all objectives.
+
+    Objectives that are registered before the schema is made are included.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -162,15 +175,6 @@ class _ObjectiveSchema:
 
 
 ObjectiveName = Annotated[str, _ObjectiveSchema]
-
-
-class _MemberSchema:
-    """JSON schema of a mixture's member: in a file also a scenario's name or the path of its file."""
-
-    @classmethod
-    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {"anyOf": [{"type": "string"}, {"type": "object"}]}
-
 
 MOST_NUMBERS = 100_000  # largest number of values in a table, which every copy of the scenario contains
 
@@ -214,7 +218,7 @@ class Table(FileModel):
         return self
 
     def column_values(self) -> dict[str, TableColumn]:
-        """Return name -> column."""
+        """Return the columns of the table by name, each with the weights of the rows."""
         rows = np.array(self.rows)
         weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
         cumulative = np.cumsum(np.asarray(weights))
@@ -222,10 +226,3 @@ class Table(FileModel):
             name: TableColumn(name, column, cumulative / cumulative[-1])
             for name, column in zip(self.columns, rows.T, strict=True)
         }
-
-
-class Member(FileModel):
-    """One scenario of a mixture, with its weight relative to the others."""
-
-    scenario: Annotated[dict[str, Any], _MemberSchema] = Field(description="a name, a path, or what its file says")
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other scenarios")

@@ -18,7 +18,10 @@ from ethbrake_marl.shield.options import ShieldOptions
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
-    """Return ``policy`` as an agent; an agent is returned unchanged. Raise ``InvalidInput`` for anything else."""
+    """Return ``policy`` as an agent that proposes actions: an agent unchanged, a learned policy as a ``LearnedAgent``.
+
+    Anything else raises ``InvalidInput``, whose message begins with ``where``.
+    """
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
             return policy
@@ -32,14 +35,14 @@ def proposing_agent(policy: object, where: str) -> Agent:
 def proposing_agents(
     policy: Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy], vehicles: Sequence[int], where: str
 ) -> dict[int, Agent]:
-    """Return the proposing agent of each shielded vehicle, by vehicle index.
+    """Return the proposing agent of each shielded vehicle: vehicle index -> agent.
 
     Args:
         policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
         vehicles: indices of the shielded vehicles.
         where: name of the interface, for error messages.
 
-    Raises ``InvalidInput`` for anything else, and where the team or mapping does not cover exactly these vehicles.
+    Raises ``InvalidInput`` for anything else, and if the team or mapping does not cover exactly these vehicles.
 
     """
     if isinstance(policy, Team):
@@ -61,10 +64,16 @@ Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
-    """Build the guard that shields all learners of an engine with these options.
+    """Return the guard that shields all learners of an engine.
 
-    ``policy`` proposes the actions that the caller leaves out; mode ``episode`` needs it. Raises ``InvalidInput`` where
-    no vehicle learns, where several learn in another mode than ``step``, and where ``policy`` is not a policy.
+    Args:
+        engine: the engine, which is not changed.
+        policy: proposes the actions that the caller leaves out; None: nobody. Mode ``episode`` needs it.
+        options: settings of the shield.
+
+    Raises ``InvalidInput`` if no vehicle learns, if several learn in another mode than ``step``, and if ``policy`` is
+    not a policy.
+
     """
     where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
     if not vehicles:
@@ -86,9 +95,19 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
 
 
 class Attached:
-    """The link between a wrapper and the guard that it put into the engine of its environment.
+    """The link between a wrapper of an environment and the guard that it puts into the environment's engine.
 
-    Raises ``InvalidInput`` where ``env`` is not an environment of this package, or is shielded already.
+    Args:
+        env: the environment to shield.
+        interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
+        maker: code that makes such an environment, for error messages.
+        policy: proposes the actions that the caller leaves out; None: nobody.
+        where: name of the wrapper, for error messages.
+        options: keywords of ``ShieldOptions``.
+
+    The attributes are ``engine``, ``guard`` and ``options``, besides the properties below. Raises ``InvalidInput`` if
+    ``env`` is not an environment of this package, or is shielded already.
+
     """
 
     def __init__(
@@ -128,11 +147,11 @@ class Attached:
         return self.memory.shield
 
     def _reached(self) -> Any:
-        """Return the engine of the wrapped environment, looked up anew at each call."""
+        """Return the engine of the wrapped environment, looked up anew at each call; None if there is none."""
         return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
 
     def check_open(self) -> None:
-        """Raise ``InvalidInput`` if this shield was closed, or if the inner environment was replaced."""
+        """Raise ``InvalidInput`` if this shield was closed, or if the environment inside the wrapper was replaced."""
         if self._reached() is not self.engine:
             raise InvalidInput(
                 f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"
@@ -142,13 +161,13 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
 
     def close(self) -> None:
-        """Remove the guard from the engine."""
+        """Remove the guard from the engine. ``memory`` and ``shield`` keep their last values."""
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)
 
     def penalty(self) -> Floats:
-        """Return the intervention penalty of the last step, to be subtracted from the rewards, [n, L]."""
+        """Return the intervention penalty of the last step, [n, L], for the wrapper to subtract from the rewards."""
         self.check_open()
         ruling = self.engine.ruling
         if ruling is None:

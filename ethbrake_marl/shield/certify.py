@@ -50,10 +50,17 @@ NEARLY = 1e-9
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Return the constant action of ``constants`` [C, K] with the least worst-case harm, as its index, and that harm.
+    """Return the index of the constant action with the least worst-case harm, and that harm (m2/s2).
 
-    Each action is held from now to the horizon, simulated in one segment. The worst case is over the members (possible
-    worlds) of the world.
+    Each action is held from now to the horizon, simulated in one segment.
+
+    Args:
+        world: the M possible worlds of one world (``Members``); the worst case is over them.
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        constants: [C, K] actions of the K shielded vehicles.
+
     """
     best, least, critical = 0, math.inf, 0
     for c in range(constants.shape[0]):
@@ -77,9 +84,21 @@ def better_plan(
 ) -> tuple[float, float]:  # fmt: skip
     """Replace the rest of a plan by the best constant action, if this reduces its harm.
 
-    ``value`` is the plan's harm. The replacement happens from decision ``step`` on, in place, and only if its harm is
-    less than ``value`` and at most ``most``. Returns the harm of the plan afterwards, and the least harm found,
-    certified or not.
+    A plan holds one action for each decision. The replacement requires a harm below ``value`` and at most ``most``.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision, from which on the plan is replaced.
+        constants: [C, K] constant actions.
+        value: harm of the plan in the worst possible world, m2/s2.
+        most: largest accepted harm, m2/s2.
+        plan: [L, K] changed in place.
+        trial: [L, K] workspace.
+
+    Returns the harm of the plan afterwards, and the least harm found, certified or not.
+
     """
     so_far = worst_so_far(world, states)
     if value <= so_far or so_far > most:  # nothing can be better
@@ -99,14 +118,14 @@ def better_plan(
 
 @compiled
 def copy_action(action: Floats, to: Floats) -> None:
-    """Copy one row of numbers, usually the actions of one decision, one for each vehicle."""
+    """Copy the numbers of ``action`` into ``to``, which is as long; usually one action per shielded vehicle."""
     for c in range(to.shape[0]):
         to[c] = action[c]
 
 
 @compiled
 def is_planned(action: Floats, planned: Floats) -> bool:
-    """Return whether the actions of all vehicles equal the planned ones."""
+    """Return whether ``action`` [K] equals the ``planned`` action [K] for all shielded vehicles."""
     for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
         if action[c] != planned[c]:
             return False
@@ -118,11 +137,28 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Take one step with ``action`` [K] and search for a plan that continues it within the budget.
+    """Simulate one step with an action, and search for a plan that continues it within the budget.
 
-    Returns the harm of the certified plan, the least harm found, and the code of the reason. If the harm is within the
-    budget, the action and the plan behind it are written into ``plan``; otherwise ``plan`` is unchanged, and
-    ``certified`` remains its harm. An action for which the physics fails is not certified.
+    A plan holds one action for each decision. Tried are the rest of the present plan, then the constant actions. An
+    action for which the physics fails is not certified.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        action: [K] action to try.
+        budget: largest accepted harm of the episode, m2/s2.
+        certified: harm of ``plan``, m2/s2.
+        constants: [C, K] constant actions.
+        plan: [L, K] present plan; on success, replaced by the action and the plan behind it.
+        room: [2, L, K] workspace.
+        after: [M, S] receives the states after the step.
+        over: [M] receives whether the episodes have ended then.
+
+    Returns the harm of the plan found, which is a success if it is at most ``budget``; the least harm found; and the
+    code of the reason (``ShieldReason``).
+
     """
     going = take_steps(world, states, ended, step, action, after, over)
     value = worst_so_far(world, after) if going >= 0 else math.inf
@@ -145,9 +181,17 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write applied action, bound and margin into ``out`` [K, 4].
+    """Write the applied action, bound and margin of each shielded vehicle into its row of ``out`` [K, 4].
 
-    Vehicles whose proposal has no certificate keep the margin that is there already.
+    ``out`` has the columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN``; its reasons are filled in before. A
+    vehicle whose proposal was rejected keeps the margin that is in ``out`` already.
+
+    Args:
+        out: changed in place.
+        action: [K] applied actions.
+        bound: harm that is guaranteed from now on, m2/s2.
+        margin: budget minus the harm found, m2/s2.
+
     """
     for c in range(action.shape[0]):
         out[c, APPLIED], out[c, BOUND] = action[c], bound
@@ -160,12 +204,29 @@ def decide_world(
     world: Members, states: Floats, ended: Bools, step: int, proposed: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, tried: Floats, after: Floats, over: Bools, out: Floats,
 ) -> bool:  # fmt: skip
-    """Decide in one world: certify the proposed actions [K], or replace them; see ``certify``.
+    """Decide in one world: accept the proposed actions, or replace them by those of the plan.
 
     All proposals are tried together first. If they have no certificate, the vehicles are tried one by one, front to
-    rear, each beside the actions that the plan holds by then. Fills ``after`` and ``over`` (by member, that is,
-    possible world) and ``out`` (by vehicle: applied action, reason, bound, margin). Afterwards ``plan`` is the plan
-    whose harm is the bound in ``out``. Returns False where the physics fails with the applied actions.
+    rear, each beside the actions that the plan holds by then.
+
+    Args:
+        world: the M possible worlds of this world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        proposed: [K] proposed actions; NaN: none.
+        budget: largest accepted harm of the episode, m2/s2.
+        certified: harm of ``plan``, m2/s2.
+        constants: [C, K] constant actions that may replace the rest of a plan.
+        plan: [L, K] one action for each decision; changed in place, so that its harm is the bound in ``out``.
+        room: [2, L, K] workspace.
+        tried: [2, K] workspace.
+        after: [M, S] receives the states after the step.
+        over: [M] receives whether the episodes have ended then.
+        out: [K, 4] receives applied action, reason, bound and margin of each vehicle.
+
+    Returns False if the physics fails with the applied actions.
+
     """
     deviating = 0
     for c in range(proposed.shape[0]):
@@ -209,9 +270,22 @@ def certify_worlds(
     running: Running, proposed: Floats, budget: Floats, certified: Floats, constants: Floats, plans: Floats,
     after: Floats, out: Floats, over: Bools, failed: Bools,
 ) -> None:  # fmt: skip
-    """Run ``decide_world`` in every world whose episode still runs; changes ``plans`` in place.
+    """Decide in each of n worlds whose episode still runs, by ``decide_world``.
 
-    Sets ``failed`` [n] where the physics fails. A world whose episode has ended keeps its state and its plan.
+    A world whose episode has ended keeps its state and its plan.
+
+    Args:
+        running: the episodes at this decision, n worlds with M possible worlds each.
+        proposed: [n, K] proposed actions; NaN: none.
+        budget: [n] largest accepted harm of each episode, m2/s2.
+        certified: [n] harm of each plan, m2/s2.
+        constants: [C, K] constant actions that may replace the rest of a plan.
+        plans: [n, L, K] one action for each decision; changed in place.
+        after: [n * M, S] receives the states after the step.
+        out: [n, K, 4] receives applied action, reason, bound and margin of each vehicle.
+        over: [n * M] receives whether the episodes have ended then.
+        failed: [n] receives whether the physics failed.
+
     """
     n, every = running.steps.shape[0], all_members(running)
     room, tried = np.zeros((2, plans.shape[1], plans.shape[2])), np.zeros((2, plans.shape[2]))
@@ -236,10 +310,10 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Fill ``value`` [n] with the harm of executing the plans from now on, in the worst member (possible world).
+    """Write the harm of each plan, executed from now on, to ``value`` [n] m2/s2; infinity if the physics fails.
 
-    The value is infinity where the physics fails. Where one of the ``constants`` (constant actions) harms less than a
-    plan, it replaces the rest of that plan in place first.
+    The harm is that of the whole episode in the worst possible world. If one of the ``constants`` [C, K] (constant
+    actions) harms less than a plan, it first replaces the rest of that plan in ``plans`` [n, L, K].
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -256,10 +330,11 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 
 @compiled
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
-    """Simulate the plans from now on and report how the episodes end.
+    """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    Fills ``rests`` [n]: whether every member (possible world) comes to rest before the horizon and stays at rest; and
-    ``borne`` [n * M, N]: the harm that each vehicle bears by then (an obstacle ahead bears none).
+    A plan holds one action for each decision; ``running`` holds n worlds with M possible worlds each. Writes to
+    ``rests`` [n] whether every possible world of a world comes to rest before the horizon and stays at rest, and to
+    ``borne`` [n * M, N] the harm that each vehicle bears by then, m2/s2 (an obstacle ahead bears none).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -274,10 +349,16 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 
 @compiled
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
-    """Improve constant actions ``action`` [n, K] by coordinate descent over the vehicles, in place.
+    """Improve constant actions by coordinate descent over the vehicles.
 
     Each vehicle's action is replaced in turn by the action of ``grid`` with the least harm, simulated in one segment.
-    Every world must have exactly one member (possible world).
+
+    Args:
+        running: the episodes, n worlds with exactly one possible world each.
+        grid: [G] actions to try for one vehicle.
+        rounds: how often every vehicle has its turn.
+        action: [n, K] constant actions, changed in place.
+
     """
     every, states, ended, steps = all_members(running), running.states, running.ended, running.steps
     for k in range(states.shape[0]):
@@ -297,27 +378,27 @@ CONSTANTS = tuple(-k / 10 for k in range(11))  # constant actions that are tried
 
 
 class Backup(NamedTuple):
-    """The plan that the shield executes where it certifies nothing else."""
+    """The plan that the shield executes if it certifies nothing else, for n worlds."""
 
-    plan: Floats  # [n, L] or [n, L, K] actions, column j for decision j
-    harm: Floats  # [n] harm of the episode in the worst member if the plan is executed from now on (m2/s2)
+    plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions, column j for decision j
+    harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
     constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] constant actions that may replace the rest of a plan
 
 
 class Decision(NamedTuple):
-    """Result of ``certify``: the applied actions, the reasons, and the bound and plan that hold from now on."""
+    """Result of ``certify`` for n worlds, with K shielded vehicles if there are several."""
 
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
     intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
     reason: NDArray[np.int64]  # [n] or [n, K] codes of ShieldReason
     bound: Floats  # [n] largest possible harm of the episode from now on (m2/s2)
-    margin: Floats  # [n] or [n, K] budget minus the least harm found after the proposal; negative if rejected (m2/s2)
-    after: Running  # the episodes at the next decision
+    margin: Floats  # [n] or [n, K] accepted harm minus least harm found after the proposal (m2/s2); < 0: rejected
+    after: Running  # the predicted episodes at the next decision
     backup: Backup  # the plan whose harm is the bound
 
     @property
     def reason_names(self) -> NDArray[np.str_]:
-        """Reasons in words, [n] or [n, K]."""
+        """Why each proposal was accepted or replaced, in words such as "no certificate", [n] or [n, K]."""
         texts = [ShieldReason(code).text for code in self.reason.ravel().tolist()]
         return np.array(texts).reshape(self.reason.shape)
 
@@ -339,15 +420,23 @@ class Decision(NamedTuple):
 def plan_harm(running: Running, plan: Floats) -> Floats:
     """Return the harm of the episodes if the plans are executed from now on, [n] m2/s2.
 
-    It is the harm in the worst member (possible world), and equals the engine's to the bit. Caps are ignored.
+    A plan holds one action for each decision: ``plan`` is [n, L], or [n, L, K] for K vehicles. The harm is that of the
+    whole episode in the worst possible world, and equals the engine's to the bit. Caps on the harm of single vehicles
+    are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Return each plan, or the best constant action if that harms less, and the harm of the result.
+    """Return each plan, or the best constant action from now on if that harms less, and the harm of the result.
 
-    Harm is that in the worst member (possible world).
+    Args:
+        running: n episodes at a decision.
+        plan: [n, L] or [n, L, K] one action for each decision.
+        constants: [C] or [C, K] constant actions to compare with.
+
+    Returns plans in the shape of ``plan``, and [n] m2/s2, the harm of the whole episode in the worst possible world.
+
     """
     value = np.empty(running.n)
     _check_plan(running, plan)
@@ -360,21 +449,26 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Return plans with the actions of ``past`` before decision ``steps`` [n], and of ``later`` afterwards."""
+    """Return plans with the actions of ``past`` before the decision number ``steps`` [n], and of ``later`` from it on.
+
+    A plan holds one action for each decision: ``past`` and the result are [n, L] or [n, L, K]; ``later`` has the same
+    shape or is one action.
+    """
     made = np.arange(past.shape[1]) < steps[:, np.newaxis]
     return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
-    """Decide in every world: apply the proposed action if it can be certified, else the backup plan's.
+    """Decide in every world: apply the proposed action if it can be certified, else the action of the backup plan.
 
-    No argument is changed.
+    A proposal is certified if some plan behind it keeps the harm of the episode within the budget. No argument is
+    changed.
 
     Args:
         running: the episodes at this decision.
         proposed: actions [n] or [n, K]; clipped to [-1, 1] first. NaN is replaced by the planned action.
-        backup: the plan to apply where a proposal has no certificate, and its harm.
-        budget: largest accepted harm of each episode, [n]; at least the backup's harm.
+        backup: the plan to apply if a proposal has no certificate, and its harm.
+        budget: largest accepted harm of each episode, [n] m2/s2; at least the backup's harm.
 
     Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, and ``PhysicsError`` naming
     the worlds in which the physics fails with the applied action.

@@ -11,17 +11,17 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.shield.certify import ends_of_plans
 from ethbrake_marl.shield.running import Running
 
-SLACK = 1e-9  # tolerance (m, m/s) around the range that several members predict; a single member must match exactly
+SLACK = 1e-9  # tolerance (m, m/s) around the range that several possible worlds predict; one alone must match exactly
 
 # columns of each pair in a state: name and unit
 GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))
 
 
 def seen_columns(packed: Packed) -> Floats:
-    """Return the running worlds in the column layout of ``Running.states``, [n, S], for comparison with a prediction.
+    """Return an engine's running worlds as rows [n, S] in the layout of the shield's predictions.
 
-    The columns are speeds, gaps, hit flags, first-impact harm and total harm. In lines with an obstacle, its column
-    comes first in each group. Raises ``InvalidInput`` where only some of the worlds have an obstacle.
+    This is the layout of ``Running.states``: speeds, gaps, hit flags, first-impact harm and total harm. If some world
+    has an obstacle ahead, its column comes first in each group.
     """
     state, column = packed.state, packed.column
     speeds, first, pairs, at = state[:, column.speed : column.command], column.gap, column.vehicles - 1, column.obstacle
@@ -33,7 +33,10 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """Return ``worlds`` with the speeds, gaps and hit flags of ``states`` [n, S], also those of an obstacle."""
+    """Return ``worlds`` with other speeds, gaps and hit flags, also those of an obstacle.
+
+    These come from ``states`` [n, S], in the layout of the shield's predictions (``Running.states``).
+    """
     added = (states.shape[1] + 4) // 6 - worlds.N  # 1 if each group starts with the column of an obstacle, else 0
     N = worlds.N + added
     gaps, hit = states[:, N : 2 * N - 1], states[:, 2 * N - 1 : 3 * N - 2] == 1.0
@@ -48,7 +51,10 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 
 
 def difference(predicted: Floats, seen: Floats) -> str:
-    """Describe the first number in which a seen state [S] differs from its prediction; "nothing" if none does."""
+    """Describe the first number in which an observed world differs from its prediction; "nothing" if none does.
+
+    ``predicted`` and ``seen`` are rows [S] as in ``Running.states``; ``seen`` may end earlier.
+    """
     vehicles = (len(predicted) + 4) // 6
     for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
         if column < vehicles:
@@ -63,9 +69,12 @@ def difference(predicted: Floats, seen: Floats) -> str:
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     """Return how the episodes end if the plans are executed from now on.
 
-    Returns two arrays: whether all vehicles rest at the horizon in every member (possible world), [n]; and the harm of
-    the whole episode that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the
-    ledger, so both agree to the bit. With an obstacle ahead, its column comes first and is 0.
+    A plan holds one action for each decision; ``plan`` is [n, L], or [n, L, K] for K shielded vehicles. ``running``
+    holds n worlds, each with M possible worlds.
+
+    Returns two arrays: whether all vehicles rest at the horizon in every possible world, [n]; and the harm of the whole
+    episode that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the ledger, so both
+    agree to the bit. With an obstacle ahead, its column comes first and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

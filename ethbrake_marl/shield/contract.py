@@ -55,31 +55,37 @@ class ShieldMode(IntEnum):
 
 
 class Guarded(NamedTuple):
-    """Memory of a guard: its shield, and the memories of the proposing policies."""
+    """Memory of a guard (the part of an engine that certifies or replaces actions) for n episodes."""
 
     shield: Any  # the mode's shield, a value with ``take(rows)``; in mode ``episode`` the memory of the HybridAgent
-    policies: dict[int, Memory]  # memory of each policy by shielded vehicle, front to rear; empty without policies
+    policies: dict[int, Memory]  # index of a shielded vehicle -> memory of its policy; empty without policies
 
     def take(self, rows: Ints) -> Guarded:
-        """Return the memory restricted to ``rows``; a row may occur several times."""
+        """Return the memory of the episodes in the rows with the indices ``rows``, which may be repeated."""
         is_tree = isinstance(self.shield, Mapping)
         shield = take_memory(self.shield, rows) if is_tree else self.shield.take(rows)
         return Guarded(shield, take_memory(self.policies, rows))
 
     @property
     def told(self) -> dict[str, Any]:
-        """Predicted harm and chosen driver of each world, under the names in an agent's memory; None if unknown."""
+        """``{"predicted_harm": [n], "chosen_policy": [n]}``: the shield's values, None for a value that it lacks.
+
+        These are the harm predicted at the alert (m2/s2), and whether the policy drives.
+        """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
 
 class ShieldGuard(ABC):
-    """Base class of the guards of all modes. It shields all learners, in the order of ``vehicles`` (front to rear).
+    """Base class of the guards of all modes: the part of an engine that certifies or replaces the learners' actions.
+
+    A subclass implements ``decide`` (which actions are applied), ``_started`` (the shield after episodes have begun)
+    and ``tell`` (the infos). It may override ``check``, which compares a step with the prediction, and ``intervened``.
 
     Args:
-        engine: the engine that the guard will protect.
-        policies: by vehicle, the policies that propose where the caller gives no action. A policy with a memory is
-            called at every decision, so that its memory stays up to date.
-        shield: the shield before any episode has begun.
+        engine: the engine that the guard will protect. All its learners are shielded, front to rear.
+        policies: vehicle index -> policy that proposes if the caller gives no action. A policy with a memory is called
+            at every decision, so that its memory stays up to date.
+        shield: the shield before any episode has begun, in the mode's own form.
         mode: code of the mode in the infos.
         where: name of the interface, for error messages.
 
@@ -96,21 +102,40 @@ class ShieldGuard(ABC):
 
     @abstractmethod
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the actions to apply instead of the proposed ones [n, L], with the details of the decision."""
+        """Return the actions to apply in the next step, with the details of the decision.
+
+        Args:
+            running: the engine before the step.
+            memory: memory of the guard.
+            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
+                proposes. A single NaN: an invalid action, which is never applied.
+
+        """
 
     @abstractmethod
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the shield after episodes start in ``rows``. The argument ``shield`` is a copy and may be changed."""
+        """Return the mode's shield after episodes have started in the rows with the indices ``rows``.
+
+        ``alert`` holds only the worlds of these rows, at t = 0. ``shield`` is a copy and may be changed.
+        """
 
     @abstractmethod
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the entries of the infos after a ruling; with None, before the first decision, under the same keys.
+        """Return the infos after a decision: name (without ``shield_``) -> value.
 
         Each value is a single number, or an array by world [n], by learner [n, L] or by vehicle [n, N].
+
+        Args:
+            memory: memory of the guard.
+            ruling: the decision; None before the first one, when the names are the same.
+
         """
 
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
-        """Return the memory after episodes start in these rows."""
+        """Return the guard's memory after episodes have started in the rows with the indices ``rows``.
+
+        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is None before the first episode.
+        """
         shield, policies = memory or Guarded(self._fresh, {})
         begun = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
         policies = renew_memory(policies, rows, begun) if policies else begun
@@ -119,21 +144,22 @@ class ShieldGuard(ABC):
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """Return the memory to keep after the step.
 
-        This base class accepts every step, and returns the ruling's memory.
+        ``ruling`` is the decision before the step, ``after`` the engine after it. This base class accepts every step,
+        and returns the ruling's memory.
         """
         memory: Guarded = ruling.memory
         return memory
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Return where the applied action differs from the proposed one, [n, L]."""
+        """Return whether the applied action differs from the proposed one, [n, L], for the decision ``ruling``."""
         decided: Bools = ruling.decision.intervened
         return decided.reshape(ruling.applied.shape)
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the infos of every vehicle, [n, N]: after the last step, or at the alert in rows that have just begun.
+        """Return the infos of every vehicle: name (without ``shield_``) -> values [n, N].
 
-        A row that restarted after the last step shows the alert of its new episode, because that step belonged to the
-        old one.
+        They describe the last step of the engine ``running``. In a row whose episode has started since, they describe
+        the alert of the new episode.
         """
         memory: Any = running.guarded
         ruling, begun = running.ruling, running.steps == 0
@@ -146,9 +172,10 @@ class ShieldGuard(ABC):
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
-        """Expand the infos to all vehicles, [n, N].
+        """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
 
-        A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries by learner.
+        ``running`` is the engine. A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries
+        that have a column per learner.
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -161,7 +188,10 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return mode, proposed action, applied action and whether they differ; 0 before the first step."""
+        """Return the infos that all modes have: mode, proposed and applied action, and whether they differ.
+
+        ``ruling`` is the decision in the last step; None before the first step, when the actions are 0.
+        """
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
             return infos | {"proposed_action": 0.0, "applied_action": 0.0, "intervened": False}
@@ -171,9 +201,13 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """Return all proposals [n, L], and the policies' new memories.
+        """Return the proposals [n, L], completed by the policies, and the policies' new memories.
 
-        The policies propose for the learners whose action the caller left out.
+        Args:
+            worlds: the n worlds as the policies see them; None only if no policy is called.
+            memories: vehicle index -> memory of its policy.
+            proposed: [n, L] the caller's actions; a column of NaN is filled in by that learner's policy.
+
         """
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not self._policies:
@@ -186,12 +220,19 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """Return the policies with their memories and the current worlds, for rollouts; None without policies."""
+        """Return the policies with their ``memories`` and the current ``worlds``, for rollouts.
+
+        None if there are no policies, or if ``worlds`` is None.
+        """
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
 
 def why(ruling: Ruling | None) -> dict[str, Any]:
-    """Return reason and margin of a certified decision, [n, L]; ``NO_DECISION`` and 0 before the first one."""
+    """Return the infos ``reason`` and ``margin`` of a decision of mode ``step``, each [n, L].
+
+    ``reason`` is a code of ``ShieldReason``; ``margin`` is the accepted harm minus the least harm found after the
+    proposal, m2/s2. Before the first decision (``ruling`` None) they are ``NO_DECISION`` and 0.
+    """
     if ruling is None:
         return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}
     return {name: getattr(ruling.decision, name).reshape(ruling.applied.shape) for name in ("reason", "margin")}

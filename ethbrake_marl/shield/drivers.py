@@ -19,10 +19,10 @@ from ethbrake_marl.shield.paper_hybrid import HybridAgent
 class ShieldedDriver(ByPolicy):
     """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
 
-    At the alert the policy is rolled out. Where it harms no more than the coupled optimum, it drives without
+    At the alert the policy is simulated to the end. Where it harms no more than E-V2X-BM, it drives without
     interventions and its harm is the bound. Elsewhere each action must be certified by the rest of the plan, by a
-    constant action, or by a rollout of the policy from the state after the action. A team's proposals are decided
-    together.
+    constant action, or by a rollout: a simulation of the policy from the state after the action. A team's proposals are
+    decided together.
 
     Args:
         policy: the agent or team that proposes.
@@ -71,7 +71,7 @@ class ShieldedDriver(ByPolicy):
 
     @property
     def adds(self) -> Source:
-        """Knowledge that the shield uses to certify, in addition to what the policy knows."""
+        """Knowledge (``Source``) that the shield uses to certify actions, in addition to what the policy knows."""
         return self.options.adds
 
     @property
@@ -81,7 +81,10 @@ class ShieldedDriver(ByPolicy):
 
     @classmethod
     def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
-        """Return the task's vehicles driven by copies of ``driver`` behind one shield; ``settings`` as in the class."""
+        """Return a team that drives the vehicles of ``task`` with copies of ``driver`` behind one shield.
+
+        ``settings`` are further keywords of ``ShieldedDriver``; scenario and harm count are the task's.
+        """
         if isinstance(driver, Team) and len(task.vehicles) == 1:
             driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
         elif isinstance(driver, Agent) and len(task.vehicles) > 1:
@@ -89,18 +92,26 @@ class ShieldedDriver(ByPolicy):
         return cls(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return a team in which each of these vehicles is driven by its own copy of the policy, behind one shield."""
+        """Return a team behind one shield, in which each of these vehicles is driven by its own copy of the policy.
+
+        ``vehicles`` are indices (0 = front).
+        """
         return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """Return the guard for the engine in which the policies drive."""
+        """Return the guard for ``engine``, in which ``policies`` (vehicle index -> agent) propose."""
         return self.options.guard(engine, policies, several=isinstance(self.policy, Team), **self._how)
 
 
 def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> Driver:
-    """Return an agent or a team behind a shield of this mode.
+    """Return an agent or a team behind a shield.
 
-    An agent drives each learner by its own copy where the scenario has several.
+    Args:
+        driver: the agent or team. If the scenario has several learners, a copy of an agent drives each.
+        scenario: the scenario in which actions are certified.
+        mode: ``step``, ``episode`` or a mode of an extension.
+        options: further keywords of ``ShieldOptions``.
+
     """
     if mode == "episode":
         settings = ShieldOptions(mode, **options)

@@ -19,19 +19,26 @@ CHUNK = 500  # worlds advanced together; limits memory, and does not change resu
 
 
 class Shielded(NamedTuple):
-    """Episodes behind a step shield: n worlds (with any leading axes), N vehicles, K of them shielded."""
+    """Results of whole episodes behind a step shield: n worlds, N vehicles, K of them shielded.
 
-    harm: Floats  # [n] harm under the guarded count (m2/s2)
+    The shapes below are for one driver. The result of ``stack``, for several drivers, has one more axis in front:
+    ``harm`` is then [drivers, n].
+    """
+
+    harm: Floats  # [n] harm of the episode, first-impact or total as the shield guarantees it (m2/s2)
     vehicle_harm: Floats  # [n, N] part of that harm that each vehicle bears (m2/s2)
-    bound: Floats  # [n] bound at the alert, allowance included (m2/s2)
-    baseline: Floats  # [n, N] harm that each vehicle bears under the baseline plan (m2/s2)
+    bound: Floats  # [n] harm that the shield guaranteed at the alert, allowance included (m2/s2)
+    baseline: Floats  # [n, N] harm that each vehicle bears under the constant actions of least harm (m2/s2)
     replaced: Ints  # [n, K] number of replaced decisions of each shielded vehicle
     decisions: Ints  # [n] number of decisions of each shielded vehicle
     moving: Bools  # [n] whether something still moved at the horizon
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """Collect the results of ended ``episodes`` that a driver behind a step shield drove."""
+        """Return the results of ended episodes that a driver behind a step shield drove.
+
+        ``task`` says which harm is reported.
+        """
         shield: StepShield = episodes.guarded.shield
         assert shield.memory.running is not None
         return Shielded(
@@ -46,7 +53,7 @@ class Shielded(NamedTuple):
 
     @staticmethod
     def join(parts: Sequence[Shielded]) -> Shielded:
-        """Concatenate the worlds of all parts."""
+        """Return the results of all parts, one after the other along the axis of worlds."""
         return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     @staticmethod
@@ -56,9 +63,14 @@ class Shielded(NamedTuple):
 
 
 def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-    """Drive a copy of ``driver`` behind a step shield through every world, in chunks of ``CHUNK`` worlds.
+    """Drive a copy of ``driver`` behind a step shield through every world, and return the results.
 
-    ``settings`` are keywords of ``ShieldedDriver``.
+    Args:
+        driver: an agent or a team.
+        worlds: n worlds at the alert; they are driven in chunks of ``CHUNK``.
+        task: scenario, shielded vehicles and harm count.
+        settings: further keywords of ``ShieldedDriver``.
+
     """
     parts = []
     for first in range(0, worlds.n, CHUNK):

@@ -25,18 +25,21 @@ VERDICTS = ("needed", "harmless", "costly")
 
 
 class Review(NamedTuple):
-    """Effect of each of the m logged interventions in the running episodes."""
+    """Effect of each of the m interventions (replaced actions) in the log of the running episodes."""
 
-    world: Ints  # [m] row of the batch
+    world: Ints  # [m] row of the world in the batch
     vehicle: Ints  # [m] index of the vehicle whose action was replaced
     step: Ints  # [m] number of the decision
-    realised: Floats  # [m] harm of the episode with the intervention (m2/s2)
+    realised: Floats  # [m] harm of the episode as it was, with the intervention (m2/s2)
     without: Floats  # [m] harm if the policy or team had driven unshielded from that decision on (m2/s2)
-    verdict: NDArray[np.str_]  # [m] one of VERDICTS
+    verdict: NDArray[np.str_]  # [m] "needed" (harm is higher without it), "costly" (lower) or "harmless" (the same)
     trusted: Bools  # [m] whether the world behaved as the shield predicted
 
     def share(self, verdict: str) -> float:
-        """Return the share of the interventions with this verdict; 0 without interventions."""
+        """Return the share (0 to 1) of the interventions with this ``verdict``: ``needed``, ``costly`` or ``harmless``.
+
+        It is 0 if there are no interventions.
+        """
         return float((self.verdict == verdict).mean()) if self.verdict.size else 0.0
 
 
@@ -77,9 +80,17 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
-    """Return the harm in worlds ``world`` [m] if the policy drives unshielded from decision ``step`` [m] on.
+    """Return the harm of m episodes in which ``policy`` drives unshielded from some decision on, [m] m2/s2.
 
-    Before that decision, the applied actions are repeated.
+    Before that decision, the actions that the shield applied are repeated.
+
+    Args:
+        shield: the shield after the episodes; its plans hold the applied actions.
+        policy: the agent or team.
+        worlds: the worlds at the alert.
+        world: [m] rows of the worlds to simulate.
+        step: [m] number of the decision from which on the policy drives.
+
     """
     scenario, plan = shield.scenario, shield.memory.backup.plan[world]
     actions = plan.reshape(*plan.shape[:2], len(shield.vehicles))
@@ -92,7 +103,16 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
 
 
 class _Released(AgentAround):
-    """An agent that repeats recorded actions [m, L] up to a step [m], and follows a policy from that step on."""
+    """Agent that repeats recorded actions up to a given decision, and follows a policy from then on.
+
+    Args:
+        policy: the policy.
+        actions: [m, L] action of each decision.
+        release: [m] number of the first decision of the policy.
+        deciding: indices of the vehicles that decide at the same moments.
+        time_step_s: time between two decisions, s.
+
+    """
 
     def __init__(
         self, policy: Agent, actions: Floats, release: Ints, deciding: tuple[int, ...], time_step_s: float

@@ -11,13 +11,20 @@ from ethbrake_marl.shield.paper_hybrid import Bound, HybridAgent
 
 
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> HybridAgent:
-    """Return the agent behind the paper's hybrid: ``+episode`` or ``+episode:pairwise``."""
+    """Return ``policy`` behind the paper's Algorithm 1 (``+episode``).
+
+    At the alert the better of policy and E-V2X-BM is chosen for the whole episode. ``argument`` is None, or
+    ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must have a scenario.
+    """
     bound: Bound = "coupled" if argument is None else "pairwise"
     return HybridAgent(policy, settings.needed_scenario(), bound=bound, harm_count=settings.harm_count)
 
 
 def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Return the agent or team behind step mode: ``+step``. Each of several learners gets a copy of the agent."""
+    """Return the agent or team ``policy`` behind a shield of mode ``step`` (``+step``).
+
+    ``argument`` is ignored; ``settings`` must have a scenario. Each of several learners gets a copy of the agent.
+    """
     return shielded(policy, settings.needed_scenario(), "step", harm_count=settings.harm_count)
 
 

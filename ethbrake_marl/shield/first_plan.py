@@ -1,8 +1,9 @@
 """The plan with which a step shield starts at the alert: the constant actions of least harm.
 
-For one shielded vehicle, the constant action is the coupled optimum. For several vehicles, the plan is the best of
-these candidates: all brake fully; one vehicle takes its coupled optimum while the others brake fully; and the result of
-a coordinate descent, vehicle by vehicle, from the best of those.
+A plan holds one action for each decision. For one shielded vehicle, the constant action is E-V2X-BM's (the coupled
+optimum). For several vehicles, the plan is the best of these candidates: all brake fully; one vehicle takes its coupled
+optimum while the others brake fully; and the result of a coordinate descent, vehicle by vehicle, from the best of
+those.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.certify import CONSTANTS, bettered_plan, descend_constants, plan_harm
 from ethbrake_marl.shield.running import Running
 
-LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions tried at the alert in worlds with several members
+LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions tried at the alert if a world has several possible worlds
 
 GRID = np.linspace(0.0, -1.0, 21)  # constant actions tried in the coordinate descent of several vehicles
 
@@ -38,11 +39,11 @@ def best_constants(
 
     Args:
         worlds: n worlds at the alert.
-        running: the same worlds with all their members.
-        vehicle: index of the shielded vehicle, or indices of several.
+        running: the episodes of these worlds, with all their possible worlds.
+        vehicle: index of the shielded vehicle (0 = front), or indices of several.
         width: number of decisions of a plan.
         scenario: the scenario of these worlds.
-        harm_count: the harm that is minimised.
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
 
     """
     vehicles = [vehicle] if isinstance(vehicle, int) else list(vehicle)
@@ -50,7 +51,7 @@ def best_constants(
     others[:, vehicles] = -worlds.vehicles.braking_capacity_mps2[:, vehicles]
 
     def optimum(i: int) -> Floats:
-        """Return the coupled optimum of one vehicle as an action [n], while the other shielded vehicles brake fully."""
+        """Return E-V2X-BM's deceleration of vehicle ``i`` as an action [n]; other shielded vehicles brake fully."""
         best = optimise_coupled(worlds, i, harm_count=harm_count, horizon_s=scenario.horizon_s, others_mps2=others)
         return command_to_action(-best.deceleration_mps2, worlds.vehicles, i)
 
@@ -64,7 +65,14 @@ def best_constants(
 
 
 def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Floats:
-    """Return the best constant actions [n, K] of several vehicles; the module docstring lists the candidates."""
+    """Return the best constant actions of K vehicles, [n, K] in [-1, 1].
+
+    Args:
+        running: n episodes at the alert.
+        optima: for each of the K vehicles, the action [n] that is best while the others brake fully.
+        width: number of decisions of a plan.
+
+    """
     best = np.full((running.n, len(optima)), -1.0)
     least = plan_harm(running, held(best, width))
     for c in range(len(optima) + 1):
@@ -80,9 +88,10 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
 
 def joint_constants(vehicles: int) -> Floats:
-    """Return joint constant actions [C, K] of several vehicles, front to rear.
+    """Return constant actions to try for several vehicles together, [C, K] in [-1, 0], front to rear.
 
-    The actions are either all equal, or change linearly from the first to the last vehicle.
+    ``vehicles`` is their number K. The actions of one row are either all equal, or change linearly from the first to
+    the last vehicle.
     """
     alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
     share = np.linspace(0.0, 1.0, vehicles)
@@ -91,5 +100,5 @@ def joint_constants(vehicles: int) -> Floats:
 
 
 def held(action: Floats, width: int) -> Floats:
-    """Return plans [n, width, K] that hold these actions [n, K] at every decision."""
+    """Return plans [n, width, K] that hold the actions ``action`` [n, K] at each of ``width`` decisions."""
     return np.repeat(action[:, np.newaxis], width, axis=1)

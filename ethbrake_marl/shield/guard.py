@@ -20,23 +20,24 @@ from ethbrake_marl.shield.step import StepShield
 
 
 class MovingAtHorizon(UserWarning):
-    """Warning: something may still be moving at the horizon, where a shield's bound ends."""
+    """Warning: some vehicle may still be moving at the horizon; the shield guarantees nothing after it."""
 
 
 class StepGuard(ShieldGuard):
-    """Certify every action, or replace it.
+    """Guard of mode ``step``: certify every proposed action, or replace it.
 
     Args:
         engine: the engine that the guard will protect.
-        policies: policies that are rolled out at each alert, and that propose where the caller gives no action.
+        policies: vehicle index -> policy that is rolled out (simulated) from each alert, and that proposes if the
+            caller gives no action.
         shield: the shield of the engine's learners, before any episode.
         mode: code of the mode in the infos.
         where: name of the interface, for error messages.
         shares: add to the infos the harm that each vehicle bears; always added with a cap.
-        later_rollouts: whether a rollout of the policy may certify an action.
+        later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
         told: worlds at the alert as the shield assumes them; None: the true worlds. Policies always see the true
             worlds.
-        warns: warn with ``MovingAtHorizon``, once, where the first plan leaves something moving at the horizon.
+        warns: warn with ``MovingAtHorizon``, once, if the first plan leaves something moving at the horizon.
 
     """
 
@@ -75,7 +76,15 @@ class StepGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Let the shield certify or replace the proposals in all worlds whose episodes still run."""
+        """Let the shield certify or replace the proposals in all worlds whose episodes still run.
+
+        Args:
+            running: the engine before the step.
+            memory: memory of the guard.
+            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
+                proposes. A single NaN: an invalid action, which is never applied.
+
+        """
         shield: StepShield = memory.shield
         goes_on, finished = ~running.ended, shield.memory.running.finished  # type: ignore[union-attr]  # it has begun
         worlds = running.worlds if self._policies or self._told is not None else None  # computed at each access
@@ -93,10 +102,11 @@ class StepGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, goes_on & ~finished, decision, Guarded(after, memories))
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
-        """Compare the worlds after the step with the shield's prediction.
+        """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
-        Raises ``UncertifiedStep`` where they differ. Where the shield assumes other worlds (``told``), a differing
-        world becomes distrusted instead. Worlds in which the physics failed are not compared.
+        ``ruling`` is the decision before the step, ``after`` the engine after it. Raises ``UncertifiedStep`` if a world
+        differs from the prediction. If the shield assumes other worlds than the true ones (``told``), a differing world
+        becomes distrusted instead. Worlds in which the physics failed are not compared.
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield
@@ -123,7 +133,11 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step: action, reason, bound, trust in the world, and the harm of each vehicle."""
+        """Return the infos of a step by name: action, reason, bound, trust in the world, and the harm of each vehicle.
+
+        ``memory`` is the guard's memory, ``ruling`` the decision in the step, None before the first one. Each value is
+        a number or an array [n], [n, L] or [n, N].
+        """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)
         infos |= {"bound_harm": shield.bound, "trusted": ~shield.memory.distrusted, "settles": shield.memory.settles}

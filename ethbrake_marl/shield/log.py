@@ -13,20 +13,20 @@ from ethbrake_marl.shield.running import Running
 
 
 class Intervention(NamedTuple):
-    """Log entry: one action that the shield replaced."""
+    """Log entry: one proposed action that the shield replaced."""
 
-    world: int  # row of the batch
+    world: int  # row of the world in the batch
     vehicle: int  # index of the shielded vehicle, 0 = front
     episode: int  # number of the episode in that row, from 0
-    step: int  # number of the decision
-    time_s: float
-    proposed: float  # proposed action, before clipping
-    applied: float  # applied action
+    step: int  # number of the decision in the episode, from 0
+    time_s: float  # time of the decision since the alert (s)
+    proposed: float  # proposed action, before clipping to [-1, 1]
+    applied: float  # applied action, in [-1, 1]
     reason: int  # code of ShieldReason
-    bound: float  # largest possible harm of the episode from now on (m2/s2)
-    margin: float  # budget minus least harm found after the proposal (m2/s2); negative: the proposal exceeds it
-    state: Floats  # [S] state at the decision
-    plan: Floats  # [L] or [L, K] plan at the decision; entries before ``step`` are the applied actions
+    bound: float  # harm of the episode that the shield guarantees from now on (m2/s2)
+    margin: float  # accepted harm minus least harm found after the proposal (m2/s2); negative: the proposal exceeds it
+    state: Floats  # [S] speeds, gaps, hit flags and harm at the decision, in the layout of ``Running.states``
+    plan: Floats  # [L], or [L, K] for K vehicles: plan at the decision; entries before ``step`` are the applied actions
 
 
 def interventions(
@@ -34,7 +34,14 @@ def interventions(
 ) -> list[Intervention]:
     """Return one log entry for each action that a decision replaced.
 
-    ``now`` are the episodes before the decision, ``episode`` [n] their numbers, and ``held`` the backup before it.
+    Args:
+        now: the n episodes before the decision.
+        episode: [n] number of the episode in each row.
+        vehicles: indices of the K shielded vehicles.
+        proposed: [n] or [n, K] proposed actions.
+        decision: the decision.
+        held: the plan that the shield held before the decision.
+
     """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))
     columns = (proposed, decision.applied, decision.reason, decision.margin, decision.intervened)

@@ -1,4 +1,4 @@
-"""Simulation of the members of a world, decision by decision, with exactly the operations of the engine's step.
+"""Simulation of the possible worlds of a world, decision by decision, with exactly the operations of the engine's step.
 
 A world has M *members*: possible worlds that must all keep the bound. Usually the world itself is its only member, and
 then nothing here costs more. K of the vehicles are shielded. An action is a row [K]; a plan [L, K] holds one action for
@@ -27,20 +27,24 @@ OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CA
 
 
 class Members(NamedTuple):
-    """Parameters of the members (possible worlds) of one world or of a whole batch, and working memory."""
+    """Parameters of M possible worlds, and workspace, as input for the compiled functions of this package.
 
-    table: Floats  # working table of one world, see ``physics.rows``
-    clock: Floats  # [M, CLOCK.WIDTH] clock of each member's episode
+    The possible worlds of a world are the variants of it in all of which the shield's bound must hold; usually there is
+    one, the world itself. ``all_members`` returns those of a whole batch, ``members_from`` those of one world.
+    """
+
+    table: Floats  # workspace in which one possible world is simulated, see ``physics.rows``
+    clock: Floats  # [M, CLOCK.WIDTH] times of the decisions, and settings of the episode, see ``physics.episode``
     bounds: Floats  # [M, K, 2] smallest and largest command of the shielded vehicles (m/s2)
-    lines: Floats  # [M, rows, N] parameters of the vehicles; a single array, because each array costs time per call
-    pieces: Floats  # [M, N, 2 P] braking profiles of the vehicles that brake in pieces
+    lines: Floats  # [M, rows, N] parameters of the vehicles, in the rows ``OF_COMMAND`` to ``OF_CAP``
+    pieces: Floats  # [M, N, 2 P] braking profiles with P intervals of constant command, as in ``Vehicles``
     vehicles: Ints  # [K] indices of the shielded vehicles, front to rear
-    critical: Ints  # [1] member that broke a limit last, tried first for speed; does not affect results
+    critical: Ints  # [1] possible world that last exceeded a limit; it is simulated first, which only saves time
 
 
 @compiled
 def all_members(running: Running) -> Members:
-    """Return the members (possible worlds) of every world of a batch, as input for the kernels."""
+    """Return the possible worlds of every world in ``running``, as input for the compiled functions here."""
     problem = running.problem
     rows, N = problem.mass.shape
     lines = np.empty((rows, OF_CAP + 1 if running.caps.shape[1] > 0 else OF_CAP, N))
@@ -60,14 +64,14 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return the members (possible worlds) in rows ``a`` to ``b - 1``, usually those of one world."""
+    """Return the possible worlds in rows ``a`` to ``b - 1`` of ``every``, usually those of one world, as views."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
 
 @compiled
 def enter(world: Members, m: int, state: Floats) -> None:
-    """Load member (possible world) ``m`` in a saved state into the working table."""
+    """Load possible world number ``m`` of ``world``, in the saved ``state`` [S], into ``world.table``."""
     table, lines = world.table, world.lines
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
@@ -78,9 +82,18 @@ def enter(world: Members, m: int, state: Floats) -> None:
 
 @compiled(apart=True)
 def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, after: Floats) -> int:
-    """Advance member (possible world) ``m`` by one decision with ``action``; write the new state into ``after``.
+    """Advance one possible world by one decision, and save its new state.
 
-    Returns the outcome code of ``step_episode``.
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        m: number of the one to advance.
+        state: [S] its state now.
+        step: number of the present decision.
+        action: [K] actions of the shielded vehicles.
+        after: [S] receives the new state.
+
+    Returns ``GOES_ON``, another code for the end of the episode, or a negative code if the physics failed.
+
     """
     enter(world, m, state)
     for c in range(world.vehicles.shape[0]):
@@ -97,9 +110,19 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 def take_steps(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, after: Floats, over: Bools
 ) -> int:
-    """Advance every member (possible world) of a world by one decision with the same action.
+    """Advance every possible world of one world by one decision with the same action.
 
-    Fills ``after`` and ``over``. Returns how many members' episodes continue, or -1 if the physics failed.
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended; these keep their states.
+        step: number of the present decision.
+        action: [K] actions of the shielded vehicles.
+        after: [M, S] receives the new states.
+        over: [M] receives whether the episodes have ended then.
+
+    Returns in how many of them the episode continues, or -1 if the physics failed.
+
     """
     going = 0
     for m in range(ended.shape[0]):
@@ -118,10 +141,11 @@ def take_steps(
 
 @compiled
 def borne_by(table: Floats, total: float, i: int) -> float:
-    """Return the harm that vehicle ``i`` has borne since the episode began, under one count (m2/s2).
+    """Return the harm that vehicle ``i`` has borne since the episode began, m2/s2.
 
-    ``total`` is 1 for total harm. The result equals the ledger's to the bit. An obstacle ahead (vehicle 0, infinite
-    mass) bears no harm; the vehicle that hits it bears all of it.
+    ``table`` is the table of one world (``physics.rows``). ``total`` is 1 for total harm, 0 for first-impact harm. The
+    result equals the ledger's to the bit. An obstacle ahead (vehicle 0, infinite mass) bears no harm; the vehicle that
+    hits it bears all of it.
     """
     row, value = ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM, 0.0
     if table[ROW.MASS, i] == math.inf:
@@ -136,7 +160,10 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 
 @compiled
 def within_caps(world: Members, m: int) -> bool:
-    """Return whether no vehicle of member (possible world) ``m``, as loaded in the table, bears more than its cap."""
+    """Return whether no vehicle bears more than its cap in the possible world ``m``, which ``world.table`` holds.
+
+    A cap is the largest harm that a vehicle may bear. Without caps the result is True.
+    """
     if world.lines.shape[1] > OF_CAP:
         for i in range(world.lines.shape[2]):
             if borne_by(world.table, world.clock[m, CLOCK.HARM_IS_TOTAL], i) > world.lines[m, OF_CAP, i]:
@@ -146,7 +173,10 @@ def within_caps(world: Members, m: int) -> bool:
 
 @compiled
 def worst_so_far(world: Members, states: Floats) -> float:
-    """Return the largest harm so far over the members (possible worlds); infinity if a vehicle exceeds its cap."""
+    """Return the largest harm so far over the possible worlds ``world``, whose states are ``states`` [M, S], m2/s2.
+
+    It is infinite if a vehicle bears more than its cap.
+    """
     worst = 0.0
     for m in range(states.shape[0]):
         enter(world, m, states[m])
@@ -158,10 +188,21 @@ def worst_so_far(world: Members, states: Floats) -> float:
 
 @compiled(apart=True)
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
-    """Return the harm of member (possible world) ``m`` if the plan is executed from ``state`` at decision ``step`` on.
+    """Return the harm of the whole episode if a plan is executed in one possible world from now on, m2/s2.
 
-    It is the harm of the whole episode, computed with the engine's operations. Returns infinity as soon as the harm
-    exceeds ``most`` (harm never falls), where a vehicle bears more than its cap, or where the physics fails.
+    It is computed with the engine's operations, so it equals the engine's harm to the bit.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        m: number of the one to simulate.
+        state: [S] its state now.
+        ended: whether its episode has ended.
+        step: number of the present decision.
+        plan: [L, K] one action for each decision.
+        most: harm beyond which the simulation stops, since harm never falls, m2/s2.
+
+    Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
+
     """
     table, no_rows, total = world.table, world.table[:0], world.clock[m, CLOCK.HARM_IS_TOTAL]
     restitution, grid = world.clock[m, CLOCK.RESTITUTION], grid_of(world.clock[m])
@@ -182,7 +223,20 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
 
 @compiled
 def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan: Floats, most: float) -> float:
-    """Return the largest harm of a plan over the members (possible worlds); infinity as soon as it exceeds ``most``."""
+    """Return the largest harm of a plan over the possible worlds of one world, m2/s2.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        states: [M, S] their states now, in the layout of ``Running.states``.
+        ended: [M] whether their episodes have ended.
+        step: number of the present decision.
+        plan: [L, K] one action for each decision, executed from now on.
+        most: largest harm of interest, m2/s2.
+
+    Returns infinity if the harm exceeds ``most`` in one of them, if a vehicle bears more than its cap, or if the
+    physics fails.
+
+    """
     worst, first = 0.0, world.critical[0]
     for j in range(ended.shape[0]):
         m = (first + j) % ended.shape[0]
@@ -195,9 +249,19 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
-    """Return the harm of member (possible world) ``m`` if constant action ``c`` of ``constants`` [C, K] is held.
+    """Return the harm of one possible world if a constant action is held to the horizon, m2/s2.
 
-    The action is held to the horizon, simulated in one segment. Returns infinity where the physics fails.
+    It is simulated in one segment. Returns infinity if the physics fails.
+
+    Args:
+        world: the M possible worlds of one world (``Members``).
+        m: number of the one to simulate.
+        state: [S] its state now.
+        ended: whether its episode has ended.
+        step: number of the present decision.
+        constants: [C, K] constant actions.
+        c: row of the one to hold.
+
     """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds
     enter(world, m, state)

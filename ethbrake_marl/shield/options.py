@@ -30,17 +30,19 @@ class ShieldOptions:
     """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. A mode of an extension adds its own.
 
     Args:
-        mode: ``step``: each action is certified or replaced. ``episode``: the paper's Algorithm 1, policy or E-V2X-BM
-            for a whole episode. None: ``step``, unless another setting belongs to one mode alone.
-        bound: the ``H*`` of mode ``episode``: ``coupled``, or the paper's ``pairwise``.
-        harm_count: the harm that is guaranteed, ``first`` or ``total``.
-        allowance: loosens the bound by that much (m2/s2), for fewer interventions; not in mode ``episode``.
-        cap: ``baseline``: no vehicle ever bears more harm than under the constant actions of least harm. None: only
-            the sum over the vehicles is bounded. Mode ``step`` alone.
+        mode: ``step``: each action is certified (some plan after it keeps the harm within the bound) or replaced.
+            ``episode``: the paper's Algorithm 1, policy or E-V2X-BM for a whole episode. None: ``step``, unless another
+            setting belongs to one mode alone.
+        bound: source of ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled``, the engine's physics, or
+            ``pairwise``, the paper's closed form.
+        harm_count: impacts whose harm is guaranteed: ``first`` (each pair's first) or ``total`` (all).
+        allowance: loosens the bound by that much (m2/s2), for fewer replaced actions; not in mode ``episode``.
+        cap: ``baseline``: no vehicle ever bears more harm than under the constant actions of least harm. None: only the
+            sum over the vehicles is bounded. Mode ``step`` alone.
         intervention_penalty: subtracted from the reward of a step in which the shield replaced the proposed action.
-        logging: keep every intervention in ``shield.log``; not in mode ``episode``.
-        shares: add to ``infos`` the harm that each vehicle bears under the current plan and under the baseline plan;
-            always added with a ``cap``. Costs a few percent of a step; not in mode ``episode``.
+        logging: keep every replaced action in ``shield.log``; not in mode ``episode``.
+        shares: add to ``infos`` the harm that each vehicle bears under the current plan and under the constant actions
+            of least harm; always added with a ``cap``. Costs a few percent of a step; not in mode ``episode``.
         where: name of the interface, for error messages.
 
     Raises ``InvalidInput`` naming a setting that does not fit, ``UnknownName`` for an unknown mode.
@@ -63,7 +65,11 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the subclass that has these settings, as ``pathlib.Path`` does for its platform."""
+        """Create an instance of the class for these settings: the mode's own class, or a subclass of another mode.
+
+        ``ShieldOptions(mode, setting=...)`` thus also accepts settings that only the subclass of an extension's mode
+        has.
+        """
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
         return object.__new__(cls)
@@ -85,14 +91,14 @@ class ShieldOptions:
         object.__setattr__(self, "mode", mode)
 
     def check_switches(self, *names: str) -> None:
-        """Raise ``InvalidInput`` unless each named setting is True or False."""
+        """Raise ``InvalidInput`` unless each setting named in ``names`` is True or False."""
         for name in names:
             if not isinstance(getattr(self, name), bool):
                 raise InvalidInput(f"{self.where}: {name} = {getattr(self, name)!r}: must be True or False")
 
     @property
     def written(self) -> str:
-        """The mode as written behind an agent's ``+``."""
+        """The mode as it is written behind an agent's ``+``, such as ``step``."""
         return str(self.mode)
 
     @property
@@ -103,9 +109,13 @@ class ShieldOptions:
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return the shield of one vehicle or of several, before any episode. Not for mode ``episode``.
+        """Return a shield with these settings, before any episode. Not for mode ``episode``.
 
-        ``others`` maps each other vehicle's index to its script; None: the scripts of the scenario.
+        Args:
+            scenario: the scenario of all episodes.
+            vehicle: index of the shielded vehicle (0 = front), or indices of several.
+            others: index of each other vehicle -> its script; None: the scripts of the scenario.
+
         """
         return StepShield(
             scenario, vehicle, harm_count=self.harm_count, allowance=self.allowance, others=others, cap=self.cap,
@@ -115,17 +125,17 @@ class ShieldOptions:
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
         """Raise ``InvalidInput`` if a shield with these settings cannot be used in the scenario.
 
-        ``several``: the driver is a team; a team's shield is checked only when its guard is built.
+        With ``several`` (a team is shielded) nothing is checked here; that happens when the guard is made.
         """
         if not several:
             self.shield(scenario, one_learner(scenario) or 0)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
-        """Return the guard with these settings for all learners of an engine.
+        """Return the guard (the part of an engine that certifies or replaces actions) for all learners of an engine.
 
         Args:
             engine: the engine that the guard will protect.
-            policies: the proposing policy of each vehicle.
+            policies: vehicle index -> policy that proposes its actions; may be empty except in mode ``episode``.
             several: treat a single learner as a team of one.
             how: further keywords of ``StepGuard``.
 
@@ -139,20 +149,32 @@ class ShieldOptions:
 
 
 def check_mode(mode: object) -> str:
-    """Return the name of a shield mode. Raise ``UnknownName`` for anything else."""
+    """Return ``mode`` if it is the name of a shield mode; otherwise raise ``UnknownName``."""
     if shield_settings(mode) is None:
         raise unknown_name("shield mode", mode, shield_modes())
     return str(mode)
 
 
 def misplaced(name: str, value: object, mode: str, takers: list[str], where: str) -> InvalidInput:
-    """Return the error for a setting that a mode does not accept; ``takers`` are the modes that accept it."""
+    """Return the error to raise for a setting that a mode does not accept.
+
+    Args:
+        name: name of the setting.
+        value: its value.
+        mode: the mode.
+        takers: modes that accept the setting.
+        where: name of the interface, with which the message begins.
+
+    """
     do = "does" if len(takers) == 1 else "do"
     return InvalidInput(f"{where}: {name} = {value!r}: mode {mode} takes none; {' and '.join(takers)} {do}")
 
 
 def shielded_vehicle(engine: Engine, several: bool) -> int | tuple[int, ...]:
-    """Return the learners of an engine in the form that ``StepShield`` takes: one index, or a tuple of them."""
+    """Return the learners of an engine as ``StepShield`` takes them: one index, or a tuple of indices.
+
+    With ``several``, a single learner is also returned as a tuple.
+    """
     vehicles = tuple(engine.learners)
     return vehicles if several or len(vehicles) > 1 else vehicles[0]
 
@@ -163,7 +185,7 @@ def one_learner(scenario: Scenario) -> int | None:
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """Return the settings class of a mode, or else of the first mode, that has all these settings.
+    """Return the settings class that has all these settings: the mode's own, or else the first of the other modes'.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

@@ -34,12 +34,13 @@ Bound = Literal["coupled", "pairwise"]  # source of H* and a*: the engine's phys
 
 
 class HybridAgent(AgentAround):
-    """Drive by ``policy`` in the worlds where its rollout harms at most ``H*``, else by E-V2X-BM.
+    """Agent that drives by ``policy`` in the worlds where its rollout harms at most ``H*``, else by E-V2X-BM.
 
-    ``bound`` chooses ``H*`` and E-V2X-BM's deceleration ``a*``; ``harm_count`` chooses the harm that is compared. The
-    memory holds ``chosen_policy`` [n], true where the policy drives; the two compared harms ``policy_harm`` [n] and
-    ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of the two. Raises ``InvalidInput`` for an unknown
-    ``bound`` or ``harm_count``, and where ``policy`` is not an agent.
+    The rollout simulates the episode from the alert; ``H*`` is the harm of E-V2X-BM's constant deceleration. ``bound``
+    chooses how both are computed: in the engine's physics (``coupled``), or in the paper's closed form (``pairwise``).
+    ``harm_count`` chooses the harm that is compared. The memory holds ``chosen_policy`` [n], true where the policy
+    drives; the two compared harms ``policy_harm`` [n] and ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of
+    the two. Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
     """
 
     adds = Source.MODEL  # both candidates are compared in the true model
@@ -56,7 +57,14 @@ class HybridAgent(AgentAround):
         self.harm_count: HarmCount = harm_count
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Roll the policy out, and choose the driver in each world."""
+        """Simulate the policy's episode, choose the driver of each world, and return the memory.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: index of each scripted vehicle -> its script.
+
+        """
         refuse_untold(alert, [vehicle], f"agent {self.name!r}")
         policy = begin_script(self.policy, alert, vehicle, scripts)
         backup = begin_script(self.backup, alert, vehicle, scripts)
@@ -70,7 +78,11 @@ class HybridAgent(AgentAround):
         }  # fmt: skip
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the wanted signed acceleration of the chosen driver, [n] m/s2, and the new memory."""
+        """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory.
+
+        ``worlds`` are the worlds now; ``memory`` is what ``begin`` or the last call returned; ``vehicle`` is the index
+        of the controlled vehicle.
+        """
         command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
         constant, _ = self.backup.act(worlds, memory["backup"], vehicle)
         return np.where(memory["chosen_policy"], command, constant), {**memory, "policy": policy}
@@ -80,7 +92,7 @@ class HybridAgent(AgentAround):
 
 
 class FixedCommand:
-    """An agent that holds one command per world for the whole episode."""
+    """Agent that holds the command ``command_mps2`` [n] of each world for the whole episode."""
 
     name = "fixed"
 
@@ -96,9 +108,11 @@ ROUNDING = 1e-6  # rounding error of an action in 32 bits
 
 
 class EpisodeGuard(ShieldGuard):
-    """Guard of mode ``episode``: the hybrid chooses the driver at each alert, whatever is proposed.
+    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses who drives the whole episode.
 
-    A proposal counts as replaced where it differs from the applied action by more than the rounding of 32 bits.
+    The choice is the policy inside ``hybrid`` or E-V2X-BM; proposed actions do not change it. A proposal counts as
+    replaced where it differs from the applied action by more than the rounding of 32 bits. ``engine`` is the engine
+    that the guard will protect; ``where`` names the interface in error messages.
     """
 
     def __init__(self, engine: Engine, hybrid: HybridAgent, *, where: str = "shield") -> None:
@@ -110,7 +124,14 @@ class EpisodeGuard(ShieldGuard):
         return begun if shield is None else renew_memory(shield, rows, begun)
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Apply the action of the driver that was chosen at the alert."""
+        """Return the actions of the driver that was chosen at the alert.
+
+        Args:
+            running: the engine before the step.
+            memory: memory of the guard.
+            proposed: [n, 1] proposed actions, which have no effect.
+
+        """
         worlds = running.worlds
         command, hybrid = ask_script(self._hybrid, worlds, memory.shield, self.vehicles[0])
         applied = command_to_action(command, worlds.vehicles, self.vehicles[0])[:, np.newaxis]
@@ -118,10 +139,13 @@ class EpisodeGuard(ShieldGuard):
         return Ruling(proposed, applied, ~hybrid["chosen_policy"], ~running.ended, None, memory)
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Return where the applied action differs from the proposed one, [n, L]."""
+        """Return whether the applied action differs from the proposed one, [n, 1], for the decision ``ruling``."""
         return np.asarray(abs(ruling.applied - ruling.proposed) > ROUNDING, np.bool_)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos: chosen driver and compared harms. ``proposed_action`` is NaN where nothing was proposed."""
+        """Return the infos by name: chosen driver and compared harms, each [n], and the actions.
+
+        ``ruling`` is the decision in the last step, or None. ``proposed_action`` is NaN where nothing was proposed.
+        """
         compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
         return self._of_step(ruling) | compared

@@ -8,6 +8,8 @@ from enum import IntEnum
 class ShieldReason(IntEnum):
     """Reason why a shield accepted or replaced an action: the code ``shield_reason`` in the infos.
 
+    The shield holds a plan, one action for each later decision. The budget is the largest harm that it accepts.
+
     >>> import ethbrake_marl as eb
     >>> eb.ShieldReason(3).name, eb.ShieldReason.NO_CERTIFICATE.text
     ('NO_CERTIFICATE', 'no certificate')

@@ -1,7 +1,8 @@
-"""Rollouts of the proposing policies: their actions from the alert, or from a later decision on, as a plan.
+"""Rollouts of the proposing policies: simulations in which they drive, whose actions become a plan.
 
-Such a plan is certified like any other (``plan_harm``). If a policy later deviates from its rollout, this costs
-interventions, but the bound still holds.
+A plan holds one action for each decision. A rollout starts at the alert or at a later decision, and its plan is
+certified like any other (``plan_harm``). If a policy later deviates from its rollout, this costs interventions, but the
+bound still holds.
 """
 
 from __future__ import annotations
@@ -32,17 +33,26 @@ from ethbrake_marl.shield.running import Running
 class Proposer(NamedTuple):
     """The proposing policies, with everything that a rollout of them needs."""
 
-    policies: Mapping[int, Agent]  # by shielded vehicle, front to rear
-    memories: Mapping[int, Memory]  # memory of each policy after this decision's action
+    policies: Mapping[int, Agent]  # index of each shielded vehicle -> its policy, front to rear
+    memories: Mapping[int, Memory]  # index -> memory of its policy after this decision's action
     worlds: Worlds  # the n worlds at this decision
 
 
 def rolled_out(
     worlds: Worlds, policies: Mapping[int, Agent], scenario: Scenario, vehicle: int | tuple[int, ...], width: int
 ) -> Floats:
-    """Return the actions of policies that drive unshielded from the alert, as plans.
+    """Return the actions of policies that drive unshielded from the alert to the end of the episodes.
 
-    They are [n, width], or [n, width, K] for several vehicles. After the end of an episode, the action is full braking.
+    Args:
+        worlds: n worlds at the alert.
+        policies: index of each shielded vehicle -> its policy.
+        scenario: the scenario, whose scripts drive the other vehicles.
+        vehicle: index of the shielded vehicle, or a tuple of indices, which chooses the shape of the result.
+        width: number of decisions to return.
+
+    Returns [n, width] for one index, [n, width, K] for a tuple. After the end of an episode, the action is full
+    braking.
+
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
     engine = episode_engine(worlds, team, scenario)
@@ -54,7 +64,17 @@ def rolled_out(
 def certify_by_policy(
     decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Accept those rejected proposals that a rollout of the policy can certify; see ``certify_rollouts``."""
+    """Return the decision with every rejected proposal accepted that a rollout (simulation) of the policy certifies.
+
+    Args:
+        decision: the decision without rollouts.
+        running: the n episodes at this decision.
+        proposed: [n] or [n, K] proposed actions.
+        budget: [n] largest accepted harm, m2/s2.
+        held: [n, L] or [n, L, K] plans that the shield held before the decision: one action for each decision.
+        proposer: the policies.
+
+    """
     rejected = (decision.reason == NO_CERTIFICATE).reshape(running.n, -1).any(axis=1)
     rows = np.flatnonzero(rejected)
     if not rows.size:
@@ -70,21 +90,21 @@ def certify_by_policy(
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in ``rows``, whose proposals have no certificate, with rollouts of the policy as plans.
+    """Decide again in worlds whose proposals have no certificate, with rollouts of the policy as plans.
 
-    The plan that is tried consists of the clipped proposal and the policy's actions from the state after it. Where this
-    plan keeps the budget, it becomes the backup and the proposal is accepted. Elsewhere the reason stays
+    The plan that is tried consists of the clipped proposal and the policy's actions from the state after it. If this
+    plan keeps the budget, it becomes the backup and the proposal is accepted. Otherwise the reason stays
     ``NO_CERTIFICATE``. With several vehicles, a vehicle whose proposal is NaN keeps its planned action.
 
     Args:
-        running: the episodes of the whole batch.
-        proposed: proposed actions of the whole batch.
-        rows: worlds in which to decide again.
-        budget: largest accepted harm, for the whole batch.
-        held: current plans of the whole batch.
+        running: the n episodes of the whole batch.
+        proposed: [n] or [n, K] proposed actions of the whole batch.
+        rows: [m] worlds in which to decide again.
+        budget: [n] largest accepted harm, m2/s2.
+        held: [n, L] or [n, L, K] plans (one action for each decision) that the shield now holds in the whole batch.
         proposer: the policies.
 
-    Returns a decision for ``rows`` only.
+    Returns a decision for the m worlds of ``rows`` only.
 
     """
     part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])
@@ -107,9 +127,18 @@ def certify_rollouts(
 def _later_plan(
     running: Running, first: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Floats:
-    """Return the plans of ``rows``: past actions, then ``first`` ([m] or [m, K]), then the policies' actions.
+    """Return plans of m worlds: past actions, then ``first``, then the actions of a rollout of the policies.
 
     A rollout stops as soon as its harm exceeds the budget.
+
+    Args:
+        running: the n episodes, with one possible world each.
+        first: [m] or [m, K] actions of the present decision.
+        rows: [m] the worlds.
+        budget: [n] largest accepted harm, m2/s2.
+        held: [n, L] or [n, L, K] current plans, which hold the past actions.
+        proposer: the policies.
+
     """
     policies, memories, worlds = proposer
     memories, seen = take_memory(memories, rows), worlds.take(rows)
@@ -149,27 +178,34 @@ def _later_plan(
 
 
 def no_constants(plan: Floats) -> Floats:
-    """Return an empty list of constant actions, so that none can replace the rest of a plan."""
+    """Return an empty list of constant actions for plans like ``plan``, so that none can replace the rest of a plan."""
     return np.zeros((0, *plan.shape[2:]))
 
 
 def proposed_actions(
     policies: Mapping[int, Agent], memories: Mapping[int, Memory], worlds: Worlds
 ) -> tuple[Floats, dict[int, Memory]]:
-    """Return the actions that the policies propose, [n, K], and their new memories."""
+    """Return the actions that the policies propose, [n, K] in [-1, 1], and vehicle index -> new memory.
+
+    ``policies`` and ``memories`` map the index of each of K vehicles to its policy and the policy's memory; ``worlds``
+    are n worlds at a decision.
+    """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
     return np.stack([action for action, _ in asked.values()], axis=1), after
 
 
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """Return the actions [n] in [-1, 1] that a policy proposes, and its new memory. A NaN command stays NaN."""
+    """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and its new memory.
+
+    A command that is NaN stays NaN.
+    """
     command, memory = ask_script(policy, worlds, memory, vehicle)
     return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory
 
 
 class _Rounded(AgentAround):
-    """A policy whose commands are converted to actions and back, as in a plan; its memory holds the last ``action``."""
+    """Policy whose commands are converted to actions and back, as in a plan. Its memory holds the last ``action``."""
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         return {"policy": begin_script(self.policy, alert, vehicle, scripts), "action": np.zeros(alert.n)}

@@ -13,55 +13,55 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 
 class Running(NamedTuple):
-    """Running episodes at a decision: n worlds with M members (possible worlds) each. Usually M is 1.
+    """Running episodes at a decision: n worlds with M possible worlds (*members*) each. Usually M is 1.
 
-    The members of world k are the rows k * M to k * M + M - 1; the first is the *nominal* member, the world itself.
-    With several shielded vehicles, actions are [n, K] and plans [n, L, K]. With one vehicle, they are [n] and [n, L],
-    or [n, 1] and [n, L, 1].
+    The possible worlds of world k are the rows k * M to k * M + M - 1; the first is the *nominal* one, the world
+    itself. With several shielded vehicles, actions are [n, K] and plans (one action for each decision) [n, L, K]. With
+    one vehicle, they are [n] and [n, L], or [n, 1] and [n, L, 1].
     """
 
     problem: ProfileProblem  # parameters, commands of the other vehicles and times of the decisions, in n * M rows
-    states: Floats  # [n * M, S] in the layout of ``physics.episode.save``: speeds, gaps, hit flags, harms, forces
-    steps: Ints  # [n] number of the decision
-    ended: Bools  # [n * M] whether the member's episode is over
+    states: Floats  # [n * M, S] speeds, gaps, hit flags, harms, forces; in the layout of ``physics.episode.save``
+    steps: Ints  # [n] number of the present decision, from 0
+    ended: Bools  # [n * M] whether the episode is over
     caps: Floats = np.zeros((0, 0))  # [n * M, N] largest harm that each vehicle may bear (m2/s2); [0, 0]: no caps
 
     @property
     def uncapped(self) -> Running:
-        """The same episodes without caps."""
+        """The same episodes without limits on the harm of single vehicles (``caps``)."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
     def n(self) -> int:
-        """Number of worlds."""
+        """Number of worlds, not counting their possible worlds."""
         return len(self.steps)
 
     @property
     def members(self) -> int:
-        """Number of members (possible worlds) of each world, M."""
+        """Number M of possible worlds of each world."""
         return len(self.ended) // max(self.n, 1)
 
     @property
     def finished(self) -> Bools:
-        """Worlds in which the episode of every member (possible world) is over, [n]."""
+        """Whether the episode is over in every possible world of a world, [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property
     def time_s(self) -> Floats:
-        """Time of the decision in each world's nominal member (the world itself), [n] s."""
+        """Time of the present decision of each world since the alert, [n] s."""
         clock = self.problem.clock[:: self.members]
         return Decisions(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP]).at(self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
-        """Return the rows that hold the members (possible worlds) of these worlds."""
+        """Return the rows of the possible worlds of the worlds with the indices ``worlds``, [len(worlds) * M]."""
         return np.asarray((worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel(), np.int64)
 
     def take(self, worlds: Ints) -> Running:
-        """Return the episodes of some worlds, with all their members (possible worlds)."""
+        """Return the episodes of the worlds with the indices ``worlds``, with all their possible worlds."""
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return every world with only its nominal member, the world itself, without its other possible worlds."""
+        """Return the same episodes with only one possible world each: the world itself."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
@@ -72,9 +72,10 @@ class Running(NamedTuple):
 
 
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
-    """Return the episodes of a problem at their first decision.
+    """Return the episodes of ``problem`` at their first decision.
 
-    Every ``members`` rows of the problem are the possible worlds of one world.
+    A problem holds the states of the worlds at that decision, and the commands of the unshielded vehicles. ``members``
+    is the number M of possible worlds of each world: each M consecutive rows of ``problem`` are one world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)
@@ -84,7 +85,7 @@ Number = TypeVar("Number", bound=np.generic)
 
 
 def put(old: NDArray[Number], rows: Ints, new: NDArray[Number]) -> NDArray[Number]:
-    """Return a copy of ``old`` with ``rows`` replaced by ``new``."""
+    """Return a copy of ``old`` in which row ``rows[j]`` is replaced by row j of ``new``."""
     placed = old.copy()
     placed[rows] = new
     return placed

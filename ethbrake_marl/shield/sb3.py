@@ -19,10 +19,11 @@ from ethbrake_marl.shield.attach import Attached, Proposing
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     """``make_sb3_vec_env`` behind a shield, by default in mode ``step``. The rows of one world are decided together.
 
-    ``options`` are keywords of ``ShieldOptions``. The intervention penalty does not enter the return in
-    ``infos[row]["episode"]``. Without a ``policy``, the bound is the coupled optimum's harm. Each row's infos contain
-    ``shield_bound_harm`` and the other shield entries at every step; ``reset_infos`` contains them at the alert. Raises
-    ``InvalidInput`` for another environment, or for several learners in another mode than ``step``.
+    ``options`` are keywords of ``ShieldOptions``. ``policy`` is simulated from each alert: its harm is the bound where
+    it is lower than E-V2X-BM's; None: the bound is always the latter. The intervention penalty does not enter the
+    return in ``infos[row]["episode"]``. Each row's infos contain ``shield_bound_harm`` and the other shield entries at
+    every step; ``reset_infos`` contains them at the alert. Raises ``InvalidInput`` for another environment, or for
+    several learners in another mode than ``step``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -39,18 +40,22 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
         super().__init__(venv)
 
     def reset(self) -> Observations:
-        """Reset the environment."""
+        """Start an episode in every world; return the observations, [rows, F] float32."""
         self.attached.check_open()
         observation: Observations = self.venv.reset()  # type: ignore[assignment]
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Pass the proposed actions [rows, 1] to the environment."""
+        """Take the proposed actions [rows, 1] for the next ``step_wait``."""
         self.attached.check_open()
         self.venv.step_async(actions)
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], Bools, list[dict[str, Any]]]:
-        """Advance every world by one step with the certified or replaced actions."""
+        """Advance every world by one step with the certified or replaced actions.
+
+        Returns observations [rows, F], rewards [rows] with the intervention penalty subtracted, whether each episode
+        ended [rows], and the infos, one dictionary per row.
+        """
         self.attached.check_open()
         observation, reward, done, infos = self.venv.step_wait()
         paid = reward - self.attached.penalty().reshape(-1).astype(np.float32)
@@ -58,7 +63,7 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
-        """Infos at the start of the running episodes, row by row, taken from the unwrapped environment."""
+        """Infos at the start of the running episodes, one dictionary per row."""
         infos: list[dict[str, Any]] = self.unwrapped.reset_infos
         return infos
 

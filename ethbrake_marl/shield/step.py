@@ -70,26 +70,29 @@ class StepShield:
     Both methods replace the whole state in one assignment and change no array in place. So an error or an interrupt
     leaves bound, plan and trust as they were, and a ``copy.copy`` is independent.
 
-    The bound starts as the harm of the coupled optimum, executed decision by decision, or as the harm of ``policy``,
-    rolled out from the alert, where that is lower. It never rises. It covers the time up to the scenario's horizon.
-    ``settles`` [n] is true where nothing moves any more at the horizon under the first plan.
+    The bound starts as the harm of the coupled optimum (E-V2X-BM's constant deceleration), executed decision by
+    decision, or as the harm of ``policy``, simulated from the alert, where that is lower. It never rises. It covers the
+    time up to the scenario's horizon. ``memory.settles`` [n] is true where nothing moves any more at the horizon under
+    the first plan.
 
     At each decision the observed worlds are compared with the prediction, bit by bit. Where they differ (a vehicle
-    brakes beyond its capacity, a number is NaN, a message is missing), ``distrusted`` [n] is set and the guarantee is
-    lost. For the rest of the episode the *fallback* drives: the rest of the plan or the best constant action, whichever
-    harms less, chosen again after every surprise. If a world continues (``only``) after its episode should have ended,
-    it brakes fully.
+    brakes beyond its capacity, a number is NaN, a message is missing), ``memory.distrusted`` [n] is set and the
+    guarantee is lost. For the rest of the episode the *fallback* drives: the rest of the plan or the best constant
+    action, whichever harms less, chosen again after every surprise. If a world continues (``only``) after its episode
+    should have ended, it brakes fully.
 
     If each world has several ``possible`` worlds, all of this holds for the worst of them, and the observed world must
     lie within the range of their predictions.
 
     Args:
         scenario: the scenario of all worlds.
-        vehicle: index of the shielded vehicle, or indices of several, front to rear.
-        harm_count: the harm that is guaranteed.
+        vehicle: index of the shielded vehicle (0 = front), or indices of several, front to rear.
+        harm_count: impacts whose harm is guaranteed: ``first`` (each pair's first) or ``total`` (all).
         allowance: loosens the bound by that much (m2/s2), until the episode ends.
-        others: scripts of the other vehicles, whose commands must be fixed at the alert; None: the scenario's scripts.
-        cap: ``baseline``: no vehicle bears more than under the constant actions of least harm.
+        others: index of each other vehicle -> its script, whose command must be fixed at the alert; None: the
+            scenario's scripts.
+        cap: ``baseline``: no vehicle bears more harm than under the constant actions of least harm; None: only the sum
+            over the vehicles is bounded.
         logging: keep every intervention in ``log``.
 
     Raises ``InvalidInput`` for an unknown count or vehicle, a negative allowance, or others whose commands are not
@@ -97,7 +100,7 @@ class StepShield:
 
     """
 
-    possible_are = "possible worlds"  # name of a world's members in error messages
+    possible_are = "possible worlds"  # what error messages call the possible worlds; a subclass may set another name
 
     def __init__(
         self,
@@ -134,7 +137,7 @@ class StepShield:
 
     @property
     def bound(self) -> Floats:
-        """Largest possible harm of each running episode, [n] m2/s2; certificates may use all of it."""
+        """Harm of each running episode that the shield guarantees not to exceed, [n] m2/s2."""
         return self._bound_of(self.memory)
 
     def _bound_of(self, memory: StepMemory) -> Floats:
@@ -145,17 +148,17 @@ class StepShield:
 
     @property
     def predicted_harm(self) -> Floats:
-        """Bound at the alert, allowance included, [n] m2/s2."""
+        """Harm that the shield guaranteed at the alert, allowance included, [n] m2/s2."""
         return self.memory.first_bound + self.allowance
 
     @property
     def chosen_policy(self) -> Bools:
-        """Worlds in which no proposal has been replaced so far, [n]."""
+        """Whether no proposed action of the episode has been replaced so far, [n]."""
         return np.asarray(self.interventions == 0, np.bool_)
 
     @property
     def log(self) -> list[Intervention] | None:
-        """All interventions so far; None without ``logging``."""
+        """All interventions (replaced actions) since the last ``clear_log``; None without ``logging``."""
         return self._entries[: self.memory.logged] if self.logging else None
 
     def clear_log(self) -> None:
@@ -175,7 +178,7 @@ class StepShield:
         return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
-        """Return an independent shield for some of the rows."""
+        """Return an independent shield for the episodes in the rows with the indices ``rows``."""
         part = copy.copy(self)
         part.memory = self.memory.take(rows)
         return part
@@ -188,17 +191,18 @@ class StepShield:
         *,
         possible: Worlds | None = None,
     ) -> None:
-        """Start new episodes in these rows.
+        """Start new episodes in some rows of the batch.
 
         To start a larger batch, pass all of its rows, 0 to k - 1, at once. Raises ``InvalidInput`` for other rows that
         do not exist, and where messages lack a piece that certificates need.
 
         Args:
             worlds: the worlds of these rows at the alert, as the shield assumes them.
-            rows: rows in which the episodes start.
-            policy: the policy that proposes, which is rolled out from the alert; for several vehicles, one for each
-                index.
-            possible: the members of each world [n * M], the world itself first; None: ``members_of(worlds)``.
+            rows: indices of the rows in which the episodes start.
+            policy: the policy that proposes, which is simulated from the alert; for several vehicles, vehicle index ->
+                policy; None: only the constant actions of least harm give the bound.
+            possible: the possible worlds of each world, [len(rows) * M], the world itself first; None:
+                ``members_of(worlds)``.
 
         """
         running_rows = len(self.memory.first_bound)
@@ -212,13 +216,24 @@ class StepShield:
         self.memory = self.memory.put(rows, self._begun(worlds, rows, policy, possible))
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """Return the members (possible worlds) of worlds at the alert, [n * M]. Here each world is its only member."""
+        """Return the possible worlds of worlds at the alert, M for each of n worlds: n * M worlds.
+
+        Here each world is its only possible world; a subclass may return more.
+        """
         return worlds
 
     def _begun(
         self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds
     ) -> StepMemory:
-        """Return the memory of these episodes as they begin, with the first plan and its bound in each world."""
+        """Return the memory of new episodes, with the first plan and its bound in each world.
+
+        Args:
+            worlds: n worlds at the alert.
+            rows: [n] rows of the batch in which the episodes start.
+            policy: the policy that proposes; for several vehicles, vehicle index -> policy; None: none.
+            possible: the possible worlds, M for each world, [n * M].
+
+        """
         members, vehicles = possible.n // worlds.n, self.vehicles
         problem = self._problem(possible, members)
         running = begin_running(problem, members)
@@ -250,10 +265,10 @@ class StepShield:
         )  # fmt: skip
 
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
-        """Return all possible worlds with the commands of the unshielded vehicles.
+        """Return the possible worlds and the commands of the unshielded vehicles, as a problem of ``engine.profiles``.
 
-        Raises ``InvalidInput`` where these commands are not fixed at the alert. With several members, each member must
-        also leave the shielded vehicles at least one decision before the horizon.
+        Raises ``InvalidInput`` if these commands are not fixed at the alert. If each world has several possible worlds
+        (``members``), each of them must also leave the shielded vehicles at least one decision before the horizon.
         """
         vehicles, horizon_s = self.vehicles, self.scenario.horizon_s
         if members > 1 and self.cap is not None:
@@ -277,9 +292,18 @@ class StepShield:
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Any]:
-        """Return the bound [n] of the first plans, and the enclosure to remember.
+        """Return the bound of the first plans, [n] m2/s2, and the shield's further memory (``StepMemory.enclosure``).
 
-        Here the bound is ``harm``, their harm in the worst member, and there is no enclosure.
+        Here the bound is ``harm``, and the further memory is None. A subclass may compute another bound, and use the
+        memory.
+
+        Args:
+            possible: the possible worlds at the alert, M for each world.
+            problem: the same worlds as a problem of ``engine.profiles``.
+            rows: rows of the batch in which the episodes start.
+            plan: [n, L] or [n, L, K] first plans.
+            harm: [n] their harm in the worst possible world, m2/s2.
+
         """
         return harm, None
 
@@ -291,10 +315,19 @@ class StepShield:
         only: Bools | None = None,
         proposer: Proposer | None = None,
     ) -> Decision:
-        """Decide in every running episode, or ``only`` in some worlds [n]; the others stay unchanged.
+        """Decide on the proposed actions in every running episode.
 
-        ``seen`` [n, columns] holds the observed worlds in the first columns of ``Running.states``; None skips the
-        comparison with the prediction. A ``proposer`` is rolled out where nothing else certifies a proposal.
+        Args:
+            proposed: [n], or [n, K] for several vehicles: proposed actions; clipped to [-1, 1]. Where it is NaN,
+                nothing is proposed, and the plan's action is applied.
+            seen: [n, columns] the observed worlds, as the first columns of ``Running.states``; None: they are not
+                compared with the prediction.
+            only: [n] worlds in which to decide; the others stay unchanged. None: all whose episode has not ended.
+            proposer: the policies. Where nothing else certifies a proposal, they are simulated from this decision on,
+                and their actions are tried as a plan. None: this is not tried.
+
+        Returns the decision, with the actions to apply. Afterwards ``memory`` holds the predicted next state.
+
         """
         memory = self.memory
         if memory.running is None:
@@ -310,7 +343,10 @@ class StepShield:
     def _decided(
         self, memory: StepMemory, proposed: Floats, asked: Bools, proposer: Proposer | None
     ) -> tuple[Decision, StepMemory]:
-        """Return the decision in the worlds that are ``asked`` [n], and the memory after it."""
+        """Return the decision on ``proposed`` [n] or [n, K] in the worlds ``asked`` [n], and the memory after it.
+
+        ``memory`` is the memory before. ``proposer`` holds the policies to simulate, or None.
+        """
         before, held, budget = memory.running, memory.backup, self._bound_of(memory)
         assert before is not None
         goes_on, asked = asked & before.finished, asked & ~before.finished
@@ -340,13 +376,25 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Restrict a decision that all members allow; ``held`` is the backup before it. This class changes nothing."""
+        """Return the decision to apply, given a decision that keeps the budget in every possible world.
+
+        Here it is returned unchanged; a subclass may replace more actions.
+
+        Args:
+            now: the episodes before the decision.
+            memory: memory before the decision, with the plan held so far.
+            budget: [n] largest accepted harm, m2/s2.
+            decision: the decision.
+            asked: [n] worlds in which to decide.
+
+        """
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
-        """Return ``seen`` in the layout of the prediction.
+        """Return ``seen`` [n, columns], the observed worlds, in a form that can be compared with the prediction.
 
-        Worlds without an obstacle get the predicted gap to the obstacle where the prediction has a column for it.
+        If the prediction has a column for the gap to an obstacle ahead, worlds without obstacle (an infinite gap) get
+        the predicted gap there. Otherwise ``seen`` is returned unchanged.
         """
         running = self.memory.running
         assert running is not None
@@ -358,9 +406,9 @@ class StepShield:
         return seen
 
     def expects(self, seen: Floats) -> Bools:
-        """Return where the observed worlds [n, columns] agree with the prediction, [n].
+        """Return whether each observed world in ``seen`` [n, columns] agrees with the prediction, [n].
 
-        With one member, both must be equal to the bit. With several members, each column must lie within the range of
+        With one possible world, both must be equal to the bit. With several, each column must lie within the range of
         their predictions, or, after an impact in one of them, be a finite number.
         """
         running = self.memory.running
@@ -375,15 +423,20 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return worlds [n] that may leave the range of their members (possible worlds), after an impact in one."""
+        """Return whether an impact has happened in one of a world's possible worlds, [n].
+
+        From then on the world itself may lie outside their range. ``running`` are the predicted episodes.
+        """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
 
     def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
-        """Return the memory after a comparison of the observed worlds with the prediction.
+        """Return the shield's memory after it has compared the observed worlds with the prediction in ``memory``.
 
-        Worlds that contradict it are distrusted, and get a new fallback plan from the observed state.
+        ``seen`` [n, columns] holds the observed worlds, as the first columns of ``Running.states``. Only the worlds
+        ``asked`` [n] are compared. Worlds that contradict the prediction are distrusted, and get a new plan from the
+        observed state.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None

@@ -14,20 +14,20 @@ from ethbrake_marl.shield.running import Running, put
 class StepMemory(NamedTuple):
     """Memory of a step shield for n episodes. No array is ever changed in place."""
 
-    running: Running | None = None  # the predicted episodes; None before the first one
+    running: Running | None = None  # the episodes as the shield predicts them; None before the first one
     backup: Backup = Backup(np.zeros((0, 0)), np.zeros(0))  # the certified plan and its harm
-    first_bound: Floats = np.zeros(0)  # [n] harm of the backup at the first decision
-    alone_harm: Floats = np.zeros(0)  # [n] harm of the policy's rollout; infinity without a policy
+    first_bound: Floats = np.zeros(0)  # [n] harm of the plan at the first decision (m2/s2)
+    alone_harm: Floats = np.zeros(0)  # [n] harm if the policy drove unshielded (m2/s2); infinity without a policy
     settles: Bools = np.zeros(0, np.bool_)  # [n] whether all vehicles rest at the horizon under the first plan
     replaced: Ints = np.zeros(0, np.int64)  # [n] or [n, K] number of actions replaced so far in the episode
     distrusted: Bools = np.zeros(0, np.bool_)  # [n] whether the world contradicted the prediction
-    baseline_shares: Floats = np.zeros((0, 0))  # [n, N] harm of each vehicle under the best constant actions
-    episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode
-    enclosure: Any = None  # what a kind of shield remembers besides, with ``take(rows)``
+    baseline_shares: Floats = np.zeros((0, 0))  # [n, N] harm of each vehicle under the best constant actions (m2/s2)
+    episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode, from 0
+    enclosure: Any = None  # further memory of a kind of shield, an object with ``take(rows)``; None: nothing
     logged: int = 0  # number of interventions in the log
 
     def take(self, rows: Ints) -> StepMemory:
-        """Return the memory of some rows."""
+        """Return the memory of the episodes in the rows with the indices ``rows``."""
         running, backup, enclosure = self.running, self.backup, self.enclosure
         return self._replace(
             running=None if running is None else running.take(rows),
@@ -37,14 +37,17 @@ class StepMemory(NamedTuple):
         )
 
     def put(self, rows: Ints, begun: StepMemory) -> StepMemory:
-        """Return this memory with newly begun episodes in ``rows``; a batch that is not smaller replaces the whole.
+        """Return this memory with newly begun episodes in the rows with the indices ``rows``.
 
-        ``begun.enclosure`` covers the whole batch already. The numbers of episodes count on.
+        ``begun`` is the memory of the new episodes, in the order of ``rows``, except that ``begun.enclosure`` covers
+        the whole batch already. If the new episodes are at least as many as the present ones, they replace the whole
+        batch. The numbers of episodes count on.
         """
         old, new = self.running, begun.running
         assert new is not None
         if old is None or new.n >= old.n:
-            ordered = begun._replace(enclosure=None, episode=self.episode.max(initial=-1) + 1 + 0 * rows)
+            episode = np.full(len(rows), self.episode.max(initial=-1) + 1)
+            ordered = begun._replace(enclosure=None, episode=episode)
             return ordered.take(np.argsort(rows))._replace(enclosure=begun.enclosure, logged=self.logged)
         at = old.rows_of(rows)
         running = Running(

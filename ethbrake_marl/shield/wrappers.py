@@ -25,16 +25,16 @@ from ethbrake_marl.shield.attach import Attached, Proposing
 from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
-Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # return value of a step of the environment
+Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rewards, terminated, truncated, infos
 
 
 class _Closing:
-    """Mixin: removes the guard from the engine before the wrapped environment is closed."""
+    """Mixin for wrappers, with a ``close`` that removes the guard from the engine and then closes the environment."""
 
-    attached: Attached
+    attached: Attached  # the link to the engine and its guard
 
     def close(self, **settings: Any) -> None:
-        """Remove the shield from the environment, and close the environment."""
+        """Remove the shield from the environment, then close the environment with its keywords ``settings``."""
         self.attached.close()
         super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
 
@@ -50,7 +50,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     Args:
         env: ``eb.parallel_env(...)`` with one learner (mode ``step``: one or more), or a wrapper around it.
         policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. Mode ``episode`` needs one.
-            In the other modes, its harm is the bound where that is lower.
+            In the other modes, its harm is the bound (the guaranteed harm) where it is lower than that of E-V2X-BM.
         agents: names of the shielded learners; must be all learners, which is also the meaning of None.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
@@ -93,14 +93,22 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
-        """Start an episode. ``infos[agent]["shield_bound_harm"]`` already holds the bound."""
+        """Start an episode; return the observations and infos of the agents.
+
+        ``seed`` and ``options`` are the environment's. ``infos[agent]["shield_bound_harm"]`` already holds the bound.
+        """
         self.attached.check_open()
         begun: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
         self.attached.check_open()
         return begun
 
     def step(self, actions: Mapping[str, Any]) -> Told:
-        """Advance by one step with the learners' actions certified or replaced. Actions may be omitted."""
+        """Advance by one step with the learners' actions certified or replaced.
+
+        ``actions`` maps agent names to actions [1]; the policy proposes for agents that are left out. Returns
+        observations, rewards (with the intervention penalty subtracted), terminations, truncations and infos, each by
+        agent name.
+        """
         self.attached.check_open()
         found: Told = super().step(actions)
         for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
@@ -109,9 +117,10 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
-    """Return ``HybridShield`` with agents acting in turn (AEC), front to rear; arguments as for ``HybridShield``.
+    """Return a shielded environment with agents acting in turn (AEC), front to rear.
 
     ``env`` is the parallel environment: in AEC, the actions of a step are complete only after the last agent has acted.
+    ``args`` and ``settings`` are the further arguments of ``HybridShield``.
     """
     return InTurns.around(HybridShield(env, *args, **settings))
 
@@ -122,8 +131,8 @@ class ShieldedEnv(
     """``EthBrake-v0`` behind a shield, by default in mode ``step``: each action is certified, or replaced.
 
     ``options`` are keywords of ``ShieldOptions``. The info reports each decision under ``shield_reason`` and other
-    ``shield_...`` keys. ``policy``, required only in mode ``episode``, is rolled out at each alert: where it harms no
-    more than the coupled optimum, its harm is the bound.
+    ``shield_...`` keys. ``policy``, required only in mode ``episode``, is simulated from each alert: where it harms no
+    more than E-V2X-BM, its harm is the bound.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
@@ -147,14 +156,21 @@ class ShieldedEnv(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode. ``info["shield_bound_harm"]`` already holds the bound."""
+        """Start an episode; return observation and info.
+
+        ``seed`` and ``options`` are the environment's. ``info["shield_bound_harm"]`` already holds the bound.
+        """
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
         return begun
 
     def step(self, action: NDArray[Any]) -> Any:
-        """Advance by one time step with the action certified or replaced; around ``CostEnv``, also return its cost."""
+        """Advance by one time step with the action [1] certified or replaced.
+
+        Returns what the wrapped environment returns, with the intervention penalty subtracted from the reward; around
+        ``CostEnv`` that includes the cost.
+        """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
         return observation, float(reward) - self.attached.penalty().item(), *others
@@ -163,9 +179,10 @@ class ShieldedEnv(
 class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
 
-    ``options`` are keywords of ``ShieldOptions``. ``infos["shield_bound_harm"]`` and the other shield entries describe
-    the same moment as the other infos: in a restarted row the new alert, while ``infos["final_info"]`` describes the
-    last step. Raises ``InvalidInput`` for another environment.
+    ``options`` are keywords of ``ShieldOptions``. ``policy``, required only in mode ``episode``, is simulated from each
+    alert: where it harms no more than E-V2X-BM, its harm is the bound. ``infos["shield_bound_harm"]`` and the other
+    shield entries describe the same moment as the other infos: in a restarted row the new alert, while
+    ``infos["final_info"]`` describes the last step. Raises ``InvalidInput`` for another environment.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -187,14 +204,21 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every row. ``infos["shield_bound_harm"]`` already holds the bounds."""
+        """Start an episode in every row; return observations [rows, F] and infos.
+
+        ``seed`` and ``options`` are the environment's. ``infos["shield_bound_harm"]`` already holds the bounds.
+        """
         self.attached.check_open()
         begun = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
         return begun
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
-        """Advance every world by one time step with the actions [rows, 1] certified or replaced."""
+        """Advance every world by one time step with the actions [rows, 1] certified or replaced.
+
+        Returns observations, rewards with the intervention penalty subtracted, terminated, truncated (each [rows]) and
+        infos.
+        """
         self.attached.check_open()
         observation, reward, terminated, truncated, infos = self.env.step(actions)
         return observation, reward - self.attached.penalty()[:, 0], terminated, truncated, infos
@@ -208,8 +232,8 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             interface, or Stable-Baselines3's ``VecEnv``. Inner wrappers may change actions: the action that reaches the
             engine is certified. Or an agent or a team, which needs ``scenario``, the scenario in which actions are
             certified.
-        policy: proposes where the caller gives no action, and lowers the bound to its own harm where that is lower.
-            Mode ``episode`` needs it.
+        policy: proposes where the caller gives no action, and lowers the bound (the harm that the shield guarantees) to
+            its own harm where that is lower. Mode ``episode`` needs it. None: nobody.
         mode: ``step``, ``episode``, or a mode of an extension. None: ``step``, unless the options belong to another
             mode.
         options: further keywords of ``ShieldOptions``.

@@ -21,7 +21,10 @@ from ethbrake_marl.training.team import has_policy_each, load_team
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
-    """Return the policy of a run or a bundle as an agent, or as a team if each learner of the run has its own.
+    """Return the agent of a spec such as ``ppo@PATH``: the policy of a run or of a policy bundle.
+
+    It is a team if each learner of the run has its own policy. ``argument`` is unused; ``settings`` holds the spec with
+    the path, the scenario and the harm count.
 
     ``PATH`` may also be ``shipped``, the policy that comes with the package for this scenario and harm count, or
     ``shipped/NAME``. ``universal@shipped`` is for all scenarios; ``team@shipped`` is the same as ``policy@shipped``.

@@ -1,4 +1,4 @@
-"""Interface of a learning algorithm: how it builds its model, and which parts of the model a checkpoint saves."""
+"""Interface of a learning algorithm: how it builds its model, and which parts of that model a checkpoint saves."""
 
 from __future__ import annotations
 
@@ -19,32 +19,50 @@ from ethbrake_marl.training.training import Training
 class Algorithm(ABC):
     """Base class of a learning algorithm whose model is a ``BaseAlgorithm`` of Stable-Baselines3.
 
-    A subclass must implement ``build``. The other methods say which policies a model holds, which of its state a
-    checkpoint must save in addition to the state of every Stable-Baselines3 model, and which numbers must stay valid.
-    The defaults fit a model whose ``policy`` has one ``optimizer``, as in PPO and A2C.
+    A subclass must implement ``build``, which returns the model. It may override ``actors`` and ``tensors`` (the
+    policies inside the model, and their weights), ``optimizers`` and ``learned_beside`` (what a checkpoint saves
+    besides ``model.policy``), and ``log_noise`` (which must stay finite). The defaults fit a model whose ``policy`` has
+    one ``optimizer``, as in PPO and A2C.
     """
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """Return a new model on the CPU, seeded by the recipe. The model must depend on the two arguments only."""
+        """Return a new model on the CPU, seeded by the recipe.
+
+        The model must depend on the two arguments only.
+
+        Args:
+            training: recipe and scenario.
+            environment: vectorised environment to learn in, with one row for each learner of each world.
+
+        """
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
-        """Return the policies that drive: one for all learners, or one for each, front to rear (``independent``)."""
+        """Return the policies of Stable-Baselines3 inside the model that choose actions.
+
+        This is one policy for all learners, or, in the scheme ``independent``, one for each learner, front to rear.
+        """
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of an actor's weights, under the names of a policy bundle with this network."""
+        """Return a copy of the weights of one of ``actors``, by their names in a policy bundle with this network."""
         return tensors_of(actor, network)
 
     def optimizers(self, model: BaseAlgorithm) -> Mapping[str, Optimizer]:
-        """Return every optimiser by a unique name, always in the same order."""
+        """Return every optimiser of the model by a unique name, always in the same order."""
         return {"policy": model.policy.optimizer}
 
     def learned_beside(self, model: BaseAlgorithm) -> Mapping[str, Tensor]:
-        """Return learned tensors outside the model's policy, by name; a checkpoint saves them."""
+        """Return learned tensors outside ``model.policy``, by name, which a checkpoint saves too; by default none.
+
+        SAC returns ``{"log_ent_coef": ...}``, the entropy coefficient that it learns.
+        """
         return {}
 
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
-        """Return the logarithm of the exploration noise, which must stay finite; None if there is nothing to check."""
+        """Return the logarithm of the model's exploration noise, which is checked to stay finite during the training.
+
+        None if there is nothing to check.
+        """
         found: Tensor | None = getattr(model.policy, "log_std", None)
         return None if found is None else found.detach()

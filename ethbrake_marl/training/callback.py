@@ -1,4 +1,4 @@
-"""Callback that runs between two updates of a training: it measures, logs, writes checkpoints, and stops."""
+"""Callback of a training: between two updates it measures the policies, logs, writes checkpoints, and may stop."""
 
 from __future__ import annotations
 
@@ -32,30 +32,39 @@ EPISODE_COLUMNS = {
     "rollout/collision_rate": "collided",
 }
 
-StopAt = Callable[[Mapping[str, float]], str | None]  # takes an evaluation; returns a reason to stop, or None
+StopAt = Callable[[Mapping[str, float]], str | None]  # takes the metrics of an evaluation; returns why to stop, or None
 
 
 class StopRequested(Exception):
-    """Internal exception, with a reason, that leaves the training loop between two updates."""
+    """Internal exception that leaves the training loop between two updates.
+
+    Its argument is the reason that ``StopAt`` returned, or None after Ctrl-C.
+    """
 
 
 class Watchers(NamedTuple):
-    """Callables that follow a training, and may stop it."""
+    """Functions that follow a training: they measure its policies, may stop it, and receive its progress."""
 
-    evaluate: Evaluate | None  # measures the policies
-    stop_at: StopAt | None  # decides after each evaluation whether to stop
-    on_progress: OnProgress | None  # receives the progress
-    stop: Callable[[], bool]  # called before every rollout; True stops the training
+    evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
+    stop_at: StopAt | None  # takes the metrics of an evaluation and returns a reason to stop, or None to go on
+    on_progress: OnProgress | None  # takes a ``Progress``; None: nobody is informed
+    stop: Callable[[], bool]  # called before every rollout; returns True to stop the training (Ctrl-C)
 
 
 class RunCallback(BaseCallback):
-    """Measure, log and write checkpoints between two updates, and stop the training on request.
+    """Callback that measures, logs and writes checkpoints between two updates, and stops the training on request.
 
     ``_between_updates`` lists what happens and when. It runs before the first rollout, after each update, and at the
     end. To stop, the callback writes a checkpoint and raises ``StopRequested``.
+
+    Args:
+        run: folder of the run.
+        learner: the model that learns, with its algorithm and training.
+        watchers: functions that measure, stop and report.
+
     """
 
-    model: Model
+    model: Model  # the model that learns
 
     def __init__(self, run: RunDirectory, learner: Learner, watchers: Watchers) -> None:
         super().__init__()
@@ -107,7 +116,10 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights, once per update; raise ``TrainingDiverged`` if a weight is not finite."""
+        """Copy the current weights as policies into ``course``, at most once per update.
+
+        Raises ``TrainingDiverged`` if a weight is not finite.
+        """
         course, steps = self.course, self.model.num_timesteps
         if course.policy is None or (course.steps, course.updates) != (steps, self.updates):
             if not weights_are_finite(self.model, self.learner.algorithm):
@@ -143,7 +155,7 @@ class RunCallback(BaseCallback):
         return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
 
     def tell(self, note: str = "") -> None:
-        """Report the progress of the training to ``on_progress``."""
+        """Report the progress of the training to ``on_progress``, with ``note`` as a message to print once."""
         if self._watchers.on_progress is None:
             return
         course = self.course
@@ -166,7 +178,7 @@ class RunCallback(BaseCallback):
             write_checkpoint(folder, self._state())
 
     def _state(self) -> TrainingState:
-        """Return everything that ``restore`` needs."""
+        """Return the state of model, environment, random generators and logs, from which ``restore`` continues."""
         course = self.course
         numbers, arrays = capture_model(self.model, self.learner.algorithm)
         best: tuple[Policy, ...] = ()
@@ -186,7 +198,10 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Restore model and progress from ``state``; raise ``CorruptBundle`` if the state belongs to another model."""
+        """Restore model and progress from the checkpoint ``state``, so that the training continues there.
+
+        Raises ``CorruptBundle`` if the state belongs to another model.
+        """
         numbers, course = state.numbers, self.course
         try:
             restore_model(self.model, self.learner.algorithm, state)

@@ -10,7 +10,14 @@ from torch import Tensor
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO policy whose actor sees the first ``own`` numbers of a row, and whose critic sees the whole row."""
+    """PPO policy whose actor sees only the beginning of an observation row, and whose critic sees the whole row.
+
+    Args:
+        arguments: positional arguments of Stable-Baselines3's ``ActorCriticPolicy``.
+        own: number of entries at the beginning of a row that the actor sees: the vehicle's own observation.
+        settings: keyword arguments of ``ActorCriticPolicy``.
+
+    """
 
     def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
         self._own = own  # set first, because the base class builds the networks
@@ -21,7 +28,11 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of the actor, on the first ``own`` numbers, and of the critic, on all of them."""
+    """Hidden layers of actor and critic: the actor's take the first ``own`` entries of a row, the critic's all.
+
+    ``whole`` is the length of a row; ``net_arch`` and ``activation_fn`` are those of Stable-Baselines3's
+    ``ActorCriticPolicy``.
+    """
 
     def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__(own, net_arch, activation_fn, device="cpu")
@@ -29,5 +40,5 @@ class _OwnPartForTheActor(MlpExtractor):
         self._own = own
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the output of the actor's last hidden layer."""
+        """Return the output of the actor's last hidden layer for rows ``features`` [n, F]."""
         return super().forward_actor(features[:, : self._own])

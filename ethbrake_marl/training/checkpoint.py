@@ -35,21 +35,21 @@ KEPT = 2  # checkpoints kept during a training, so that an older one remains if 
 
 
 class TrainingState(NamedTuple):
-    """Everything that a training needs to continue."""
+    """State of a training between two updates, from which it can continue as if it had not stopped."""
 
-    numbers: dict[str, Any]  # plain data for JSON
-    arrays: Arrays
+    numbers: dict[str, Any]  # counters, settings and log as plain data for JSON
+    arrays: Arrays  # weights, optimiser states, environment and random generators, by name
 
     @property
     def steps(self) -> int:
-        """Decisions of all learners so far."""
+        """Number of decisions that all learners together have made so far."""
         return int(self.numbers["steps"])
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
-    """Write ``folder``, completely or not at all, and delete the oldest checkpoints beside it.
+    """Write ``state`` as a checkpoint in a new ``folder``, and delete all but the two newest checkpoints beside it.
 
-    All bytes are on the disk before the folder gets its name.
+    It is written completely or not at all: all bytes are on the disk before the folder gets its name.
     """
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in state.arrays.items()}
     with new_folder(folder) as partial:
@@ -63,7 +63,10 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
 
 
 def read_checkpoint(folder: Path) -> TrainingState:
-    """Read a checkpoint. Raise ``CorruptBundle`` if it is damaged, ``InvalidInput`` if it has another format."""
+    """Read and check the checkpoint in ``folder``, and return its state.
+
+    Raises ``CorruptBundle`` if it is damaged, ``InvalidInput`` if it has another format.
+    """
     if not os.path.lexists(folder / NUMBERS):
         raise InvalidInput(
             f"{folder}: has no {NUMBERS}, so another version of this package wrote it; go on with that version, or"
@@ -92,22 +95,23 @@ def read_checkpoint(folder: Path) -> TrainingState:
 
 
 def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of both files of a checkpoint, in hexadecimal digits."""
+    """Return the SHA-256 over the open file of arrays and the numbers of a checkpoint, in hexadecimal digits."""
     digest = hashlib.file_digest(arrays, "sha256")
     digest.update(json.dumps(numbers, sort_keys=True).encode())
     return digest.hexdigest()
 
 
 def checkpoint_folders(folder: Path) -> list[Path]:
-    """Return the checkpoints in ``folder``, newest first, without checking them."""
+    """Return the folders of all checkpoints inside ``folder``, newest first, without checking their content."""
     found = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
     return sorted(found, reverse=True)
 
 
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
-    """Return the newest undamaged checkpoint in ``folder``, and why each newer one is damaged; delete the damaged ones.
+    """Read the newest undamaged checkpoint inside ``folder``, and delete damaged newer ones.
 
-    Raises ``InvalidInput`` for a checkpoint of another format, which is not deleted.
+    Returns its state (None if there is none), and for each damaged checkpoint a message that says what is wrong. Raises
+    ``InvalidInput`` for a checkpoint of another format, which is not deleted.
     """
     reasons: list[str] = []
     for path in checkpoint_folders(folder):

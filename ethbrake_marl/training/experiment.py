@@ -40,35 +40,37 @@ BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """A trained policy and its evaluation, as input for reports."""
+    """A trained policy and its evaluation: the input of the functions that write reports about a run."""
 
     trained: TrainResult  # result of the training, which may have been interrupted
-    agents: Mapping[str, Agent]  # baselines, the trained policy, and the trained policy behind its shield
-    evaluation: Evaluation
-    rows: SummaryTable
+    agents: Mapping[str, Agent]  # by name: baselines, the trained policy, and ``hybrid``, the policy behind its shield
+    evaluation: Evaluation  # outcomes of these agents on the evaluation list
+    rows: SummaryTable  # results table of the evaluation, one row per agent
     list_seed: int  # seed of the evaluation's worlds
     harm_count: HarmCount  # harm that all agents minimise
     started: float  # start of the experiment by ``time.monotonic`` (s)
 
     @property
     def run(self) -> RunDirectory:
-        """Folder of the run."""
+        """Folder of the run, as an object that names its files."""
         return RunDirectory(self.trained.directory)
 
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """Tables and note of a report about a run."""
+    """What ``ethbrake run`` prints about a report that was written."""
 
     tables: tuple[Any, ...]  # tables to print instead of the usual ones
     note: str  # text that says where the report is
 
 
-MakeReport = Callable[[Experiment, OnProgress], RunReport]
+MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report; the second argument takes its progress
 
 
 def register_run_report(name: str, make: MakeReport) -> None:
     """Register a function that writes a report into the folder of every ``ethbrake run``, after its results.
+
+    ``name`` is the name of the report, which no other report may have; ``make`` writes it from an ``Experiment``.
 
     An installed package does the same with an entry point of the group ``ethbrake_marl.run_reports``.
     """
@@ -80,11 +82,11 @@ RUN_REPORTS: Registry[MakeReport] = Registry("report of a run", "run_reports", r
 
 @dataclass(frozen=True, slots=True)
 class ExperimentResult:
-    """Result of an experiment: the training, and the tables and notes to print."""
+    """What ``run_experiment`` returns: the training, the results, and the tables and notes to print."""
 
-    trained: TrainResult
-    results: list[dict[str, Any]]  # content of results.json
-    tables: tuple[Any, ...]  # tables for a terminal
+    trained: TrainResult  # result of the training, which may have been interrupted
+    results: list[dict[str, Any]]  # content of results.json: one object per agent
+    tables: tuple[Any, ...]  # tables of the evaluation for a terminal
     notes: tuple[str, ...]  # texts that say where results and reports are
 
 
@@ -106,11 +108,24 @@ def run_experiment(
     All agents minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe). Installed
     extensions then write their reports.
 
-    ``seed`` is the seed of the training. The evaluation list is ``episodes`` worlds of ``list_seed``. ``settings`` are
-    recorded in ``config.json``. Ctrl-C during the training ends it after the current update, and the policy so far is
-    evaluated. A second Ctrl-C, or one during the evaluation, raises ``KeyboardInterrupt``; the folder still contains
-    the policy. ``run.json`` records how the run ended. Raises what ``train`` and ``evaluate`` raise; ``AlreadyExists``
-    for an existing run, before any work.
+    Ctrl-C during the training ends it after the current update, and the policy so far is evaluated. A second Ctrl-C, or
+    one during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the policy. ``run.json`` records
+    how the run ended.
+
+    Args:
+        scenario: scenario with exactly one learner.
+        directory: the new folder of the run.
+        recipe: recipe of the training.
+        steps: overrides the recipe's number of decisions.
+        seed: overrides the recipe's seed of the training.
+        episodes: number of worlds of the evaluation list.
+        list_seed: seed of the evaluation list.
+        force: replace an earlier run.
+        settings: how recipe and scenario differ from their files, ``KEY=VALUE`` each; recorded in ``config.json``.
+        on_progress: called with the progress of training, evaluation and reports.
+
+    Raises what ``train`` and ``evaluate`` raise; ``AlreadyExists`` for an existing run, before any work.
+
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)
@@ -160,7 +175,15 @@ def run_experiment(
 def compared_agents(
     policy: Policy, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] = BASELINES
 ) -> dict[str, Agent]:
-    """Return the baselines, the trained policy alone, and the trained policy behind its shield (``hybrid``)."""
+    """Return the agents to compare, by name: the baselines, the policy alone, and ``hybrid``, the policy shielded.
+
+    Args:
+        policy: the trained policy.
+        scenario: scenario whose only learner they drive.
+        harm_count: harm that baselines minimise and the shield bounds: ``first`` or ``total``.
+        baselines: specs of the baselines.
+
+    """
     alone = LearnedAgent(policy, TRAINED_POLICY)
     learned: dict[str, Agent] = {TRAINED_POLICY: alone, "hybrid": HybridAgent(alone, scenario, harm_count=harm_count)}
     return {**make_agents(baselines, scenario, harm_count=harm_count), **learned}
@@ -169,7 +192,16 @@ def compared_agents(
 def write_results(
     folder: Path, name: str, rows: Sequence[SummaryRow], harm_count: HarmCount, per_world: Path | None = None
 ) -> list[dict[str, Any]]:
-    """Write the rows as ``NAME.json`` and, as a flat table, ``NAME.csv``; return the content of the JSON file."""
+    """Write a results table as ``NAME.json`` and ``NAME.csv`` into ``folder``; return the content of the JSON file.
+
+    Args:
+        folder: existing folder.
+        name: name of the files, without their endings.
+        rows: rows of the table, one per agent.
+        harm_count: harm that the agents minimise, which is recorded.
+        per_world: existing file with one row per world, to which the JSON file refers.
+
+    """
     results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count})
     content = json.dumps(results, indent=2, allow_nan=False) + "\n"
     write_output(folder / f"{name}.json", content.encode(), force=True)
@@ -178,9 +210,9 @@ def write_results(
 
 
 def results_csv(rows: Sequence[SummaryRow]) -> str:
-    """Return a CSV with one line per agent.
+    """Return a results table as CSV text, with one line per agent.
 
-    The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
+    ``rows`` is the table. The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
     """
     lines = []
     for told in (row.to_json() for row in rows):
@@ -194,7 +226,11 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory, status: str) -> Iterator[None]:
-    """Record in ``run.json`` that the evaluation is running, and afterwards the training's status or the error."""
+    """Context manager around the evaluation of a run: record in ``run.json`` that it is running, then how it ended.
+
+    Without an exception, ``status`` (the status of the training) is recorded. For an exception inside, ``interrupted``
+    (Ctrl-C) or ``failed`` is recorded with the error, which is raised again.
+    """
     _note(run, "running", "evaluation", None)
     try:
         yield
@@ -205,7 +241,7 @@ def _status(run: RunDirectory, status: str) -> Iterator[None]:
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Update status and stage in ``run.json``. Its steps and ``wall_s`` remain those of the training."""
+    """Update status, stage and reason in ``run.json``. Its steps and ``wall_s`` remain those of the training."""
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

@@ -20,7 +20,10 @@ class TrainingDiverged(EthBrakeError, ArithmeticError):
 
 
 def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
-    """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite."""
+    """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite.
+
+    ``algorithm`` is the algorithm of the model, which knows its optimisers.
+    """
     hint = "learning_rate or max_grad_norm" if hasattr(model, "max_grad_norm") else "learning_rate"
 
     def check(optimizer: torch.optim.Optimizer, args: Any, kwargs: Any) -> None:
@@ -35,7 +38,10 @@ def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
 
 
 def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
-    """Return whether every weight is finite, and the exploration noise finite and positive."""
+    """Return whether every weight of the model is finite, and the exploration noise finite and positive.
+
+    ``algorithm`` is the algorithm of the model, which knows its exploration noise.
+    """
     logarithm = algorithm.log_noise(model)
     noise = torch.ones(1) if logarithm is None else torch.exp(logarithm)
     usable = torch.isfinite(noise) & (noise > 0.0)

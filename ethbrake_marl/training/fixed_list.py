@@ -1,4 +1,4 @@
-"""Measurement of policies during training, on the recipe's fixed list of worlds."""
+"""Measurement of policies during training, on the fixed list of worlds that the recipe names (``evaluation``)."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ CHUNK = 2_500  # worlds driven together; limits memory, and does not change resu
 
 Evaluate = Callable[[Any], Mapping[str, float]]  # takes a ``Policy`` or a ``PolicyTeam``; returns its metrics
 
-Measure = Callable[[Training], Evaluate]
+Measure = Callable[[Training], Evaluate]  # takes a training; returns the function that measures its policies
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Draw the recipe's fixed list, and return the function that measures policies on it.
+    """Draw the fixed list of worlds that the recipe names, and return the function that measures policies on it.
 
-    Metrics are means over the list, equal to the results of ``evaluate``. If a learner has another objective than total
-    harm, the value of each learner's objective and their mean are added.
+    That function takes a ``Policy`` or ``PolicyTeam``, and returns means over the list by name, equal to the results of
+    ``evaluate``: ``first_impact_harm``, ``total_harm``, ``collision_rate`` and ``horizon_rate``. If a learner has
+    another objective than the line's harm, it adds ``objective_vehicle_2`` and so on, and their mean ``objective``.
     """
     recipe, scenario = training.recipe, training.scenario
     names, harm_count = scenario.vehicle_names, recipe.reward.harm_count
@@ -65,9 +66,9 @@ def measure_on_list(training: Training) -> Evaluate:
 
 
 def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:
-    """Let a team drive worlds from the alert, in chunks. Worlds that cannot be advanced are left out.
+    """Let a team drive worlds from the alert, and yield the results of each chunk of 2,500 worlds.
 
-    Raises ``PhysicsError`` if every world is left out.
+    Worlds that cannot be advanced are left out. Raises ``PhysicsError`` if every world is left out.
     """
     scripts = [script.name for script in script_agents(scenario, except_for=team.drivers).values()]
     failed: dict[int, str] = {}

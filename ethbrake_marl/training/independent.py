@@ -23,9 +23,19 @@ from torch import Tensor, nn
 
 
 class SeparatePolicies(BasePolicy):
-    """An actor, a critic and an optimiser for each learner. The last number of a row says which learner it belongs to.
+    """One actor-critic policy for each learner, with its own optimiser, behind the interface of a single policy.
 
-    A learner sees only its own ``columns`` of the row. Learners in ``resting`` do not explore: they act by their mean.
+    The last entry of an observation row is the number of the learner that it belongs to (0 = foremost). Learners whose
+    numbers are in ``resting`` do not explore: they act by their mean.
+
+    Args:
+        observation_space: space of a row, whose last entry is the number of the learner.
+        action_space: space of one learner's action.
+        lr_schedule: learning rate as a function of the remaining share of the training.
+        use_sde: whether to use state-dependent exploration.
+        columns: for each learner, front to rear, the columns of a row that it observes.
+        network: other keyword arguments of ``ActorCriticPolicy``.
+
     """
 
     def __init__(
@@ -50,16 +60,19 @@ class SeparatePolicies(BasePolicy):
 
     @property
     def log_std(self) -> Tensor:
-        """Logarithm of the exploration noise of all learners, concatenated."""
+        """Logarithm of the exploration noise of all learners, front to rear, concatenated to [L]."""
         return torch.cat([member.log_std for member in self.policies])
 
     @property
     def policies(self) -> list[ActorCriticPolicy]:
-        """Policies of the learners, front to rear."""
+        """Policy of each learner, front to rear, as a list; the same objects as ``members``."""
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions [n, 1], values [n, 1] and log-probabilities [n] of rows [n, F + 1]."""
+        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observation rows [n, F + 1].
+
+        ``deterministic``: all learners act by their means, without exploration.
+        """
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
         for number, policy, rows in self._by_learner(observation):
@@ -68,7 +81,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Return the values [n, 1] of rows [n, F + 1]."""
+        """Return the critics' values [n, 1] of observation rows [n, F + 1]."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
@@ -86,11 +99,19 @@ class SeparatePolicies(BasePolicy):
 
 
 class IndependentPPO(PPO):
-    """One PPO for each of the learners ``names`` (front to rear).
+    """One PPO for each learner, all in the same worlds.
 
-    They learn all at once or, with ``turns``, one after the other, for that many rounds. While one learner learns, the
-    others drive by their means; the turns divide the updates of the training evenly. The log of a learner's training is
-    named ``vehicle_2/loss`` and so on.
+    They learn all at once or, with ``turns``, one after the other. While one learner learns, the others drive by their
+    means; the turns divide the updates of the training evenly. The log of a learner's training is named
+    ``vehicle_2/loss`` and so on.
+
+    Args:
+        env: vectorised environment whose rows end with the number of their learner.
+        names: names of the learners, front to rear.
+        turns: how often each learner has its turn to learn; None: all learn at once.
+        columns: for each learner, the columns of a row that it observes.
+        settings: other keyword arguments of ``PPO``.
+
     """
 
     policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
@@ -106,14 +127,17 @@ class IndependentPPO(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        """Collect rollouts as PPO does, but let only the learners explore whose turn it is."""
+        """Collect rollouts as PPO does, but let only those learners explore whose turn it is to learn.
+
+        The arguments are those of Stable-Baselines3. Returns False if the callback stopped the training.
+        """
         everyone = range(len(self.names))
         self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
         self.policy.resting = frozenset(everyone) - frozenset(self._learning)
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def train(self) -> None:
-        """Let each learner whose turn it is learn from its own rows, with its own optimiser."""
+        """Update each learner whose turn it is, by ``PPO.train`` on its own rows and with its own optimiser."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
         parts = {number: self._part(buffer, number) for number in self._learning}
         try:
@@ -128,14 +152,18 @@ class IndependentPPO(PPO):
             self.policy, self.rollout_buffer, self._logger = joint, buffer, log
 
     def _whose_turn(self, turns: int) -> int:
-        """Return the learner of the next update. It follows from the number of steps, so a resumed training agrees."""
+        """Return the number of the learner (0 = foremost) that learns in the next update.
+
+        Each learner has ``turns`` turns in a training. The result follows from the number of steps so far, so a resumed
+        training agrees.
+        """
         rollout = self.n_envs * self.n_steps
         planned = -(-self._total_timesteps // rollout)
         stretch = self.num_timesteps // rollout * turns * len(self.names) // planned
         return stretch % len(self.names)
 
     def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
-        """Return the experience of one learner, in a buffer of its own."""
+        """Return a new buffer with the experience of learner ``number`` (0 = foremost) only."""
         own = self.policy.policies[number].observation_space
         count = len(self.names)
         part = RolloutBuffer(

@@ -12,7 +12,15 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 
 def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
-    """Open both logs, to continue after the rows of a checkpoint, or empty without one."""
+    """Open ``progress.csv`` and the TensorBoard events of a run for writing.
+
+    Args:
+        run: folder of the run.
+        state: checkpoint after whose rows to continue; rows after it are dropped. None: begin with empty logs.
+
+    Returns the two writers, for ``output_formats`` of Stable-Baselines3's logger.
+
+    """
     run.progress.unlink(missing_ok=True)  # it may be a link
     if state is None:
         for left in run.tensorboard.glob("events.out.tfevents.*"):

@@ -1,4 +1,4 @@
-"""State of a model during training as plain numbers and arrays: capture and restore.
+"""Capture the state of a model during training as plain numbers and arrays, and restore it.
 
 Each part is captured by one function and restored by the function below it.
 """
@@ -26,7 +26,15 @@ REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "t
 
 
 def capture_model(model: Model, algorithm: Algorithm) -> tuple[dict[str, Any], Arrays]:
-    """Return the numbers and arrays of a model between two updates."""
+    """Return the state of a model between two updates, for a checkpoint.
+
+    Args:
+        model: the model of Stable-Baselines3, with its environment.
+        algorithm: the algorithm of the model, which knows its optimisers and other learned tensors.
+
+    Returns counters and settings as plain data for JSON, and arrays by name.
+
+    """
     environment: Any = model.env
     generators, random_arrays = capture_generators()
     memory: Any = getattr(model, "replay_buffer", None)  # none in PPO
@@ -51,9 +59,15 @@ def capture_model(model: Model, algorithm: Algorithm) -> tuple[dict[str, Any], A
 
 
 def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> None:
-    """Restore the state of ``capture_model`` in a new model of the same recipe, whose logger is set.
+    """Put the state that ``capture_model`` returned into a new model of the same recipe.
+
+    Args:
+        model: the new model, whose logger is set. It is changed.
+        algorithm: the algorithm of the model.
+        state: the captured numbers and arrays.
 
     Raises whatever Python, NumPy or torch raise if the state belongs to another model.
+
     """
     numbers, arrays = state
     environment: Any = model.env
@@ -72,7 +86,10 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
 
 
 def _captured_weights(model: Model, algorithm: Algorithm) -> Arrays:
-    """Return the weights of the policy, other learned tensors, and the state of every optimiser."""
+    """Return the numbers that the model has learned, as arrays by name.
+
+    These are the weights of its policy, its other learned tensors, and the states of its optimisers.
+    """
     arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
     arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     for name, optimizer in algorithm.optimizers(model).items():
@@ -98,7 +115,10 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 
 
 def _captured_rows(model: Model) -> Arrays:
-    """Return the last observations of the rows, and returns and lengths of the latest finished episodes."""
+    """Return as arrays by name: the last observation of each row of the model's environment, and finished episodes.
+
+    Returns and lengths of the latest finished episodes are what Stable-Baselines3 logs.
+    """
     observations: Any = model._last_obs
     episodes = list(model.ep_info_buffer or ())
     return {
@@ -121,7 +141,10 @@ def _restore_rows(model: Model, arrays: Arrays) -> None:
 
 
 def _captured_log(model: Model) -> dict[str, list[Any]]:
-    """Return the values recorded for the next row of the log: name -> value, count, excluded formats."""
+    """Return the values that the model has recorded for the next row of its log.
+
+    The result maps the name of a column to [value, count, excluded formats].
+    """
     log, pending = model.logger, {}
     for name, value in log.name_to_value.items():
         number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
@@ -137,7 +160,11 @@ def _restore_log(model: Model, pending: Mapping[str, Any]) -> None:
 
 
 def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
-    """Restore the content of a replay buffer; raise ``ValueError`` for a position outside it."""
+    """Restore the content of a replay buffer; raise ``ValueError`` for a position outside it.
+
+    ``memory`` is the buffer of Stable-Baselines3, which is changed; ``place`` is its (position, whether it is full),
+    and ``arrays`` hold its content.
+    """
     position, full = place
     if (type(position), type(full)) != (int, bool) or not 0 <= position < memory.buffer_size:
         raise ValueError(f"replay = {place!r:.60}: is no place in its memory")
@@ -148,7 +175,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of the optimiser, so that torch raises if its state belongs to other weights."""
+    """Take a step with a copy of ``optimizer``, so that torch raises if its state belongs to other weights."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:
@@ -157,14 +184,17 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 
 
 def check_counter(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError`` unless ``value`` has this type and, if it is a whole number, is at least 0."""
+    """Raise ``ValueError`` unless ``value`` has the type ``kind`` and, for ``int``, is from 0 to 2^53 - 1.
+
+    ``name`` begins the message.
+    """
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
         right = "a whole number, at least 0" if kind is int else f"of type {kind.__name__}"
         raise ValueError(f"{name} = {value!r:.60}: must be {right}")
 
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
-    """Return the array of this name; raise ``ValueError`` unless it is finite, with shape and dtype of ``model``."""
+    """Return ``arrays[name]``; raise ``ValueError`` unless it is finite, and shaped and typed as ``model``."""
     found = arrays[name]
     if (found.shape, found.dtype) != (model.shape, model.dtype) or not np.isfinite(found).all():
         raise ValueError(f"{name}: {model.shape} finite {model.dtype} are needed")
@@ -172,7 +202,7 @@ def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
 
 
 def group_of(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
-    """Return the arrays whose names begin with ``prefix``, under names without it."""
+    """Return those of ``arrays`` whose names begin with ``prefix``, by names without it."""
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 

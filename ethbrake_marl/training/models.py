@@ -22,14 +22,14 @@ Model = BaseAlgorithm  # a model of Stable-Baselines3
 
 
 class Learner(NamedTuple):
-    """A model that learns, its algorithm and its training."""
+    """A model that learns, with its algorithm and the training that it is for."""
 
-    training: Training
-    algorithm: Algorithm
-    model: Model
+    training: Training  # recipe and scenario
+    algorithm: Algorithm  # how to read the model's policies, optimisers and other learned tensors
+    model: Model  # the model of Stable-Baselines3
 
     def policies(self) -> Trained:
-        """Copy the current weights into one policy for all learners, or into one policy for each."""
+        """Return a copy of the current policy, or one policy for each learner in the scheme ``independent``."""
         actors = self.algorithm.actors(self.model)
         return make_policies(
             self.training, self.model.num_timesteps, lambda k, network: self.algorithm.tensors(actors[k], network)
@@ -52,7 +52,16 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
-    """Build the model of a training, with optimisers that refuse gradients which are not finite."""
+    """Build the model of a training, with optimisers that refuse gradients which are not finite.
+
+    Args:
+        algorithm: the algorithm of the training's recipe.
+        training: recipe and scenario.
+        environment: the environment to learn in, from ``make_environment``.
+
+    Raises ``InvalidInput`` for a model that normalises observations by ``VecNormalize``.
+
+    """
     model = algorithm.build(training, environment)
     if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
         raise InvalidInput(
@@ -66,7 +75,14 @@ def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVe
 def make_policies(
     training: Training, steps: int, tensors: Callable[[int, NetworkSpec], Mapping[str, Float32s]]
 ) -> Trained:
-    """Return one policy for all learners, or one for each; ``tensors(k, network)`` are the weights of the k-th."""
+    """Return one policy for all learners, or one for each learner in the scheme ``independent``.
+
+    Args:
+        training: recipe and scenario.
+        steps: number of decisions after which these weights were learned, which is recorded.
+        tensors: function that returns the weights of the k-th policy (0 = foremost learner), by name, for a network.
+
+    """
     recipe, scenario = training.recipe, training.scenario
     names = tuple(training.drivers)
     apart = training.scheme == "independent"

@@ -15,15 +15,19 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 
 
 def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
-    """Return a copy of the weights of Stable-Baselines3's PPO or SAC policy, under the names of a bundle."""
+    """Return a copy of the weights of Stable-Baselines3's PPO or SAC policy, by their names in a policy bundle.
+
+    ``spec`` is the bundle's network, which has the same layers as ``policy``.
+    """
     state = policy.state_dict()
     return {name: copy_of(state[theirs]) for name, theirs in sb3_names(spec).items()}
 
 
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
-    """Return the mapping from a bundle's tensor names to those of Stable-Baselines3's PPO (``clip``) or SAC policy.
+    """Return name of a tensor in a policy bundle -> its name in Stable-Baselines3's policy.
 
-    Stable-Baselines3 also numbers the activations, so a hidden layer's number there is twice ours.
+    ``spec`` is the bundle's network: of PPO if its ``output`` is ``clip``, else of SAC. Stable-Baselines3 also numbers
+    the activations, so a hidden layer's number there is twice ours.
     """
     if spec.output == "clip":
         ours = {"policy": ("mlp_extractor.policy_net", "action_net"), "value": ("mlp_extractor.value_net", "value_net")}
@@ -41,7 +45,13 @@ def sb3_names(spec: NetworkSpec) -> dict[str, str]:
 
 
 def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
-    """Return a copy of the weights of a perceptron, under the names that a bundle uses for network ``name``."""
+    """Return a copy of the weights of a perceptron, by their names in a policy bundle.
+
+    Args:
+        name: name of this network in the bundle, with which the tensors' names begin: ``policy``, ``gate``.
+        layers: linear layers, possibly with activations between them; the last linear layer is the output.
+
+    """
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
     numbers = [*map(str, range(len(linear) - 1)), "output"]
     pairs = {f"{name}.{k}": layer for k, layer in zip(numbers, linear, strict=True)}
@@ -57,7 +67,10 @@ def copy_of(tensor: Tensor) -> Float32s:
 
 
 def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:
-    """Return the arguments of PPO's policy: separate actor and critic, orthogonal initial weights."""
+    """Return ``policy_kwargs`` of Stable-Baselines3's PPO for a recipe's key ``network``.
+
+    Actor and critic are separate, with orthogonal initial weights.
+    """
     return {
         "net_arch": {"pi": list(shape.policy), "vf": list(shape.value)},
         "activation_fn": ACTIVATIONS[shape.activation],

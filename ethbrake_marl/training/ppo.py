@@ -22,7 +22,10 @@ class Ppo(Algorithm):
     """Stable-Baselines3's PPO with one policy for all learners, optionally a central critic, or one policy for each."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
-        """Return the model for the training's scheme."""
+        """Return a new PPO model for a training, which learns in ``environment``.
+
+        The training's scheme decides whether it has one policy, a central critic, or independent learners.
+        """
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)
         settings: dict[str, Any] = {
@@ -50,11 +53,11 @@ class Ppo(Algorithm):
         return PPO("MlpPolicy", environment, **settings)
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
-        """Return the model's policy, or the policy of each independent learner."""
+        """Return the model's policy, or the policies of independent learners, front to rear."""
         return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimiser of the model's policy, or those of independent learners, by the vehicle's name."""
+        """Return the model's optimiser as ``policy``, or that of each independent learner by the vehicle's name."""
         if isinstance(model, IndependentPPO):
             return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
         return {"policy": model.policy.optimizer}

@@ -1,4 +1,4 @@
-"""The course of a training: its policies and evaluations so far."""
+"""The course of a training so far: its last and best policy, and its evaluations."""
 
 from __future__ import annotations
 
@@ -18,36 +18,43 @@ RETURN = "episode_return"
 
 @dataclass
 class Course:
-    """The last good policy, the best policy, and the evaluations so far.
+    """The last good policy, the best policy, and the evaluations of a running training.
 
     The best policy is not the one of highest return, but the one of least harm on the fixed list, by the learners'
     objectives and in the ``harm_count`` of the reward. Without evaluations there is no best policy.
     """
 
-    harm_count: HarmCount = "first"
-    policy: Trained | None = None  # last good policy; None until the first weights were checked
-    best: Trained | None = None
-    best_harm: float = math.inf
-    steps: int = 0
-    updates: int = 0
-    evaluations: list[dict[str, float]] = field(default_factory=list)  # steps, updates and metrics of each
-    wall_before_s: float = 0.0  # time that earlier processes spent on this training
-    started: float = field(default_factory=time.monotonic)
+    harm_count: HarmCount = "first"  # harm by which the best policy is chosen
+    policy: Trained | None = None  # last policy with finite weights; None until the first weights were checked
+    best: Trained | None = None  # policy with the least harm on the fixed list; None before the first evaluation
+    best_harm: float = math.inf  # harm, or objective, of ``best``
+    steps: int = 0  # decisions of all learners at ``policy``
+    updates: int = 0  # updates at ``policy``
+    evaluations: list[dict[str, float]] = field(default_factory=list)  # one entry each: steps, updates and metrics
+    wall_before_s: float = 0.0  # time that earlier processes spent on this training (s)
+    started: float = field(default_factory=time.monotonic)  # start of this process's part, by ``time.monotonic`` (s)
     cpu_s: dict[int, float] = field(default_factory=dict)  # steps at an evaluation -> processor time of learning (s)
-    cpu_started: float = field(default_factory=time.process_time)
+    cpu_started: float = field(default_factory=time.process_time)  # ``time.process_time`` at which ``cpu_s`` is 0
 
     @property
     def wall_s(self) -> float:
-        """Seconds of training, without the time between a stop and the resume."""
+        """Time spent on this training so far (s), without the time between a stop and the resume."""
         return self.wall_before_s + time.monotonic() - self.started
 
     @property
     def kept(self) -> Trained | None:
-        """The policy to use: the best one, or the last one without evaluations."""
+        """The policy to save as the result: the best one, or the last one if there was no evaluation yet."""
         return self.best or self.policy
 
     def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> None:
-        """Record an evaluation of ``policy``, and keep the policy if it is the best so far."""
+        """Record an evaluation of ``policy``, and keep the policy if it is the best so far.
+
+        Args:
+            policy: the evaluated policy, at the current ``steps`` and ``updates``.
+            metrics: its results by name, such as ``total_harm``.
+            episode_return: mean return of the latest training episodes; None if no episode has ended yet.
+
+        """
         extra = {} if episode_return is None else {RETURN: episode_return}
         self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **extra})
         self.cpu_s[self.steps] = time.process_time() - self.cpu_started
@@ -56,7 +63,7 @@ class Course:
             self.best, self.best_harm = policy, metrics[name]
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything but the policies as plain data."""
+        """Return evaluations, least harm and times as plain data for JSON, which ``restore`` takes; no policies."""
         return {
             "evaluations": self.evaluations,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
@@ -66,7 +73,7 @@ class Course:
         }
 
     def restore(self, content: Mapping[str, Any]) -> None:
-        """Restore the values of ``to_json``."""
+        """Set all values but the policies from ``content``, which ``to_json`` returned."""
         self.evaluations = [dict(entry) for entry in content["evaluations"]]
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
@@ -75,9 +82,10 @@ class Course:
 
 
 def objective_in_words(training: Training) -> str:
-    """Describe the mean of the learners' objectives, in words; empty if all learners minimise total harm of the line.
+    """Return the name of the quantity that the learners minimise on average, for users: ``total harm (own)``.
 
-    Only harm that vehicles bear is called harm; a weighted sum of harms is called an objective.
+    It is empty if all learners minimise the harm of the whole line. Only harm that vehicles bear is called harm; a
+    weighted sum of harms is called an objective.
     """
     scenario, learners = training.scenario, training.scenario.learners
     reward, objectives = training.recipe.reward.settled(scenario.objective, scenario.vehicles)

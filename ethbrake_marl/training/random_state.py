@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 @contextmanager
 def own_random_state() -> Iterator[None]:
-    """Context manager that restores the global random generators on exit. Inside, torch uses one thread.
+    """Context manager that restores the global random generators at its end, also after an error.
 
-    With a network this small, a second thread makes training 3 to 15 times slower as soon as another process needs a
-    core.
+    These are the generators of Python, NumPy and torch. Inside, torch uses one thread: with a network this small, a
+    second thread makes training 3 to 15 times slower as soon as another process needs a core.
     """
     states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
     torch.set_num_threads(1)
@@ -31,7 +31,10 @@ def own_random_state() -> Iterator[None]:
 
 
 def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the states of the random generators of Python, NumPy and torch, as numbers and arrays."""
+    """Return the states of the global random generators of Python, NumPy and torch.
+
+    The first result holds numbers (plain data for JSON), the second arrays by name; ``restore_generators`` takes both.
+    """
     state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     version, python_state, gauss = random.getstate()
     numbers = {
@@ -47,7 +50,7 @@ def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 
 def restore_generators(numbers: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Set the generators to the states that ``capture_generators`` returned."""
+    """Set the global random generators to the states that ``capture_generators`` returned."""
     position, has_gauss, cached = numbers["numpy"]
     np.random.set_state(("MT19937", arrays["random.numpy"], position, has_gauss, cached))  # noqa: NPY002
     version, gauss = numbers["python"]

@@ -43,25 +43,38 @@ Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(stric
 
 
 class LearningRate(FileModel):
-    """A learning rate that falls from ``start`` to ``end`` over the training."""
+    """Learning rate of the optimiser, which falls from ``start`` to ``end`` over the training."""
 
-    start: Rate
-    end: Rate
+    start: Rate  # learning rate at the beginning
+    end: Rate  # learning rate at the end
     schedule: Literal["cosine"] = Field(
         "cosine", description="end + (start - end) (1 + cos(pi p)) / 2, where p is the share of steps done"
     )
 
     def at(self, remaining: float) -> float:
-        """Return ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``, the share of steps done."""
+        """Return the learning rate when the share ``remaining`` (1 to 0) of the training's steps is still to be done.
+
+        It is ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+        """
         done = min(max(1.0 - remaining, 0.0), 1.0)
         return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
 class Shape(FileModel):
-    """Sizes of an algorithm's networks; a subclass declares them as keys."""
+    """Base class of the value of the key ``network`` in a recipe: the sizes of the networks.
+
+    A subclass declares the keys as fields. It needs ``policy`` (sizes of the actor's hidden layers, ``[64, 64]``) and
+    ``activation``, or its own ``spec``.
+    """
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the network of a policy bundle, for one action in [-1, 1]: the actor, with the fields in ``more``."""
+        """Return the description of the network in a policy bundle: an actor with one action in [-1, 1].
+
+        Args:
+            observation_size: number of features of an observation.
+            more: fields of ``NetworkSpec`` that differ from those of a plain actor.
+
+        """
         shape: Any = self  # subclasses declare the fields
         fields = {"policy_hidden": shape.policy, "value_hidden": (), "activation": shape.activation, "output": "clip"}
         return NetworkSpec(observation_size=observation_size, action_size=1, **(fields | more))
@@ -78,16 +91,19 @@ class NetworkShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the network of a policy bundle: actor and critic."""
+        """Return the description of the network in a policy bundle: an actor and a critic.
+
+        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        """
         return super().spec(observation_size, value_hidden=self.value, **more)
 
 
 class EvaluationPlan(FileModel):
-    """The fixed list on which the policy is measured during training."""
+    """The fixed list of worlds on which the policy is measured during training, and how often."""
 
-    every_updates: Annotated[int, Field(ge=1)]
-    worlds: Annotated[int, Field(ge=1, le=1_000_000)]
-    seed: Annotated[int, Field(ge=0)]
+    every_updates: Annotated[int, Field(ge=1)]  # number of updates between two measurements
+    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # number of worlds of the list
+    seed: Annotated[int, Field(ge=0)]  # seed from which the worlds are drawn
 
 
 class TrainingRecipe(FileModel):
@@ -154,35 +170,39 @@ class TrainingRecipe(FileModel):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the network of the policy's bundle, as the recipe's ``network`` describes it."""
+        """Return the description of the network in the policy's bundle, from the recipe's key ``network``.
+
+        ``observation_size`` is the number of features of an observation.
+        """
         shape: Shape = vars(self)["network"]
         return shape.spec(observation_size)
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner between two updates: the recipe's ``n_steps``."""
+        """Decisions of each learner in each world between two updates: the recipe's ``n_steps``."""
         return int(vars(self)["n_steps"])
 
     @property
     def updates_per_row(self) -> int:
-        """Updates between two rows of the progress table."""
+        """Number of updates between two rows of ``progress.csv``."""
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit this number of learners."""
+        """Raise ``InvalidInput`` if the recipe does not fit this number of learners; a subclass may override it."""
 
     def begins(self, scenario: Scenario) -> str | None:
-        """Describe the initial weights on a scenario; None if the algorithm always begins with random weights."""
+        """Return a description of the initial weights for a scenario; None if the algorithm has random ones."""
         return None
 
     def derived(self) -> dict[str, float]:
-        """Return numbers that follow from the keys, for ``config.json``."""
+        """Return numbers that follow from the keys, by name, to be recorded in ``config.json``."""
         return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
-        """Return the recipe's scheme; if it names none, ``single`` for one learner and ``shared`` for several.
+        """Return the scheme in which the scenario's learners train: ``single``, ``shared``, ``independent``, ...
 
-        Raises ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the learners.
+        This is the recipe's scheme; if it names none, ``single`` for one learner and ``shared`` for several. Raises
+        ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the learners.
         """
         learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
         if not learners:
@@ -203,7 +223,7 @@ class TrainingRecipe(FileModel):
         return scheme
 
     def make_algorithm(self) -> Any:
-        """Return a new instance of the recipe's algorithm."""
+        """Return a new instance of the class of the recipe's algorithm, a ``training.algorithm.Algorithm``."""
         algorithm = ALGORITHMS[self.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
 
@@ -218,7 +238,7 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def usable() -> dict[str, Path]:
-        """Return the shipped recipes whose algorithm is installed; the others need an extension."""
+        """Return the file of every shipped recipe whose algorithm is installed, by name; others need an extension."""
         return {
             name: file
             for name, file in TrainingRecipe.shipped().items()
@@ -227,7 +247,11 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def file(name_or_path: str | Path) -> Path:
-        """Return the file of a recipe, from a shipped name or any path; it need not exist. Raises ``UnknownName``."""
+        """Return the path of a recipe's file, from a shipped recipe's name or a path.
+
+        A text with a separator or the ending ``.yaml`` is a path; the file need not exist. Raises ``UnknownName`` for
+        another text that is no shipped recipe.
+        """
         text = str(name_or_path)
         if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
             return Path(text)
@@ -238,7 +262,10 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def of(content: Any) -> TrainingRecipe:
-        """Return the recipe with this content of ``model_dump(mode="json")``; raise ``InvalidInput`` if invalid."""
+        """Return the recipe with this content, a mapping from keys to values as in a YAML file.
+
+        Raises ``InvalidInput``, naming the key, if the content is invalid.
+        """
         return _checked(Document("recipe", content, {}))
 
     def new_text(self, name: str) -> str:
@@ -257,7 +284,10 @@ class TrainingRecipe(FileModel):
         return self.replace(name=name, **words).text(head)
 
     def text(self, head: str) -> str:
-        """Return a commented YAML file below ``head``, with all keys; a key without a value stands in a comment."""
+        """Return the text of a commented YAML file with all keys of this recipe, below the comment ``head``.
+
+        A key without a value stands in a comment.
+        """
         lines = [head, schema_lines("recipe", "train --schema")]
         values, meanings = self.model_dump(mode="json"), key_meanings(type(self))
         for key in type(self).model_fields:
@@ -273,7 +303,7 @@ class TrainingRecipe(FileModel):
         return "".join(lines)
 
     def replace(self, **changes: Any) -> Self:
-        """Return the same recipe with other values in some fields; raise ``InvalidInput`` if it is invalid."""
+        """Return the recipe with other values for some keys, ``seed=3``; raise ``InvalidInput`` if one is invalid."""
         content = {**self.model_dump(mode="json"), **changes}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         assert isinstance(changed, type(self)) or "algorithm" in changes
@@ -319,7 +349,10 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return the meaning of each key in the recipes of one algorithm; a key without its own has the base class's."""
+    """Return key -> meaning of the key in recipes of this class.
+
+    A key that the class declares without a description has the description of its base class.
+    """
     found: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
         for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():
@@ -366,15 +399,16 @@ def algorithm_names() -> tuple[str, ...]:
 
 
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
-    """Read a shipped recipe by name (``ppo``) or a file by path (anything with a separator or ``.yaml``).
+    """Read and check a recipe: a shipped one by name (``ppo``), or a file by path.
 
-    Raises ``UnknownName`` with a suggestion, or ``InvalidInput`` with file, line, key, value and what would be right.
+    A text with a separator or the ending ``.yaml`` is a path. Raises ``UnknownName`` with a suggestion, or
+    ``InvalidInput`` with file, line, key, value and what would be right.
     """
     return _checked(TrainingRecipe.file(name_or_path))
 
 
 def _algorithm_in(document: Document) -> object:
-    """Return the algorithm that a recipe file names."""
+    """Return the value of ``algorithm`` in a recipe file; ``ppo`` if the key is missing."""
     return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
 
 
@@ -395,5 +429,9 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the known keys at a path; below ``reward``, include the weights of registered measures."""
+        """Return the keys that are allowed beside a key, from which an error message suggests one.
+
+        ``path`` holds the keys that lead to it in the file, such as ``("reward", "harm")``. Below ``reward``, the
+        weights of registered measures are included.
+        """
         return setting_names() if path[:-1] == ("reward",) else super().known(path)

@@ -60,7 +60,7 @@ class PpoRecipe(TrainingRecipe):
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` unless there is at least one update for every turn."""
+        """Raise ``InvalidInput`` if the training has fewer updates than turns of this number of learners."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
@@ -77,7 +77,10 @@ class SquashedShape(Shape):
     activation: Activation = "relu"
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the network of a policy bundle: the actor only, whose action is the tanh of its mean."""
+        """Return the description of the network in a policy bundle: the actor only, whose action is tanh of its mean.
+
+        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        """
         return super().spec(observation_size, output="tanh", **more)
 
 
@@ -117,21 +120,21 @@ class SacRecipe(TrainingRecipe):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner between two updates."""
+        """Decisions of each learner in each world between two updates: ``steps_per_update``."""
         return self.steps_per_update
 
     @property
     def updates_per_row(self) -> int:
-        """Updates between two rows of the progress table."""
+        """Number of updates between two rows of ``progress.csv``: ``log_every_updates``."""
         return self.log_every_updates
 
     @property
     def update_ratio(self) -> float:
-        """Gradient steps per decision of one learner in each world."""
+        """Number of gradient steps per decision: ``gradient_steps / (n_envs * steps_per_update)``."""
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """Return the update ratio, for ``config.json``."""
+        """Return ``{"update_ratio": ...}``, gradient steps per decision, to be recorded in ``config.json``."""
         return {"update_ratio": self.update_ratio}
 
 

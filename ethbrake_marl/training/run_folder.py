@@ -1,4 +1,4 @@
-"""The folder of a run: the names of its files, and how they are written and read."""
+"""The folder of a run (a training and its results): the names of its files, and how they are written and read."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
 class RunDirectory:
-    """The folder of a run: names of its files, and methods that read and write them."""
+    """The folder of a run: paths of its files as attributes, and methods that read and write them.
+
+    ``path`` is the folder, which need not exist yet.
+    """
 
     # Columns of progress.csv, where keys of evaluations have the prefix ``eval/``.
     RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
@@ -42,7 +45,7 @@ class RunDirectory:
         self.lock = path / "run.lock"  # lock of the process that trains here
 
     def checkpoint(self, steps: int) -> Path:
-        """Return the folder of the checkpoint after ``steps`` decisions."""
+        """Return the path of the checkpoint's folder after ``steps`` decisions of all learners."""
         return self.checkpoints / f"step_{steps:012d}"
 
     def create(
@@ -50,8 +53,13 @@ class RunDirectory:
     ) -> RunDirectory:
         """Create the folder with ``config.json`` and ``run.json``, atomically. From then on the run can be resumed.
 
-        ``team`` is the content of ``team.json``. Raises ``AlreadyExists`` if the path exists. With ``force``, an
-        earlier run (a folder with a ``run.json``) or an empty folder is replaced; anything else is still refused.
+        Args:
+            config: content of ``config.json``.
+            team: content of ``team.json``; None: no such file.
+            force: replace an earlier run (a folder with a ``run.json``) or an empty folder.
+
+        Returns this object. Raises ``AlreadyExists`` if the path exists and is not replaced.
+
         """
         path, is_run = self.path, self.status.is_file()
         replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
@@ -71,11 +79,14 @@ class RunDirectory:
         return self
 
     def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
-        """Replace ``file`` atomically by this content as JSON."""
+        """Write ``content`` as JSON to ``file``, a path in this folder, replacing the file completely or not at all."""
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
     def write_status(self, status: RunStatus, **more: Any) -> None:
-        """Replace ``run.json``. It keeps the start time; a status other than running also records the end time."""
+        """Replace ``run.json`` by this status.
+
+        The start time is kept; a status other than ``running`` also records the end time. ``more`` are other entries.
+        """
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {}
         times = {"started_utc": before.get("started_utc") or now}
@@ -84,7 +95,10 @@ class RunDirectory:
         self.write_json(self.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
 
     def read_config(self) -> dict[str, Any]:
-        """Return the configuration. Raise ``InvalidInput`` if the folder holds no run, or naming a damaged file."""
+        """Return the content of ``config.json``: recipe, scenario, seeds and versions.
+
+        Raises ``InvalidInput`` if the folder holds no run, or if a file or folder in it is damaged.
+        """
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
             raise InvalidInput(f"{self.path}: holds no training; give the folder of a run, for instance runs/my-run")
         for folder in (self.checkpoints, self.tensorboard, self.policy, self.last_policy):
@@ -102,22 +116,31 @@ class RunDirectory:
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
 
     def wait_for_others(self, longest_s: float) -> None:
-        """Wait until no other process trains in this folder, at most ``longest_s`` seconds."""
+        """Wait until no other process trains in this folder, at most ``longest_s`` seconds; never raise."""
         with suppress(Timeout, OSError), FileLock(self.lock, timeout=longest_s, mode=0o666):
             pass
 
     @classmethod
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
-        """Return the metric that chooses the best policy: the objective, or the line's harm without an objective."""
+        """Return the name of the metric whose least value chooses the best policy.
+
+        It is ``objective`` if every evaluation has one, else the harm of the line under ``harm_count``.
+
+        Args:
+            evaluations: evaluations, or rows of ``progress.csv``.
+            harm_count: harm that the training minimises.
+            prefix: text before the names of metrics in ``evaluations`` and in the result: ``eval/`` for rows.
+
+        """
         found = evaluations and all(entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations)
         return prefix + (cls.OBJECTIVE if found else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows of ``progress.csv``, one per update."""
+        """Return the rows of ``progress.csv``, each as column -> text."""
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Return the processor time of learning (s) until each evaluation, by step.
+        """Return number of decisions at each evaluation -> processor time of learning until then (s).
 
         Raises ``InvalidInput`` if none is recorded.
         """
@@ -127,5 +150,5 @@ class RunDirectory:
         return {int(steps): float(spent) for steps, spent in kept.items()}
 
     def column(self, name: str) -> dict[int, float]:
-        """Return a column of ``progress.csv`` as step -> value, without empty cells."""
+        """Return the column ``name`` of ``progress.csv`` as number of decisions -> value, without empty cells."""
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}

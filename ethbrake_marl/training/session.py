@@ -36,7 +36,7 @@ _BUSY = "another process is training here"
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """Policies of a training, and how it went.
+    """Result of ``train`` or ``resume``: the policies, and how the training went.
 
     ``trained`` is the policy with the least harm on the fixed list, or the last policy if nothing was measured.
 
@@ -54,14 +54,14 @@ class TrainResult:
     trained: Trained  # one policy for all learners, or one for each; also saved as directory/policy
     last: Trained  # policy or policies at the end; also saved as directory/policy-last
     status: Ended  # finished or interrupted
-    steps: int  # decisions of all learners, a multiple of rows x rounds
+    steps: int  # decisions of all learners together, whole updates
     updates: int  # rounds of collecting and learning
     wall_s: float  # time that all processes spent on this training (s)
-    evaluations: tuple[Mapping[str, float], ...]  # all evaluations in order
+    evaluations: tuple[Mapping[str, float], ...]  # steps, updates and metrics of each evaluation, in order
 
     @property
     def policies(self) -> dict[str, Policy]:
-        """The policy of each controlled vehicle, by the vehicle's name."""
+        """The policy of each learner, by the vehicle's name."""
         return dict(self.trained.drivers)
 
     @property
@@ -71,7 +71,7 @@ class TrainResult:
 
     @property
     def last_policy(self) -> Policy:
-        """The last policy; raises ``InvalidInput`` if each learner has its own."""
+        """The policy at the end of the training; raises ``InvalidInput`` if each learner has its own."""
         return _only(self.last)
 
 
@@ -116,12 +116,12 @@ def train(
         measure: called with the training; returns the function that measures its policies before the first update,
             every few updates (a key of the recipe), and at the end. By default the recipe's fixed list. None: no
             measurements.
-        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop
-            there with status ``interrupted``, or None.
+        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop there
+            with status ``interrupted``, or None.
         on_progress: called with the progress. By default it is shown on stderr; None: silent.
 
-    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do
-    not fit each other, ``TrainingDiverged`` for numbers that are not finite.
+    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do not
+    fit each other, ``TrainingDiverged`` for numbers that are not finite.
 
     """
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
@@ -171,7 +171,19 @@ def resume(
 def build(
     training: Training, run: RunDirectory, measure: Measure | None, stop_at: StopAt | None, on_progress: Told
 ) -> Iterator[RunCallback]:
-    """Build environment and model, and yield the callback that follows the training."""
+    """Context manager: build environment and model of a training, and yield the callback to pass to ``learn``.
+
+    Inside, Ctrl-C stops the training after the current update. At the end, also after an error, the environment is
+    closed and the global random generators are restored.
+
+    Args:
+        training: recipe and scenario.
+        run: folder of the run; nothing is written yet.
+        measure: as in ``train``.
+        stop_at: as in ``train``.
+        on_progress: as in ``train``.
+
+    """
     evaluate = None if measure is None else measure(training)
     algorithm = training.recipe.make_algorithm()
     with own_random_state(), stop_on_signal() as stop, closing(make_environment(training)) as environment:
@@ -180,9 +192,15 @@ def build(
 
 
 def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
-    """Learn, from a checkpoint or from scratch, to the end or the next stop; then save.
+    """Run the training of a callback to its end or the next stop; then save, and return the result.
 
-    The callback evaluates during training. However the training ends, its folder is complete.
+    However the training ends, its folder is complete.
+
+    Args:
+        callback: the callback from ``build``, which holds the model and measures it during the training.
+        state: checkpoint to continue from; None: begin from scratch.
+        notes: messages for the user, passed to ``on_progress`` when the training begins.
+
     """
     run, (training, algorithm, model), course = callback.run, callback.learner, callback.course
     if state is not None:
@@ -226,7 +244,16 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 
 
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
-    """Save the best and the last good policy, and record how the run ended. A finished run loses its checkpoints."""
+    """Save the best and the last good policy, and record in ``run.json`` how the run ended.
+
+    The checkpoints of a finished run are deleted.
+
+    Args:
+        callback: the callback of the training, with its policies so far.
+        status: how the run ended.
+        reason: why it was interrupted or failed; None: no reason.
+
+    """
     run, training, course = callback.run, callback.learner.training, callback.course
     for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):
         if policy is not None:
@@ -264,9 +291,10 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
 def _newest_checkpoint(
     run: RunDirectory, training: Training, other_versions: bool
 ) -> tuple[TrainingState | None, list[str]]:
-    """Return the newest undamaged checkpoint, if there is one, and what is wrong with newer ones.
+    """Return the newest undamaged checkpoint (None if there is none), and what is wrong with newer ones.
 
-    Raises ``InvalidInput`` if it belongs to another training, or was written by other versions.
+    Raises ``InvalidInput`` if it belongs to another training, or, unless ``other_versions``, if other versions of the
+    packages wrote it.
     """
     remove_unfinished(run.path)
     if run.checkpoints.is_dir():

@@ -16,18 +16,19 @@ _NO_SETTING = {"name", *WORDS}  # descriptive fields, which cannot be set
 
 
 class Settings(NamedTuple):
-    """Settings of a command, sorted by whom they belong to."""
+    """Settings ``KEY=VALUE`` of a command, sorted by whether they belong to scenario, recipe or agents."""
 
     texts: tuple[str, ...]  # the settings as the user wrote them
-    scenario: tuple[Override, ...]
-    recipe: tuple[Override, ...]
-    harm_count: HarmCount = "first"  # harm that agents minimise
-    measures: tuple[str, ...] = ()  # additional measures of an evaluation
+    scenario: tuple[Override, ...]  # keys of the scenario and their values
+    recipe: tuple[Override, ...]  # keys of the recipe and their values
+    harm_count: HarmCount = "first"  # harm that agents minimise: first impacts only, or all (``total``)
+    measures: tuple[str, ...] = ()  # names of additional measures of an evaluation
 
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
-        """Return the recipe with those settings that it has as keys.
+        """Return the recipe with the values of ``self.recipe`` for those keys that its class has.
 
-        ``tell`` is called with a note if only one of two keys was set that should be equal.
+        ``tell`` is called with a note for the user if only one of ``gamma`` and ``reward.shaping_discount``, which
+        should be equal, was set.
         """
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:
@@ -47,10 +48,17 @@ class Settings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipes: Sequence[TrainingRecipe] = (), *, of_agents: Sequence[str] = ()
 ) -> Settings:
-    """Sort settings by owner: ``mass_t=40`` and ``scenario.mass_t=40`` are the scenario's, ``gamma=0.9`` a recipe's.
+    """Parse the settings of a command, and sort them by whether they belong to scenario, recipe or agents.
 
-    ``of_agents`` lists which of ``harm_count=total`` and ``measures=A,B`` are allowed. Raises ``UnknownName`` with a
-    suggestion for an unknown key, ``InvalidInput`` for an unknown harm count.
+    ``mass_t=40`` and ``scenario.mass_t=40`` belong to the scenario, ``gamma=0.9`` to a recipe.
+
+    Args:
+        texts: settings ``KEY=VALUE`` as the user wrote them; None: none.
+        recipes: recipes of the command, whose keys may be set.
+        of_agents: which of ``harm_count`` and ``measures`` the command allows.
+
+    Raises ``UnknownName`` with a suggestion for an unknown key, ``InvalidInput`` for an unknown harm count.
+
     """
     known = {
         "scenario": {*Scenario.model_fields} - _NO_SETTING,

@@ -23,7 +23,10 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 
 def bundle_of(scheme: Scheme, vehicle: str) -> str:
-    """Return the folder, relative to the run's folder, of the policy that drives a learner."""
+    """Return the folder, relative to the run's folder, of the policy that drives a learner in this scheme.
+
+    ``vehicle`` is the learner's name, such as ``vehicle_2``.
+    """
     return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
@@ -34,13 +37,13 @@ _RIGHT_TEAM = (
 
 
 class TeamFile(FileModel):
-    """Content of ``team.json``."""
+    """Content of ``team.json`` in a run's folder, which says which policy drives which vehicle."""
 
-    format: Literal["ethbrake-team"] = "ethbrake-team"
-    format_version: Literal[1] = 1
-    scheme: Scheme
-    vehicles: Annotated[int, Field(ge=2, le=64)]
-    drivers: Annotated[dict[str, str], Field(min_length=1)]
+    format: Literal["ethbrake-team"] = "ethbrake-team"  # mark of this kind of file
+    format_version: Literal[1] = 1  # version of the format
+    scheme: Scheme  # how the learners trained together
+    vehicles: Annotated[int, Field(ge=2, le=64)]  # number of vehicles of the line
+    drivers: Annotated[dict[str, str], Field(min_length=1)]  # learner's name -> folder of its policy in the run
 
     @model_validator(mode="after")
     def _drivers_of_the_line_and_scheme(self) -> TeamFile:
@@ -58,7 +61,7 @@ class TeamFile(FileModel):
 
 
 def read_team(file: Path) -> TeamFile:
-    """Read ``team.json``; raise ``CorruptBundle`` naming what is wrong with it."""
+    """Read and check the file ``team.json`` of a run; raise ``CorruptBundle`` naming what is wrong with it."""
     data = read_plain(file, 1 << 20)
     try:
         document = Document(str(file), parse_strict_json(data), {})
@@ -71,7 +74,7 @@ def read_team(file: Path) -> TeamFile:
 
 
 def has_policy_each(run: RunDirectory) -> bool:
-    """Return whether the learners of the run have different policies, so that no single policy drives them all."""
+    """Return whether the learners of a run have different policies; False if it holds no ``team.json``."""
     return os.path.lexists(run.team) and len(set(read_team(run.team).drivers.values())) > 1
 
 
@@ -81,10 +84,18 @@ def load_team(
     name: str = "team",
     vehicles: Collection[int] | None = None,
 ) -> Team:
-    """Load the policies of a run to drive ``vehicles`` (None: the learners of ``scenario``) as in training.
+    """Load the policies of a run as a team in which each vehicle is driven by the policy that it was trained with.
 
-    Other learners of the run are omitted. Raises ``InvalidInput`` if the folder holds no team, or if the team has
-    another line length or lacks one of the vehicles; ``CorruptBundle`` for a damaged team.
+    Args:
+        folder: folder of the run.
+        scenario: scenario to drive in, its name or its path.
+        name: name of the team.
+        vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. Other learners of the run
+            are omitted.
+
+    Raises ``InvalidInput`` if the folder holds no team, or if the team has another line length or lacks one of the
+    vehicles; ``CorruptBundle`` for a damaged team.
+
     """
     path, scenario = Path(folder), scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     file = RunDirectory(path).team

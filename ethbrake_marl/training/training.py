@@ -24,12 +24,15 @@ from ethbrake_marl.training.team import TeamFile, bundle_of
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """A recipe combined with a scenario, and everything that follows from the two. Create it with ``Training.of``."""
+    """What is to be trained: a recipe combined with a scenario, and everything that follows from the two.
 
-    recipe: TrainingRecipe
-    scenario: Scenario
-    scheme: Scheme
-    drivers: Mapping[str, str]  # learner, front to rear -> folder of its policy, inside the run's folder
+    Create it with ``Training.of``.
+    """
+
+    recipe: TrainingRecipe  # the recipe, with all changes
+    scenario: Scenario  # the scenario, whose roles determine the learners
+    scheme: Scheme  # how the learners train together: ``single``, ``shared``, ``independent`` or ``centralised``
+    drivers: Mapping[str, str]  # learner's name, front to rear -> folder of its policy, inside the run's folder
     observation: ObservationSpec  # features of a row of the environment: everything that any learner observes
     observations: Mapping[str, ObservationSpec]  # features that each learner observes, by name
 
@@ -58,7 +61,7 @@ class Training:
 
     @property
     def columns(self) -> list[list[int]]:
-        """Columns of an environment row that each learner observes, front to rear."""
+        """For each learner, front to rear: the columns of an environment row that it observes."""
         place = {feature.name: column for column, feature in enumerate(self.observation.features)}
         return [[place[feature.name] for feature in spec.features] for spec in self.observations.values()]
 
@@ -68,22 +71,28 @@ class Training:
         return self.recipe.begins(self.scenario)
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Return everything that affects the training as plain data, including defaults, without descriptive texts."""
+        """Return everything that affects the training as plain data: ``{"recipe": {...}, "scenario": {...}}``.
+
+        Defaults are included; descriptive texts are not.
+        """
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
     @property
     def identity(self) -> str:
-        """SHA-256 of ``content()``, in hexadecimal digits."""
+        """SHA-256 of ``content()``, in hexadecimal digits; equal for trainings that give the same policy."""
         return self.identity_of(self.content())
 
     @staticmethod
     def identity_of(content: Mapping[str, Any]) -> str:
-        """Return the SHA-256 of plain data, in hexadecimal digits."""
+        """Return the SHA-256 of ``content`` (plain data, as ``content()`` returns it), in hexadecimal digits."""
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the content of ``config.json``. ``settings`` say how recipe and scenario differ from their files."""
+        """Return the content of ``config.json``: recipe, scenario, seeds and versions.
+
+        ``settings`` (``KEY=VALUE`` each) say how recipe and scenario differ from their files; they are recorded.
+        """
         recipe = self.recipe
         return {
             "recipe": recipe.model_dump(mode="json"),
@@ -95,12 +104,12 @@ class Training:
         }
 
     def team(self) -> dict[str, Any]:
-        """Return the content of ``team.json``."""
+        """Return the content of ``team.json``: scheme, number of vehicles, and the folder of each learner's policy."""
         file = TeamFile(scheme=self.scheme, vehicles=self.scenario.vehicles, drivers=dict(self.drivers))
         return file.model_dump(mode="json")
 
     def who_drives(self) -> str:
-        """Describe scheme and drivers in words: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Return scheme and drivers in words: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         bundles: dict[str, list[str]] = {}
         for vehicle, bundle in self.drivers.items():
             bundles.setdefault(bundle, []).append(vehicle)
@@ -109,9 +118,10 @@ class Training:
 
 
 def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
-    """Return the training that the configuration of a run describes.
+    """Return the training that the configuration of a run describes, for example to resume it.
 
-    Raises ``InvalidInput`` for an invalid configuration, and for a training by another library.
+    ``config`` is the content of the run's ``config.json``; ``run`` is named in errors. Raises ``InvalidInput`` for an
+    invalid configuration, and for a training by another library.
     """
     if "library" in config:
         raise InvalidInput(

@@ -92,3 +92,10 @@ def test_stable_baselines3__makes_it_by_its_id() -> None:
     assert make_vec_env("EthBrake-v0", n_envs=2).reset().shape[0] == 2
     model = PPO("MlpPolicy", "EthBrake-v0", n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
     assert model.get_env().render(mode="rgb_array").shape == (HEIGHT, WIDTH, 3)
+
+
+def test_old_gymnasium_spec__is_made():
+    spec = gymnasium.make("EthBrake-v0", scenario="paper-random").spec
+    old = spec.to_json().replace("ethbrake_marl.envs.gymnasium:", "ethbrake_marl.envs:")
+    assert old != spec.to_json()
+    assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(old)).reset(seed=1)[0].shape

@@ -12,11 +12,27 @@ BEGINNING = """# How the code is laid out
 
 Where does something live? The package is a core and extensions. The core is what the paper needs,
 and what training, scenarios and levels of cooperation need. An extension is a folder that can be
-deleted: it registers itself by entry points (`pyproject.toml`), and no module of the core names it.
-`make core` deletes all of them in a copy and runs the core's tests there.
+deleted: it registers itself by entry points (`pyproject.toml`), and no module of the core names
+it. To delete one, delete its folder, its folder in `tests/extensions/`, its lines in
+`pyproject.toml`, and likewise what uses it; then `make venv`. `make core` does so with all of
+them in a copy, and runs the core's tests there.
 
 A module imports from its own folder, or from what stands below it. `make lint` checks it.
 This page is made from the code: `python -m tests.docs.layout`.
+
+## Where to look
+
+| question | file |
+|---|---|
+| How does one step of an episode go? | `engine/engine.py`, `step`; [the game](game.md) |
+| What does one impact cost? | `physics/impact.py`, `record_impacts`; summed in `game/harm.py` |
+| Where does a number in a table come from? | `evaluation/`: `measure_sets.py` (columns), `outcome.py`, `rollout.py` |
+| Why did the shield replace an action? | `shield/certify.py`, `decide_world`; the proof is in `shield/step.py` |
+| What is a reward term? | `game/`: `step_outcome.py` (formulas), `rewards.py` (weights), `measures.py` (names) |
+| Which agents are there? | `pyproject.toml`, `agents/scripts.py`; [add one](extending.md#an-agent) |
+| What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (quantities); [scenarios](scenarios.md) |
+| How does a training run? | `training/session.py`, `train`; algorithms in `ppo.py` and `sac.py` |
+| How do I add a column to every evaluation? | [a set of measures](extending.md#a-set-of-measures) |
 """
 END = """
 `scenarios/` holds one YAML file per scenario, `train/` the training recipes; those of an extension

@@ -309,3 +309,11 @@ def test_restore__of_a_vec_env_returns_and_lengths_of_running_episodes_go_on() -
         assert [info.keys() for info in infos] == [info.keys() for info in told]
         ended += int(seen[2].sum())
     assert ended > 5
+
+
+def test_reward_terms__are_of_the_learners_where_another_vehicle_sets_the_grid():
+    brake = eb.make_agent("full_brake")
+    reward = {"harm": 0.0, "shaping": 1.0}
+    engine = Engine(PAPER, 1, learners=(1,), scripts={0: brake, 2: brake}, deciders=(2,), reward=reward, seed=7)
+    shaped = np.stack([engine.step(np.zeros((1, 1))).reward[0] for _ in range(3)])
+    assert shaped[:, 1].all() and not shaped[:, [0, 2]].any()

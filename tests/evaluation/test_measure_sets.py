@@ -14,7 +14,7 @@ from ethbrake_marl import registry
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.chunks import Lineup, summarise_tally, tally_list
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measures import MEASURE_SETS, Measure, MeasureSet, Silent, register_measure_set
+from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Measure, MeasureSet, Silent, register_measure_set
 from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.evaluation.summary_row import SummaryRow

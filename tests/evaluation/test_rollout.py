@@ -26,7 +26,7 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.exploits import FAR_M
 from ethbrake_marl.evaluation.identity import scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
-from ethbrake_marl.evaluation.measures import measures
+from ethbrake_marl.evaluation.measure_sets import measures
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.per_world import write_per_world
 from ethbrake_marl.evaluation.record import record_episode

@@ -26,7 +26,7 @@ import numpy as np
 import z3
 
 from ethbrake_marl.physics import impact, motion, rows
-from ethbrake_marl.shield import certify, members
+from ethbrake_marl.shield import certify
 from tests.programmes import Cases, Given, Told
 
 # ---------------------------------------------------------------- symbolic execution
@@ -438,7 +438,7 @@ def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
         )  # fmt: skip
         return good, plan, out
 
-    found = list(_run(members, decide, line.known(), line))
+    found = list(_run(certify, decide, line.known(), line))
     for end in found:
         good, plan, out = end.result
         assert good

@@ -28,21 +28,24 @@ DURATION, RESTITUTION, SHARED_S = range(3)  # entries of a line's clock
 
 CLEAR_M, CLEAR_MPS = 1e-6, 1e-6  # margins, a million times the rounding error of a gap or a speed
 
-_DIGIT = 1_000.0  # numbers of impacts of a pair that ``_course`` distinguishes
+_DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of each pair
 
 
 class Line(NamedTuple):
-    """One world in which candidates are simulated, as tables of ``physics.rows``; an obstacle ahead is column 0."""
+    """One world in which decelerations of one vehicle are simulated, as tables of ``physics.rows``.
 
-    start: Floats  # [rows_for(2 K), N or N + 1], with all commands but the controlled vehicle's
-    shared: Floats  # the table when the controlled vehicle's command takes effect
-    table: Floats  # workspace
-    clock: Floats  # [3] length of a simulation, restitution, time from the start to ``shared``
+    A table has a row per quantity and a column per vehicle, front to rear; an obstacle ahead is column 0.
+    """
+
+    start: Floats  # [rows, N or N + 1] table at the start, with all commands but the controlled vehicle's
+    shared: Floats  # same shape: table at the time when the controlled vehicle's command takes effect
+    table: Floats  # same shape: workspace, in which each simulation runs
+    clock: Floats  # [3] length of a simulation (s), restitution, time from ``start`` to ``shared`` (s)
     controlled: int  # column of the controlled vehicle
-    vehicles: int  # column of Vehicle 1
-    harm: int  # row of the harm that is minimised
-    other: int  # row of the harm under the other count
-    no_rows: Floats  # an empty list of impacts
+    vehicles: int  # column of Vehicle 1: 1 behind an obstacle, else 0
+    harm: int  # row of the harm that is minimised: first-impact or total
+    other: int  # row of the other harm, which decides ties
+    no_rows: Floats  # empty list of impacts, so that single impacts are not recorded
 
 
 @compiled(apart=True)
@@ -51,7 +54,29 @@ def make_line(
     mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
     time: float, restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
-    """Return one world at its ``time``, ready for ``share_start``; an ``obstacle`` at a finite distance is included."""
+    """Return the tables of one world of N vehicles, on which ``share_start`` is called next.
+
+    Args:
+        gap: [N - 1] m, bumper to bumper.
+        speed: [N] m/s.
+        hit: [N - 1] whether the pair has had an impact.
+        obstacle: distance from Vehicle 1 to an obstacle ahead, m; infinite: none.
+        obstacle_hit: whether Vehicle 1 has had an impact with it.
+        command: [N] commands, m/s2; the controlled vehicle's is ignored.
+        latency: [N] s since the alert.
+        mass: [N] t.
+        limit: [N] speed limits, m/s.
+        in_force: [N] accelerations in force at the start, m/s2.
+        brake_rate: [N] rates at which brakes build up, m/s3.
+        release_rate: [N] rates at which brakes are released, m/s3.
+        pieces: [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``.
+        time: time of the world, s since the alert.
+        restitution: of every impact, 0 to 1.
+        horizon: end of the simulations, s since the alert.
+        vehicle: index of the controlled vehicle, from 0.
+        total: minimise total harm; if False, first-impact harm.
+
+    """
     at = 1 if obstacle < math.inf else 0
     vehicles = speed.shape[0]
     table = np.zeros((rows_for(pieces.shape[1]), vehicles + at))
@@ -75,7 +100,11 @@ def make_line(
 
 @compiled(apart=True, bare=True)
 def share_start(line: Line) -> int:
-    """Move the line to the time when the controlled vehicle's command takes effect; return DONE or the failed check."""
+    """Simulate in ``line.shared`` until the controlled vehicle's command takes effect; return a status.
+
+    That time is written to ``line.clock``. The status is ``FLAG.DONE``, or the code of the check of the physics that
+    failed.
+    """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
     start_events(table, builds_up(table))
@@ -95,10 +124,18 @@ def share_start(line: Line) -> int:
 
 @compiled(apart=True, bare=True)
 def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -> int:
-    """Simulate the decelerations ``samples.at[first:end]`` and fill in their results; return DONE or the failed check.
+    """Simulate constant decelerations of the controlled vehicle and write their results into ``samples``.
 
-    A simulation stops when its harm reaches ``bound``. Its harm is then only known to be at least ``bound``, and the
-    other columns are meaningless.
+    Args:
+        line: the world, after ``share_start``; its ``table`` is overwritten.
+        samples: ``at`` holds the decelerations; the other columns are filled in.
+        first: index of the first sample to simulate.
+        end: index after the last one.
+        bound: harm at which a simulation stops, m2/s2. Its harm is then only known to be at least ``bound``, and its
+            other columns are meaningless.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
     """
     for s in range(first, end):
         if s > first and samples.at[s] == samples.at[s - 1]:
@@ -115,7 +152,10 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Simulate one candidate; its harm is left in the line's table."""
+    """Simulate one ``command`` (m/s2) in ``line.table``, until the harm reaches ``bound`` at the latest.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
     _copy_state(line.start, table)
@@ -136,7 +176,7 @@ def _simulate_one(line: Line, command: float, bound: float) -> int:
 
 @compiled(within=True)
 def _copy_state(of: Floats, table: Floats) -> None:
-    """Copy the state of table ``of``, which has the same vehicles."""
+    """Copy the state of the vehicles and pairs from table ``of`` to ``table``; masses and other parameters stay."""
     vehicles = table.shape[1]
     for i in range(vehicles):
         table[ROW.SPEED, i] = of[ROW.SPEED, i]
@@ -157,7 +197,7 @@ def _copy_state(of: Floats, table: Floats) -> None:
 
 @compiled(within=True)
 def copy_table(one: Floats, other: Floats) -> None:
-    """Copy the table ``one`` to ``other``."""
+    """Copy every entry of the table ``one`` into the table ``other`` of the same shape."""
     for row in range(one.shape[0]):
         for i in range(one.shape[1]):
             other[row, i] = one[row, i]
@@ -167,15 +207,16 @@ def copy_table(one: Floats, other: Floats) -> None:
 def will_stay_apart(table: Floats) -> bool:
     """Return whether no pair can have another impact, however long all commands last; False if that is not certain.
 
-    It requires that all commands are in full effect, brake or coast, and that no vehicle moves backward. Then every
-    vehicle keeps its acceleration (that of its body, if several rest against each other) until it stands. A pair of
-    front ``f`` and rear ``r`` with gap g, closing speed w and decelerations d has no impact if
+    ``table`` is the table of one world (``physics.rows``). Commands must be in full effect, and no vehicle may drive or
+    move backward. Then every vehicle keeps its acceleration until it stands; vehicles that rest against each other have
+    a common one. A pair of a front vehicle f and a rear vehicle r has gap g, closing speed w, speeds v and
+    decelerations d. It has no impact if one of these is true, the last one with margins for rounding:
 
-    * r stands, or both are one body;
-    * ``w <= 0`` and ``d_r >= d_f``: w stays so until r stands, also with the kernel's rounding;
-    * r would stop behind f, ``g + v_f^2 / 2 d_f > v_r^2 / 2 d_r``, the pair is apart (or separating), and, if r brakes
-      harder while it closes, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
-      gap is concave until f stands, and decreases from then on.) All of this with margins.
+    * r stands, or both move as one body;
+    * ``w <= 0`` and ``d_r >= d_f``: then w stays at most 0 until r stands;
+    * r would stop behind f, ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``; the pair does not touch, or separates; and if r
+      closes and brakes harder, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
+      gap is least at one of its ends: it is concave until f stands, and decreases from then on.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):
@@ -214,13 +255,16 @@ def will_stay_apart(table: Floats) -> bool:
 
 @compiled(within=True)
 def _way_to_stop(speed: float, acceleration: float) -> float:
-    """Return the distance (m) in which a vehicle stops that brakes or coasts; infinite if it coasts."""
+    """Return the distance in which a vehicle with this speed (m/s) stops, m; ``acceleration`` (m/s2) <= 0.
+
+    It is infinite for a moving vehicle with acceleration 0.
+    """
     return speed * speed / (2.0 * abs(acceleration)) if speed > 0.0 else 0.0
 
 
 @compiled(within=True)
 def _course(line: Line) -> float:
-    """Return a number that encodes how many impacts each pair, and the obstacle, had."""
+    """Return a number that encodes how many impacts each pair, and the obstacle, had in ``line.table``."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
         course += table[ROW.COUNT, p] * digit
@@ -230,7 +274,7 @@ def _course(line: Line) -> float:
 
 @compiled(within=True)
 def _sum_row(line: Line, row: int) -> float:
-    """Sum a row over the pairs and the obstacle, in the order in which NumPy sums a row."""
+    """Sum a row of ``line.table`` over the pairs and the obstacle, in the order in which NumPy sums a row."""
     table, first, total = line.table, line.vehicles, 0.0
     eights = (table.shape[1] - 1 - first) // 8
     if eights > 0:
@@ -242,7 +286,10 @@ def _sum_row(line: Line, row: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
-    """Sum entries in blocks of eight: each of the eight positions separately, then the positions pairwise."""
+    """Sum ``table[row, first:end]``, a multiple of eight entries, in NumPy's order.
+
+    Each of the eight positions in a block is summed separately, then the eight sums are added pairwise.
+    """
     return (
         (_sum_place(table, row, first, end) + _sum_place(table, row, first + 1, end))
         + (_sum_place(table, row, first + 2, end) + _sum_place(table, row, first + 3, end))
@@ -254,7 +301,7 @@ def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_place(table: Floats, row: int, first: int, end: int) -> float:
-    """Sum every eighth entry."""
+    """Sum every eighth entry of ``table[row, first:end]``, beginning with the first."""
     total = table[row, first]
     for p in range(first + 8, end, 8):
         total += table[row, p]

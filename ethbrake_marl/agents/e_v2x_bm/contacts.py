@@ -8,8 +8,8 @@ gap            bumper to bumper at the start [m], >= 0
 v_l, v_f       speeds at the start [m/s], >= 0
 a_l, a_f       decelerations [m/s2], >= 0, held to standstill
 onset_l/_f     start of braking after the start [s]; before it a vehicle coasts
-tau            latency of the follower after the leader's onset [s], >= 0
-lead           latency of the leader after the follower's onset [s], > 0
+tau            time from the leader's onset to the follower's [s], >= 0
+lead           time from the follower's onset to the leader's [s], > 0
 w              closing speed ``v_f - v_l`` [m/s]
 =============  ===============================================================
 
@@ -32,7 +32,10 @@ _NONE = -1.0
 
 @compiled
 def stopping_time(speed: float, deceleration: float) -> float:
-    """Return the time from the onset of braking to standstill: ``v / a``; 0 at rest, inf without braking. [s]"""
+    """Return the time in which a vehicle stops, s; 0 at rest, inf without braking.
+
+    It is ``speed / deceleration``, in m/s and m/s2.
+    """
     if speed == 0.0:
         return 0.0
     return speed / deceleration
@@ -40,7 +43,10 @@ def stopping_time(speed: float, deceleration: float) -> float:
 
 @compiled
 def stopping_distance(speed: float, deceleration: float) -> float:
-    """Return the distance from the onset of braking to standstill: ``v^2 / 2a``; 0 at rest, inf without braking. [m]"""
+    """Return the distance in which a vehicle stops, m; 0 at rest, inf without braking.
+
+    It is ``speed^2 / (2 deceleration)``, in m/s and m/s2.
+    """
     if speed == 0.0:
         return 0.0
     return speed * speed / (2.0 * deceleration)
@@ -48,7 +54,18 @@ def stopping_distance(speed: float, deceleration: float) -> float:
 
 @compiled
 def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while the follower coasts (regimes A and A'), else -1."""
+    """Return the squared closing speed if the pair meets while the follower coasts, else -1. [m2/s2]
+
+    Regimes A (the leader still moves) and A' (it stands) of docs/proofs/constant-deceleration.md.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        tau: time until which the follower coasts, s.
+
+    """
     w = v_f - v_l
     stop_l = stopping_time(v_l, a_l)
     squared = w * w + 2.0 * a_l * gap
@@ -66,7 +83,19 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
 
 @compiled
 def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while both brake and move (regime B), else -1."""
+    """Return the squared closing speed if the pair meets while both brake and move, else -1. [m2/s2]
+
+    Regime B of docs/proofs/constant-deceleration.md.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        tau: time until which the follower coasts, s.
+
+    """
     stop_l = stopping_time(v_l, a_l)
     if not stop_l > tau:
         return _NONE
@@ -87,9 +116,16 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
 
 @compiled
 def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed at the first contact if the leader brakes first; 0 without contact.
+    """Return the squared closing speed at the first contact if the leader brakes first; 0 without contact. [m2/s2]
 
-    The leader brakes from 0, the follower from ``tau``.
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        tau: time until which the follower coasts, s.
+
     """
     squared = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if squared < 0.0:
@@ -105,9 +141,16 @@ def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: fl
 
 @compiled
 def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) -> float:
-    """Return the squared closing speed if a braking follower meets a leader that coasts for ``lead``, else -1.
+    """Return the squared closing speed if a braking follower meets a leader that still coasts; else -1. [m2/s2]
 
-    ``w^2 - 2 a_f gap`` at ``s = 2 gap / (w + sqrt(.)) <= lead``. A touch is ignored: the pair separates again.
+    The pair meets at ``s = 2 gap / (w + sqrt(w^2 - 2 a_f gap)) <= lead``. A touch is ignored: the pair separates again.
+
+    Args:
+        gap: gap at the start, m.
+        w: closing speed at the start, follower minus leader, m/s.
+        a_f: deceleration of the follower, held from the start, m/s2, >= 0.
+        lead: time until which the leader coasts, s.
+
     """
     squared = w * w - 2.0 * a_f * gap
     if w > 0.0 and squared > TOUCH_SQUARED and 2.0 * gap / (w + math.sqrt(squared)) <= lead:
@@ -119,7 +162,18 @@ def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) 
 def closing_speed_squared(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float
 ) -> float:
-    """Return the squared closing speed at the pair's first impact; 0 without one, or for a mere touch. [m2/s2]"""
+    """Return the squared closing speed at the pair's first impact; 0 without one, or for a mere touch. [m2/s2]
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
+        onset_l: time until which it coasts, s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
+        onset_f: time until which it coasts, s.
+
+    """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)
     if w > 0.0 and gap <= w * both_coast:
@@ -140,7 +194,18 @@ def closing_speed_squared(
 
 @compiled
 def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Case of ``least_to_spare_front`` in which the leader brakes from 0 and the follower from ``tau >= 0``."""
+    """Return the smallest deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+
+    The case of ``least_to_spare_front`` in which the leader brakes first.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from the start to standstill, m/s2, > 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        tau: time until which the follower coasts, s, >= 0.
+
+    """
     coasting = contact_while_coasting(gap, v_l, a_l, v_f, tau)
     if coasting > TOUCH_SQUARED:
         return math.inf
@@ -159,7 +224,18 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
 
 @compiled
 def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
-    """Case of ``least_to_spare_front`` in which the follower brakes from 0 and the leader from ``lead > 0``."""
+    """Return the smallest deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+
+    The case of ``least_to_spare_front`` in which the follower brakes first, from the start.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from ``lead`` to standstill, m/s2, > 0.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        lead: time until which the leader coasts, s, > 0.
+
+    """
     if v_f == 0.0:
         return 0.0
     w = v_f - v_l
@@ -179,8 +255,17 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
     """Return the smallest constant deceleration of the follower that avoids the leader; inf if none does. [m/s2]
 
     At any time the follower's position decreases with its deceleration, so every larger deceleration avoids the leader
-    too. The leader brakes (``a_l > 0``). The limit is either the stopping distance or, if the follower would stop
-    first, a grazing contact of two moving vehicles.
+    too. The limit is either the stopping distance or, if the follower would stop first, a grazing contact of two moving
+    vehicles.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
+        onset_l: time until which it coasts, s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        onset_f: time until which it coasts, s.
+
     """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)
@@ -194,7 +279,18 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Case of ``most_to_spare_rear`` in which the leader brakes from 0 and the follower from ``tau >= 0``."""
+    """Return the largest deceleration of the leader that avoids the follower; inf: all do, -inf: none does. [m/s2]
+
+    The case of ``most_to_spare_rear`` in which the leader brakes first, from the start.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``tau`` to standstill, m/s2, > 0.
+        tau: time until which the follower coasts, s, >= 0.
+
+    """
     reach = v_f * tau + stopping_distance(v_f, a_f)
     touching = gap == 0.0 and v_f == v_l  # pressed together from the start: no impact
     if reach <= gap or touching:
@@ -214,8 +310,17 @@ def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: 
     """Return the leader's largest constant deceleration that avoids the follower; inf: all do, -inf: none does. [m/s2]
 
     At any time the leader's position decreases with its deceleration, so every smaller deceleration avoids the follower
-    too. The follower brakes (``a_f > 0``). A follower that brakes first is advanced to the leader's onset, because
-    until then nothing depends on the leader's deceleration.
+    too. A follower that brakes first is advanced to the leader's onset, because until then nothing depends on the
+    leader's deceleration.
+
+    Args:
+        gap: gap at the start, m.
+        v_l: speed of the leader (front vehicle) at the start, m/s.
+        onset_l: time until which it coasts, s.
+        v_f: speed of the follower (rear vehicle) at the start, m/s.
+        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
+        onset_f: time until which it coasts, s.
+
     """
     w = v_f - v_l
     both_coast = min(onset_l, onset_f)

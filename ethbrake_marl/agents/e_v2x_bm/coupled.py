@@ -31,7 +31,7 @@ from ethbrake_marl.physics.messages import LOOK_AHEAD, refuse_untold
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-_MANY = 200  # number of worlds from which on a search is cached and uses several threads
+_MANY = 200  # smallest number of worlds for which a search is cached and uses several threads
 
 _REMEMBERED = 32  # cached searches; a shield around another agent repeats the baseline's search
 
@@ -39,12 +39,12 @@ _FOUND: dict[bytes, Floats] = {}  # SHA-256 of a search's arguments -> its resul
 
 
 class CoupledOptimum(NamedTuple):
-    """The best constant deceleration found in each world, [n] each."""
+    """The best constant deceleration of one vehicle found in each of n worlds."""
 
-    deceleration_mps2: Floats  # a*, in [0, braking capacity]
-    harm: Floats  # harm with a* under the minimised count (m2/s2)
-    first_impact_harm: Floats  # harm with a*
-    total_harm: Floats  # harm with a*
+    deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
+    harm: Floats  # [n] the harm that was minimised, with a*: one of the two below (m2/s2)
+    first_impact_harm: Floats  # [n] harm of each pair's first impact, with a* (m2/s2)
+    total_harm: Floats  # [n] harm of all impacts, with a* (m2/s2)
 
 
 def optimise_coupled(
@@ -57,16 +57,16 @@ def optimise_coupled(
 ) -> CoupledOptimum:
     """Return the constant deceleration of ``vehicle`` with the least simulated harm until ``horizon_s``.
 
-    If the middle of the pairwise collision-free interval is harmless, it is taken. Otherwise an even grid and the
-    pairwise breakpoints are simulated. Where the number of impacts changes, one smooth piece of the harm ends; these
-    borders are located to 1e-9 m/s2. So are the best local minima, on the safe side if the harm jumps. Ties are decided
-    by the other count, then by the middle one of the equal decelerations. The result of a world does not depend on its
-    batch.
+    If the closed form (``optimise_pairwise``) finds decelerations that avoid both neighbours, and the middle one is
+    harmless in the simulation, it is taken. Otherwise an even grid of decelerations, and those at which the closed
+    form's harm has a kink, are simulated. The harm may jump where the number of impacts changes; these places and the
+    best local minima are located to 1e-9 m/s2. At a jump the result lies on the side of less harm. Among equals the
+    other harm decides, then the middle one is taken. The result of a world does not depend on its batch.
 
     Args:
         worlds: n worlds of N vehicles.
         vehicle: index of the controlled vehicle, from 0.
-        harm_count: count that is minimised.
+        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
         horizon_s: end of the simulations, s.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
             None: all brake fully.
@@ -100,7 +100,18 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Return the best deceleration of the worlds ``rows`` [m], its harm, and its harm under the other count: [3, m]."""
+    """Search the best deceleration in some worlds; return it, its harm and its harm under the other count, [3, m].
+
+    Args:
+        worlds: n worlds.
+        told: the same worlds for the closed form, with the capacities of other vehicles set to their braking commands.
+        command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's is ignored.
+        vehicle: index of the controlled vehicle, from 0.
+        rows: [m] indices of the worlds to search.
+        harm_count: impacts whose harm is minimised.
+        horizon_s: end of the simulations, s.
+
+    """
     v = worlds.vehicles
     lines = (
         worlds.gaps_m, worlds.speeds_mps, worlds.time_s, worlds.pair_hit, worlds.obstacle_gap_m, worlds.obstacle_hit,
@@ -139,7 +150,13 @@ def _search_worlds(
     release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
     found: Floats, status: Ints,
 ) -> None:  # fmt: skip
-    """Fill ``found`` [3, m] and ``status`` [m] for the worlds ``rows`` [m]."""
+    """Search the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
+
+    Writes the deceleration, its harm and its harm under the other count to ``found`` [3, m], and the status of the
+    physics (``FLAG.DONE`` if sound) to ``status`` [m]. ``capacity`` and ``onset`` [n, N] are braking capacities (m/s2)
+    and times until a vehicle may brake (s). The other arguments are those of ``make_line``, for n worlds along a new
+    first axis.
+    """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
         k = rows[m]
@@ -176,14 +193,21 @@ class EV2XBM:
         self._mode, self._harm_count, self._horizon_s = mode, harm_count, horizon_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Choose a* from the worlds at the alert."""
+        """Choose each world's best deceleration a* at the alert and return it in the memory.
+
+        Args:
+            alert: n worlds at the alert.
+            vehicle: index of the controlled vehicle (0 = front).
+            scripts: index of each scripted vehicle -> its script.
+
+        """
         if self._mode == "pairwise":
             refuse_untold(alert, [vehicle], f"agent {self.name!r}", LOOK_AHEAD[:-1])  # masses play no part in it
             closed = optimise_pairwise(alert, vehicle)
             return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
 
         def is_fixed(script: Script) -> bool:
-            """Return whether the script's command is fixed before that of ``vehicle``, scripted or free, is chosen."""
+            """Return whether the script's command is fixed at the alert without knowing the choice of ``vehicle``."""
             chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
             return is_state_free(script) or chooses_first
 
@@ -198,12 +222,15 @@ class EV2XBM:
         return {"deceleration_mps2": coupled.deceleration_mps2, "predicted_harm": coupled.harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command ``-a*``, [n] m/s2."""
+        """Return the command ``-a*`` chosen at the alert, [n] m/s2, and the unchanged memory."""
         return -memory["deceleration_mps2"], memory
 
 
 def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``e_v2x_bm`` (the same as ``e_v2x_bm:coupled``) or ``e_v2x_bm:pairwise``."""
+    """Make E-V2X-BM with the horizon and harm count of ``settings``.
+
+    ``argument`` is ``pairwise``, ``coupled`` or None, which means ``coupled``.
+    """
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
         raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")

@@ -30,22 +30,32 @@ _TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
 
 
 class PairwiseOptimum(NamedTuple):
-    """The closed-form optimum of each world, [n] each."""
+    """The closed-form best constant deceleration of one vehicle in each of n worlds."""
 
-    deceleration_mps2: Floats  # a*, in [0, braking capacity]
-    harm: Floats  # predicted H* (m2/s2)
-    spares_front_mps2: Floats  # smallest deceleration that avoids the front vehicle; inf if none does
-    spares_rear_mps2: Floats  # largest deceleration that avoids the rear vehicle; inf if all do, -inf if none
+    deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
+    harm: Floats  # [n] predicted harm with a*, called H* (m2/s2)
+    spares_front_mps2: Floats  # [n] smallest deceleration that avoids the vehicle in front; inf if none does
+    spares_rear_mps2: Floats  # [n] largest deceleration that avoids the vehicle behind; inf if all do, -inf if none
     breakpoints_mps2: Floats  # [n, 6] every deceleration at which the harm may have its minimum, unordered
 
 
 @compiled
 def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
-    """Return kink and jump of the front pair's harm if the follower may brake before the leader; (0, 0) otherwise.
+    """Return two decelerations of the follower at which the harm of the pair has a kink, and a jump. [m/s2]
 
-    Kink: contact exactly at the leader's onset, ``2 (w lead - gap) / lead^2``. Jump: below ``w^2 / (2 gap)`` the
-    follower strikes the coasting leader lightly; above, it grazes past and may strike harder once the leader brakes.
-    The open end of the jump is represented by the lightest contact that still is an impact. [m/s2]
+    Both are 0 unless the follower may brake before the leader (front vehicle) does. ``lead`` is the time in between.
+
+    - Kink: contact exactly when the leader begins to brake, at ``2 (w lead - gap) / lead^2``.
+    - Jump: below ``w^2 / (2 gap)`` the follower strikes the coasting leader lightly. Above, it does not reach it, and
+      may strike harder once the leader brakes. The result is the deceleration just below, with the lightest contact
+      that counts as an impact.
+
+    Args:
+        gap: gap at the present time, m.
+        w: closing speed, follower minus leader, m/s.
+        onset_l: time at which the leader begins to brake, s.
+        onset_f: time at which the follower may begin to brake, s.
+
     """
     lead = onset_l - onset_f
     if lead <= 0.0:
@@ -56,7 +66,11 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
 
 @compiled
 def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Return the predicted harm of vehicle ``i``'s front pair if it brakes with ``a``; 0 for the first vehicle."""
+    """Return the predicted harm of vehicle ``i`` with the vehicle in front, m2/s2; 0 for the first vehicle.
+
+    Vehicle ``i`` brakes with ``a``, the one in front with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
+    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    """
     if i == 0:
         return 0.0
     return closing_speed_squared(gap[i - 1], speed[i - 1], capacity[i - 1], onset[i - 1], speed[i], a, onset[i])
@@ -64,7 +78,11 @@ def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, o
 
 @compiled
 def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Return the predicted harm of vehicle ``i``'s rear pair if it brakes with ``a``; 0 for the last vehicle."""
+    """Return the predicted harm of vehicle ``i`` with the vehicle behind, m2/s2; 0 for the last vehicle.
+
+    Vehicle ``i`` brakes with ``a``, the one behind with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
+    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    """
     if i == gap.shape[0]:
         return 0.0
     return closing_speed_squared(gap[i], speed[i], a, onset[i], speed[i + 1], capacity[i + 1], onset[i + 1])
@@ -74,7 +92,12 @@ def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, on
 def find_breakpoints(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Fill ``at`` [6] with the candidates of one world, all inside [0, capacity]; return both thresholds."""
+    """Write the decelerations of vehicle ``i`` at which its harm may be least to ``at`` [6], all in [0, capacity].
+
+    Returns the smallest deceleration that avoids the vehicle in front, and the largest one that avoids the vehicle
+    behind (may be infinite). ``gap`` [P] m, ``speed`` [N] m/s, ``capacity`` [N] m/s2 and ``onset`` [N] s (time until a
+    vehicle may brake) describe one world.
+    """
     low, high = 0.0, math.inf
     at[:] = 0.0
     at[1] = capacity[i]
@@ -97,9 +120,11 @@ def find_breakpoints(
 def minimise_over(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Return the minimiser of the predicted harm over the candidates, and its harm.
+    """Return the deceleration of least predicted harm of vehicle ``i``, and this harm (m2/s2).
 
-    If the harm is flat between minimisers, their middle is returned.
+    Only the candidates ``at`` [6] (m/s2) are compared. If two of them, and the middle between them, have the least
+    harm, the middle is returned. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity`` [N] m/s2 and ``onset`` [N] s (time
+    until a vehicle may brake) describe one world.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
@@ -123,7 +148,12 @@ def minimise_over(
 def optimise_worlds(
     gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, at: Floats, out: Floats
 ) -> None:
-    """Write the candidates of every world to ``at`` [n, 6], and a*, H* and both thresholds to ``out`` [4, n]."""
+    """Optimise the deceleration of vehicle ``i`` in n worlds, in closed form.
+
+    Writes the candidates to ``at`` [n, 6], and to ``out`` [4, n]: the best deceleration, its predicted harm, and the
+    two thresholds that ``find_breakpoints`` returns. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, ``capacity`` [n, N] m/s2
+    and ``onset`` [n, N] s (time until a vehicle may brake) are read.
+    """
     for k in range(gaps.shape[0]):
         low, high = find_breakpoints(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
         top = min(high, capacity[k, i])
@@ -136,7 +166,11 @@ def optimise_worlds(
 
 @compiled
 def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset: Floats, out: Floats) -> None:
-    """Write the squared closing speed of every pair on its own to ``out`` [n, P]."""
+    """Write the squared closing speed at each pair's first impact, or 0, to ``out`` [n, P] m2/s2.
+
+    Each pair is treated on its own. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, constant ``deceleration`` [n, N] m/s2 and
+    ``onset`` [n, N] s (time until a vehicle may brake) are read.
+    """
     for k in range(gaps.shape[0]):
         for p in range(gaps.shape[1]):
             out[k, p] = closing_speed_squared(
@@ -160,7 +194,7 @@ def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """Return the optimum as if every command took full effect at once, whatever the brake rates."""
+    """Version of ``optimise_pairwise`` that also accepts brakes that build up, and treats them as acting at once."""
     onset, capacity = onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
     at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
     optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
@@ -169,11 +203,17 @@ def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
-    """Return the predicted harm of each pair on its own, [n, P] (m2/s2), under constant decelerations [n, N].
+    """Return the predicted harm of each pair on its own, [n, P] m2/s2.
 
     Every vehicle coasts until its latency has elapsed and then brakes to rest. E-V2X-BM's prediction is the sum over
-    the controlled vehicle's pairs. Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if
-    brakes build up.
+    the controlled vehicle's pairs.
+
+    Args:
+        worlds: n worlds.
+        deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2 or a shape that broadcasts to it.
+
+    Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if brakes build up.
+
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     onset = onset_s(worlds, 0)
@@ -188,9 +228,10 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
 
 
 def onset_s(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the time from now until each vehicle may brake, [n, N] s.
+    """Return the time from the worlds' present time until each vehicle may brake, [n, N] s; 0 if it may brake now.
 
-    Raises ``InvalidInput`` if the closed form does not apply: an unknown vehicle, or a negative speed.
+    Raises ``InvalidInput`` if the closed form does not apply: no vehicle has the index ``vehicle``, or a speed is
+    negative.
     """
     if not 0 <= vehicle < worlds.N:
         raise InvalidInput(f"vehicle {vehicle}: must be an index in 0..{worlds.N - 1}")

@@ -21,23 +21,23 @@ TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
 class Samples(NamedTuple):
-    """Simulated decelerations of one world, [k] each."""
+    """Decelerations of one vehicle in one world and the harm that a simulation gave for each."""
 
-    at: Floats  # decelerations (m/s2)
-    harm: Floats  # harm under the minimised count (m2/s2)
-    other: Floats  # harm under the other count
-    course: Floats  # code of the numbers of impacts; the harm may jump where it changes
+    at: Floats  # [k] decelerations (m/s2)
+    harm: Floats  # [k] the harm that is minimised, first-impact or total (m2/s2)
+    other: Floats  # [k] the other harm, which decides ties (m2/s2)
+    course: Floats  # [k] code of how many impacts each pair had; the harm may jump where it changes
 
 
 @compiled
 def make_samples(most: int) -> Samples:
-    """Allocate ``most`` samples."""
+    """Return uninitialised space for ``most`` samples."""
     return Samples(np.empty(most), np.empty(most), np.empty(most), np.empty(most))
 
 
 @compiled(bare=True)
 def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
-    """Copy sample ``k`` of ``one`` to place ``to`` of ``other``."""
+    """Write sample number ``k`` of ``one`` to place ``to`` of ``other``."""
     other.at[to] = one.at[k]
     other.harm[to] = one.harm[k]
     other.other[to] = one.other[k]
@@ -46,7 +46,10 @@ def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
 
 @compiled(bare=True)
 def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
-    """Merge the first ``n`` and ``m`` samples of two sorted lists into one sorted list."""
+    """Merge two lists sorted by deceleration into one: the first ``n`` of ``one``, the first ``m`` of ``other``.
+
+    The result is written to the first ``n + m`` places of ``into``.
+    """
     i, j = 0, 0
     for to in range(n + m):
         if j == m or (i < n and one.at[i] <= other.at[j]):
@@ -59,7 +62,7 @@ def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
 
 @compiled(bare=True)
 def put_in_order(samples: Samples, n: int) -> None:
-    """Sort the first ``n`` samples, few or nearly sorted, by deceleration."""
+    """Sort the first ``n`` samples in place by deceleration; fast if they are few or nearly sorted."""
     for k in range(1, n):
         at, harm, other, course = samples.at[k], samples.harm[k], samples.other[k], samples.course[k]
         to = k
@@ -71,9 +74,10 @@ def put_in_order(samples: Samples, n: int) -> None:
 
 @compiled(bare=True)
 def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
-    """Write the least harm expected between neighbours of ``n`` samples to ``bounds`` [n - 1].
+    """Write an estimate of the least harm between each two neighbouring samples to ``bounds`` [n - 1], m2/s2.
 
-    A slope that falls towards the interval is extended into it, ``STEEPER`` times as steep.
+    The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls towards an interval, from
+    the sample before it or from the sample after it, it is assumed to go on falling inside, ``STEEPER`` times as steep.
     """
     before, slope = 0.0, _slope(samples, 0)
     for k in range(n - 1):
@@ -87,14 +91,14 @@ def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
 
 @compiled(bare=True)
 def _slope(samples: Samples, k: int) -> float:
-    """Return the slope of the harm from sample ``k`` to the next one."""
+    """Return the slope of the harm between samples ``k`` and ``k + 1``, m2/s2 per m/s2."""
     width = samples.at[k + 1] - samples.at[k]
     return float((samples.harm[k + 1] - samples.harm[k]) / max(width, NARROWEST_MPS2))
 
 
 @compiled(bare=True)
 def least_harm(samples: Samples, n: int) -> float:
-    """Return the smallest harm among the first ``n`` samples."""
+    """Return the smallest harm among the first ``n`` samples, m2/s2."""
     least = math.inf
     for k in range(n):
         least = min(least, samples.harm[k])
@@ -103,9 +107,9 @@ def least_harm(samples: Samples, n: int) -> float:
 
 @compiled(bare=True)
 def find_smallest(values: Floats, n: int, places: Ints) -> None:
-    """Fill ``places`` with the indices of the smallest of ``n`` values, in increasing order of value.
+    """Write the indices of the smallest of the first ``n`` values to ``places``, in increasing order of value.
 
-    Equal values keep their order.
+    As many as ``places`` is long, which must be at most ``n``. Equal values keep their order.
     """
     found = 0
     for k in range(n):
@@ -121,10 +125,10 @@ def find_smallest(values: Floats, n: int, places: Ints) -> None:
 
 @compiled(bare=True)
 def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
-    """Fill ``places`` with the lowest local minima of ``n`` samples, in increasing order of harm.
+    """Write the indices of the lowest local minima of the first ``n`` samples to ``places``, lowest harm first.
 
-    ``depth`` [n] receives the harm at a local minimum, infinity elsewhere. If there are too few minima, the remaining
-    places are filled with the first other samples.
+    ``depth`` [n or more] is filled with the harm at a local minimum, infinity elsewhere. If there are fewer minima than
+    places, the remaining places get the first other samples.
     """
     for k in range(n):
         falls = k == 0 or samples.harm[k] < samples.harm[k - 1]
@@ -135,9 +139,10 @@ def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
 
 @compiled(bare=True)
 def choose(samples: Samples, n: int, room: Floats) -> float:
-    """Return the deceleration of least harm; ties by the other count, then the middle one of the remaining.
+    """Return the deceleration of least harm among the first ``n`` samples, m/s2.
 
-    ``room`` [n or more] is workspace. It is faster if the samples are sorted at the beginning.
+    Among equals, the least ``other`` harm decides, then the middle one of the rest is taken. ``room`` [n or more] is a
+    workspace, overwritten. Sorted samples make it faster.
     """
     least, rest = least_harm(samples, n) + TIE, math.inf
     for k in range(n):

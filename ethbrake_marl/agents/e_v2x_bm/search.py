@@ -31,11 +31,11 @@ from ethbrake_marl.physics.state import Floats, Ints
 
 GRID = 161  # first step: number of evenly spaced decelerations from 0 to the capacity
 
-CELLS = 24  # largest number of grid cells that are refined
+CELLS = 24  # largest number of grid cells (intervals between two neighbours of the grid) that are refined
 
 INSIDE = 16  # samples inside a refined cell
 
-BORDERS = 6  # largest number of borders between numbers of impacts that are located
+BORDERS = 6  # largest number of borders (decelerations at which the number of impacts changes) that are located
 
 MINIMA = 6  # number of local minima that are refined
 
@@ -60,21 +60,25 @@ _FIFTHS = np.arange(1, 5) / 5  # new samples between the two sides of a border
 
 
 class Room(NamedTuple):
-    """Workspace of a search, reused for every world of a batch."""
+    """Workspace of a search, reused for every world of a batch.
+
+    A *cell* is the interval between two neighbouring decelerations of the grid. A *border* is a deceleration at which
+    the number of impacts changes.
+    """
 
     one: Samples  # the grid; later all samples so far
     two: Samples  # all samples so far; at the end with borders and minima
-    new: Samples
-    few: Samples
-    values: Floats
-    cells: Ints  # [CELLS] indices into a list of samples
-    borders: Ints  # [BORDERS]
-    minima: Ints  # [MINIMA]
+    new: Samples  # the samples that a step adds
+    few: Samples  # a handful of samples around one place
+    values: Floats  # one number per sample: bounds or depths
+    cells: Ints  # [CELLS] index of the sample at the left end of each refined cell
+    borders: Ints  # [BORDERS] index of the sample before each border
+    minima: Ints  # [MINIMA] index of each local minimum among the samples
 
 
 @compiled
 def make_room() -> Room:
-    """Allocate the workspace for searches."""
+    """Return uninitialised workspace for searches."""
     return Room(
         make_samples(_MOST), make_samples(_MOST), make_samples(_MOST), make_samples(_FEW), np.empty(_MOST),
         np.empty(CELLS, np.int64), np.empty(BORDERS, np.int64), np.empty(MINIMA, np.int64),
@@ -83,9 +87,17 @@ def make_room() -> Room:
 
 @compiled(apart=True, bare=True)
 def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
-    """Find a line's best deceleration; write it, its harm and its harm under the other count to ``out`` [3].
+    """Find the best constant deceleration of a line's controlled vehicle.
 
-    ``breakpoints`` [CANDIDATES] are simulated in addition to the grid. Returns DONE or the failed check.
+    Args:
+        line: the world, from ``make_line``.
+        room: workspace, overwritten.
+        breakpoints: [CANDIDATES] decelerations that are simulated in addition to an even grid, m/s2.
+        capacity: braking capacity of the vehicle, m/s2.
+        out: [3] receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2).
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
     """
     status = share_start(line)
     if status == FLAG.DONE:
@@ -103,7 +115,11 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 
 @compiled(apart=True, bare=True)
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
-    """Simulate the grid into ``room.one``, and the grid with the breakpoints into ``room.two``."""
+    """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
+
+    The grid is left in ``room.one``, grid and breakpoints sorted in ``room.two``. ``capacity`` is the largest
+    deceleration, m/s2. Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     grid, new = room.one, room.few
     for k in range(GRID):
         grid.at[k] = capacity * _SHARES[k]
@@ -119,9 +135,11 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 
 @compiled(apart=True, bare=True)
 def look_inside(line: Line, room: Room) -> int:
-    """Refine the cells of the grid that contain a border, or may contain less harm than every sample so far.
+    """Step 2: simulate more decelerations in the intervals of the grid that may contain the least harm.
 
-    Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated.
+    These are intervals in which the number of impacts changes, or whose estimated harm is below every sample so far.
+    Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated. Returns a status:
+    ``FLAG.DONE``, or the code of the check of the physics that failed.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -149,7 +167,7 @@ def look_inside(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _put_in_order(places: Ints, n: int) -> None:
-    """Sort the first ``n`` places."""
+    """Sort the first ``n`` entries of ``places`` in place."""
     for k in range(1, n):
         place, to = places[k], k
         while to > 0 and places[to - 1] > place:
@@ -160,10 +178,11 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Locate borders between numbers of impacts that may hide less harm: two samples each, 1e-9 m/s2 apart.
+    """Step 3: locate the decelerations at which the number of impacts changes, if less harm may be found there.
 
-    Between borders the harm is smooth, so harm that falls towards a border is least there. Leaves all samples in
-    ``room.two``.
+    Between two such borders the harm is smooth, so harm that falls towards a border is least there. Each located border
+    ends up between two samples 1e-9 m/s2 apart. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or
+    the code of the check of the physics that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -188,7 +207,11 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Bring samples 0 and 5, on the two sides of a border, together: each round divides their distance by five."""
+    """Bring samples 0 and 5 of ``few``, on the two sides of a border, to a distance of 1e-9 m/s2.
+
+    A border is a deceleration at which the number of impacts changes. Each round divides the distance by five. Returns
+    a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
         for k in range(4):
@@ -208,7 +231,10 @@ def _cut(line: Line, few: Samples) -> int:
 
 @compiled(apart=True, bare=True)
 def narrow_minima(line: Line, room: Room) -> int:
-    """Refine the lowest local minima to brackets of 1e-9 m/s2, and add the refined samples."""
+    """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    """
     found, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(found, _NARROWED, room.values, minima)
     for m in range(MINIMA):
@@ -224,9 +250,18 @@ def narrow_minima(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
-    """Narrow the bracket ``low``, ``high`` around the least harm, which is sample ``found[to]``.
+    """Narrow an interval around a local minimum of the harm to 1e-9 m/s2; return a status.
 
     Both sides are divided in three in each round. If no new sample is lower, the middle stays.
+
+    Args:
+        line: the world.
+        few: workspace.
+        low: lower end of the interval, m/s2.
+        high: upper end, m/s2.
+        found: samples; number ``to`` is the minimum inside the interval, and is replaced by better ones.
+        to: index of this sample.
+
     """
     while high - low > NARROWEST_MPS2:
         middle = found.at[to]
@@ -253,9 +288,20 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Move a minimum at the very edge of a jump 1e-9 m/s2 to its safe side.
+    """Step 5: if ``best`` (m/s2) lies within 1e-9 m/s2 of a jump of the harm, move it to the lower side.
 
-    Otherwise the last bits, which differ if the same motion is advanced step by step, would decide the harm.
+    An engine advances the same motion step by step, which changes its last bits. Directly at a jump these bits would
+    decide on which side the harm is.
+
+    Args:
+        line: the world.
+        around: workspace.
+        best: best deceleration found, m/s2.
+        capacity: braking capacity of the vehicle, m/s2.
+        out: [3] receives the deceleration, its harm, and its harm under the other count.
+
+    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+
     """
     for k in range(5):
         around.at[k] = min(max(best + NARROWEST_MPS2 * (k - 2.0), 0.0), capacity)

@@ -35,8 +35,14 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
 
     Shapes: observation [n, L, F], action and reward [n, L, 1], state [n, S], done [n, 1].
 
-    ``horizon_is_end``: count an episode that the horizon cuts off as terminated, as in a training recipe. ``shield``:
-    the mode of a shield around the learners (``step`` if there are several learners); None means no shield.
+    Args:
+        scenario: the scenario, which has at least one learner.
+        n: number of worlds.
+        seed: seed of the worlds.
+        reward: reward of the learners, as in the other environments: a name such as ``harm``, or weights.
+        horizon_is_end: count an episode that the horizon cuts off as terminated, as in a training recipe.
+        shield: mode of a shield around the learners (``step`` if there are several learners); None: no shield.
+
     """
 
     def __init__(
@@ -91,7 +97,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Restart all worlds from the stream of worlds of ``seed``."""
+        """Start new episodes in all worlds, with worlds drawn from ``seed``; None changes nothing."""
         if seed is not None:
             self.engine.reset(seed=seed)
 
@@ -105,15 +111,22 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
 class LineTask(TaskClass):  # type: ignore[misc]
     """BenchMARL task for one scenario.
 
-    Keys of ``config``: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``), ``reward``,
-    ``horizon_is_end`` and, optionally, ``shield`` (the mode of a shield).
+    Args:
+        name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
+        config: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``) and the arguments ``reward``,
+            ``horizon_is_end`` and, optionally, ``shield`` of ``LineEnv``.
+
     """
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """Return a function that makes a ``LineEnv`` with ``num_envs`` worlds."""
+        """Return a function without arguments that makes a ``LineEnv`` with ``num_envs`` worlds.
+
+        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``continuous_actions`` and ``device``, which
+        are unused.
+        """
         config = self.config
         settings = config["reward"], config["horizon_is_end"], config.get("shield")
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
@@ -127,7 +140,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return False
 
     def max_steps(self, env: Any) -> int:
-        """Return the largest number of decisions in an episode."""
+        """Return the largest number of decisions in an episode; ``env`` is unused."""
         scenario: Scenario = self.config["scenario"]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
@@ -136,12 +149,12 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return False
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        """Return the one group, which holds the names of all learners."""
+        """Return ``{"learners": names}`` with the names of all learners, which form one group; ``env`` is unused."""
         scenario = self.config["scenario"]
         return {GROUP: [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
-        """Return the spec of the learners' observations."""
+        """Return the TorchRL spec of the learners' observations in ``env``, without the batch of worlds."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec["state"]
         return spec
@@ -151,13 +164,13 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return None
 
     def state_spec(self, env: Any) -> Any:
-        """Return the spec of the critic's state."""
+        """Return the TorchRL spec of the critic's state in ``env``, without the batch of worlds."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec[GROUP]
         return spec
 
     def action_spec(self, env: Any) -> Any:
-        """Return the spec of the learners' actions."""
+        """Return the TorchRL spec of the learners' actions in ``env``, without the batch of worlds."""
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: Any) -> Any:

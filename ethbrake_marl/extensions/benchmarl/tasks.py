@@ -22,11 +22,14 @@ class _Scenarios(Task):  # type: ignore[misc]  # untyped where the extra is miss
 
     @staticmethod
     def associated_class() -> type[LineTask]:
-        """Return the class that implements the tasks."""
+        """Return ``LineTask``, the class that implements all of these tasks."""
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return the task of this shipped scenario, or of the scenario file ``path``. The reward is minus the harm."""
+        """Return the task of this shipped scenario, or of the scenario file ``path`` unless it is None.
+
+        The reward is minus the harm, and there is no shield.
+        """
         return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
 
 

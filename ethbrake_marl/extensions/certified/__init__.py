@@ -1,7 +1,6 @@
 """Shields for incomplete knowledge: ``robust`` against an uncertainty, and ``believed`` on received messages only."""
 
 from ethbrake_marl.extensions.certified.uncertainty import (
-    UNCERTAINTY_EXAMPLE as UNCERTAINTY_EXAMPLE,
     Uncertainty as Uncertainty,
     parse_uncertainty as parse_uncertainty,
 )

@@ -27,7 +27,9 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Return the largest distance of an affine form's values from its centre."""
+    """Return the largest distance of a value of the affine form ``x`` [W] from its centre: the sum of the sizes of its
+    slopes, plus its remainder.
+    """
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
         whole += abs(x[k])
@@ -36,19 +38,22 @@ def radius(x: Floats) -> float:
 
 @compiled(apart=True)
 def low(x: Floats) -> float:
-    """Return the least value of an affine form."""
+    """Return the least value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
     return float(x[0] - radius(x))
 
 
 @compiled(apart=True)
 def high(x: Floats) -> float:
-    """Return the largest value of an affine form."""
+    """Return the largest value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
     return float(x[0] + radius(x))
 
 
 @compiled(apart=True)
 def add(out: Floats, share: float, x: Floats) -> None:
-    """Add ``share * x`` to ``out`` in place; exact except for rounding."""
+    """Add ``share * x`` to ``out`` in place; exact except for rounding.
+
+    ``x`` and ``out`` are affine forms [W] (centre, slopes, remainder), ``share`` is any number.
+    """
     for k in range(x.shape[0] - 1):
         out[k] += share * x[k]
     out[-1] += abs(share) * x[-1]
@@ -56,7 +61,7 @@ def add(out: Floats, share: float, x: Floats) -> None:
 
 @compiled(apart=True)
 def difference(x: Floats, y: Floats) -> Floats:
-    """Return ``x - y``."""
+    """Return the affine form ``x - y`` [W] (centre, slopes, remainder) of two affine forms."""
     out = x.copy()
     add(out, -1.0, y)
     return out
@@ -64,13 +69,15 @@ def difference(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def negative(x: Floats) -> Floats:
-    """Return ``-x``."""
+    """Return the affine form ``-x`` [W] (centre, slopes, remainder) of an affine form."""
     return linear(x, -1.0, 0.0, 0.0)
 
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """Return the affine form [width] of an arbitrary number in an interval."""
+    """Return the affine form [width] (centre, slopes, remainder) of an arbitrary number between ``least`` and ``most``.
+    ``width`` is the length W of the form.
+    """
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
     return out
@@ -78,7 +85,10 @@ def between(least: float, most: float, width: int) -> Floats:
 
 @compiled(apart=True)
 def product(x: Floats, y: Floats) -> Floats:
-    """Return ``x * y``. The second-order part goes to the remainder."""
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * y``, for two affine forms.
+
+    The second-order part of the product goes to the remainder.
+    """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = x[0] * y[k] + y[0] * x[k]
@@ -89,7 +99,10 @@ def product(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def square(x: Floats) -> Floats:
-    """Return ``x * x``. Its second-order part is never negative, so the remainder is half of that of ``product``."""
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * x``.
+
+    Its remainder is half of that of ``product(x, x)``, because a square is never negative.
+    """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = 2.0 * x[0] * x[k]
@@ -101,7 +114,9 @@ def square(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
-    """Return ``start + slope * x`` with an error of at most ``error`` on either side."""
+    """Return the affine form [W] (centre, slopes, remainder) of ``start + slope * x``, widened by ``error`` on either
+    side.
+    """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
         out[k] = slope * x[k]
@@ -112,10 +127,11 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 
 @compiled(apart=True)
 def square_root(x: Floats) -> Floats:
-    """Return the square root of ``x`` where ``x >= 0``. Needs ``high(x) >= 0``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
+    Needs ``high(x) >= 0``.
 
-    Where ``x`` is negative the result means nothing. On [a, b] the root lies between its chord, with slope
-    1 / (sqrt a + sqrt b), and the parallel tangent.
+    Where ``x`` is negative the result means nothing. On [a, b] the root lies between its chord, with slope 1 / (sqrt a
+    + sqrt b), and the parallel tangent.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -128,7 +144,7 @@ def square_root(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
-    """Return ``1 / x``. Needs ``low(x) > 0``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. Needs ``low(x) > 0``.
 
     On [a, b] it lies between its chord, with slope -1 / (a b), and the parallel tangent.
     """
@@ -141,7 +157,10 @@ def reciprocal(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def positive_part(x: Floats) -> Floats:
-    """Return ``max(x, 0)``. It lies between its chord and the parallel line through 0."""
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``max(x, 0)``.
+
+    The function lies between its chord and the parallel line through 0.
+    """
     least, most = low(x), high(x)
     if least >= 0.0:
         return x.copy()
@@ -154,9 +173,10 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return an affine form of the same number, which is known to lie in an interval.
+    """Return an affine form [W] (centre, slopes, remainder) of the same number as ``x``, if that number is known to lie
+    between ``least`` and ``most``.
 
-    The result is the interval where it is tighter than the form, else the form itself.
+    The result is the form of that interval if the interval is tighter than ``x``, else ``x`` itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
@@ -181,63 +201,81 @@ TOUCH_WIDTH = 9
 
 
 class Forces(NamedTuple):
-    """Accelerations of brakes and engines that build up: from the alert to the first piece, and then in each piece.
+    """Accelerations of brakes and engines that build up, as affine forms, for every vehicle and time interval.
 
-    Index 0 of the second axis is the time from the alert to the first piece, index j + 1 is piece j. Impacts do not
-    change these accelerations, so they are the same on every path.
+    Index 0 of the second axis is the time from the alert to the first piece (time interval of constant command); index
+    j + 1 is piece j. Impacts do not change these accelerations, so they hold for every sequence of impacts.
     """
 
-    mean: Floats  # [N, J + 1, W] mean acceleration of the piece
-    rise: Floats  # [N, J + 1, W] change of speed in the piece
-    gain: Floats  # [N, J + 1, W] distance beyond the starting speed times the length of the piece
-    swing: Floats  # [N, J + 1, 2] largest deviation from the mean where the acceleration falls, and where it rises
+    mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
+    rise: Floats  # [N, J + 1, W] change of speed in the piece, m/s
+    gain: Floats  # [N, J + 1, W] distance in the piece beyond initial speed times length, m
+    # [N, J + 1, 2] largest deviation from the mean (m/s2): column 0 where the acceleration falls, column 1 where it
+    # rises
+    swing: Floats
     build: Bools  # [N] True where the vehicle's command builds up; the other arrays are 0 for all other vehicles
 
 
 class Cell(NamedTuple):
-    """A box of worlds as affine forms, with the commands and the pieces of time."""
+    """A box of worlds as affine forms [W], with the commands and the pieces (time intervals of constant command).
 
-    speed: Floats  # [N, W] speeds at the start of the first piece
-    gap: Floats  # [P, W] gaps at the start of the first piece
-    brake: Floats  # [N, W] braking capacities
-    drive: Floats  # [W] driving capacity of the shielded vehicle
-    share: Floats  # [P, 2, W] share of the front and of the rear vehicle in an impact's change of relative speed; sum 1
+    An *affine form* stands for a number that depends on the world: a centre, a slope for each uncertain number of the
+    box, and a remainder.
+    """
+
+    speed: Floats  # [N, W] speeds at the start of the first piece, m/s
+    gap: Floats  # [P, W] gaps at the start of the first piece, m
+    brake: Floats  # [N, W] braking capacities, m/s2
+    drive: Floats  # [W] driving capacity of the shielded vehicle, m/s2
+    # [P, 2, W] fraction of an impact's change of relative speed that the front (0) and the rear (1) vehicle take; both
+    # sum to 1
+    share: Floats
     onset: Floats  # [N, W] time after the first decision at which a vehicle's command takes effect, s
-    constant: Floats  # [N] command of each other vehicle; NaN: full braking
-    limit: Floats  # [N] speed limits
+    constant: Floats  # [N] command of each other vehicle, m/s2; NaN: full braking
+    limit: Floats  # [N] speed limits, m/s
     vehicle: int  # index of the shielded vehicle
-    restitution: float
-    times: Floats  # [J + 1] limits of the pieces, s after the first decision
-    action: Floats  # [J] actions of the shielded vehicle
-    forces: Forces
+    restitution: float  # coefficient of restitution, 0 to 1
+    times: Floats  # [J + 1] start of each piece and end of the last one, s after the first decision
+    action: Floats  # [J] action of the shielded vehicle in each piece, -1 (full braking) to 1
+    forces: Forces  # accelerations of vehicles whose command builds up
     moving: bool  # True if the command of any vehicle builds up
 
 
 class Path(NamedTuple):
-    """A set of worlds of a cell with the same sequence of impacts and contacts so far."""
+    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, with their present state.
 
-    forms: Floats  # [N + P + 1, W] speeds, gaps, harm so far
-    # [P, TOUCH_WIDTH] state of pairs in contact; meaningless for other pairs. Both speeds of a pair in contact are the
-    # speed of its centre of mass, and the gaps to its neighbours are measured from there.
+    An affine form [W] is a number that depends on the world: a centre, a slope for each uncertain number of the box,
+    and a remainder.
+    """
+
+    forms: Floats  # [N + P + 1, W] affine forms of the speeds (m/s), the gaps (m) and the harm so far (m2/s2)
+    # [P, TOUCH_WIDTH] state of each pair in contact (columns ``OPENING`` to ``REACH``); meaningless for other pairs.
+    # Both speeds of a pair in contact are the speed of its centre of mass, and the gaps to its neighbours are measured
+    # from there.
     touch: Floats
-    marks: Ints  # [2 P + 1] of each pair 1 after an impact; of each pair FREE, TOUCHES or PARTS; index of the piece
+    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE (not in contact), TOUCHES (in
+    # contact) or PARTS (it opens in the present piece); last: index of the present piece
+    marks: Ints
 
 
 class Motion(NamedTuple):
-    """Motion of each vehicle alone through one piece of time, filled in by ``move_alone``."""
+    """Motion of each vehicle, as if alone, through one piece (time interval of constant command).
 
-    pull: Floats  # [N, W] acceleration by the command
-    onward: Floats  # [N, W] speed at the end under the command alone, as if the vehicle never stopped
-    reach: Floats  # [N, W] distance under the command alone, as if the vehicle never stopped
-    speed: Floats  # [N, W] speed at the end
-    way: Floats  # [N, W] distance
+    Each [W] is an affine form: centre, a slope for each uncertain number of the box, remainder.
+    """
+
+    pull: Floats  # [N, W] acceleration by the command, m/s2
+    onward: Floats  # [N, W] speed at the end under the command alone, m/s, as if the vehicle never stopped
+    reach: Floats  # [N, W] distance under the command alone, m, as if the vehicle never stopped
+    speed: Floats  # [N, W] speed at the end, m/s
+    way: Floats  # [N, W] distance travelled, m
     rest: Ints  # [N] MOVES, MAY_STOP or STANDS
-    vague: Floats  # [N] largest deviation of the acceleration from ``pull`` within the piece
+    vague: Floats  # [N] largest deviation of the acceleration from ``pull`` within the piece, m/s2
 
 
 @compiled(apart=True)
 def new_motion(N: int, width: int) -> Motion:
-    """Return a ``Motion`` of zeros for ``move_alone`` to fill in."""
+    """Return a ``Motion`` of zeros for ``N`` vehicles and affine forms of length ``width``."""
     return Motion(
         np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)),
         np.zeros(N, np.int64), np.zeros(N),
@@ -246,7 +284,16 @@ def new_motion(N: int, width: int) -> Motion:
 
 @compiled(apart=True)
 def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
-    """Move every vehicle through one piece of time under its command, as if it were alone on the road."""
+    """Compute the motion of every vehicle through one piece under its command, as if it were alone on the road.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        piece: index of the piece, 0 to J - 1.
+        motion: receives the result.
+
+    """
     for i in range(cell.speed.shape[0]):
         command(cell, i, piece, motion)
     for i in range(cell.speed.shape[0]):
@@ -293,10 +340,17 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Account for brakes that hold a vehicle at rest while they are released in this piece of time.
+    """Widen the motion of vehicle ``i``, in place, for brakes that hold it at rest while they are released in a piece.
 
     The vehicle may stand until its force is above 0. It is then faster, and further on, by at most the negative speed
     that it would have reached.
+
+    Args:
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        i: index of the vehicle.
+        length: length of the piece (time interval of constant command), s.
+        motion: motion of all vehicles in the piece; ``onward`` and ``reach`` of vehicle ``i`` are changed.
+
     """
     least, most = low(motion.pull[i]) - motion.vague[i], high(motion.pull[i]) + motion.vague[i]
     slowest = low(speed) + least * length
@@ -307,7 +361,9 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
 
 @compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
-    """Return the affine form of any number between ``x`` and ``x + shift``."""
+    """Return the affine form [W] (centre, slopes, remainder) of any number between the affine form ``x`` and ``x +
+    shift``.
+    """
     out = x.copy()
     add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
     return out
@@ -315,7 +371,19 @@ def between_shifted(x: Floats, shift: float) -> Floats:
 
 @compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set the acceleration ``pull`` of vehicle ``i`` by its command; it is 0 before the latency has elapsed."""
+    """Set ``motion.pull`` of vehicle ``i`` to the acceleration by its command in a piece; 0 before its latency has
+    elapsed.
+
+    ``motion.rest`` and ``motion.vague`` of the vehicle are set too.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        i: index of the vehicle.
+        piece: index of the piece, 0 to J - 1.
+        motion: receives the result.
+
+    """
     pull = motion.pull[i]
     pull[:] = 0.0
     motion.rest[i], motion.vague[i] = MOVES, 0.0
@@ -336,7 +404,18 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``onward`` and ``reach`` of a vehicle whose command may take effect within this piece of time or after it."""
+    """Set the motion of vehicle ``i`` in a piece if its command may take effect only within the piece or after it.
+
+    Changes ``onward``, ``reach``, ``pull`` and ``vague`` of the vehicle in ``motion``, in place.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        i: index of the vehicle.
+        piece: index of the piece, 0 to J - 1.
+        motion: motion of each vehicle in the present piece; changed in place.
+
+    """
     pull = motion.pull[i]
     if pull[0] == 0.0 and radius(pull) == 0.0:
         return
@@ -354,7 +433,11 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """Return how long a command has acted at a time, s."""
+    """Return for how long the command of vehicle ``i`` has acted at ``time``, as an affine form [W] (centre, slopes,
+    remainder), in s, at least 0.
+
+    ``time`` counts from the first decision, in s. ``cell`` is the box of worlds.
+    """
     since = negative(cell.onset[i])
     since[0] += time
     return positive_part(since)
@@ -362,7 +445,16 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set speed and distance of a braking vehicle that stops, or may stop, in this piece of time and then stands."""
+    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and then stands.
+
+    Args:
+        moving: True if the command of any vehicle builds up.
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        i: index of the vehicle.
+        length: length of the piece (time interval of constant command), s.
+        motion: receives ``rest``, ``speed`` and ``way`` of vehicle ``i``; its other fields are read.
+
+    """
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
     beyond = negative(motion.onward[i])
     least, most = max(low(beyond), 0.0), max(high(beyond), 0.0)
@@ -379,9 +471,12 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Return the mean deceleration over any part of the piece of time, as an affine form.
+    """Return the affine form [W] (centre, slopes, remainder) of the mean deceleration over any part of a piece, m/s2.
 
-    The acceleration differs from ``pull`` by at most ``vague``.
+    Args:
+        pull: affine form [W] of the mean acceleration in the piece (time interval of constant command), m/s2.
+        vague: largest deviation of the acceleration from ``pull``, m/s2.
+
     """
     out = negative(pull)
     out[-1] += vague

@@ -42,19 +42,28 @@ SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possi
 
 
 class Approach(NamedTuple):
-    """How a pair may meet within a piece of time."""
+    """The way a pair may come into contact within one piece (time interval of constant command), as affine forms
+    (centre, slopes, remainder).
+    """
 
-    closing: Floats  # [W] closing speed at the start of the piece
-    squared: Floats  # [W] squared closing speed at contact
+    closing: Floats  # [W] closing speed at the start of the piece, m/s
+    squared: Floats  # [W] squared closing speed at contact, m2/s2
     time: Floats  # [W] time of contact, s after the start of the piece
     front_stands: bool  # True if the front vehicle stands at contact
 
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return how much a neighbouring pair in contact may change the relative speed, or the gap, of a pair.
+    """Return by how much, at most, bounces of neighbouring pairs may change the relative speed (m/s) or the gap (m) of
+    pair ``p``.
 
-    The change is within the present piece of time.
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        of_gap: True for the gap, False for the relative speed.
+
     """
     P, most = cell.gap.shape[0], 0.0
     if p > 0 and path.marks[P + p - 1] != FREE:
@@ -66,9 +75,10 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest closing acceleration of a pair in the piece of time.
+    """Return the least and the largest closing acceleration of pair ``p`` in a piece, m/s2.
 
-    Either vehicle may stop in it.
+    Either vehicle may stop in it. ``motion`` is the motion of all vehicles in the piece (time interval of constant
+    command).
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]
@@ -81,7 +91,17 @@ def pressing(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> bool:
-    """Return whether the pair may come into contact in this piece of time while it closes."""
+    """Return whether pair ``p`` may come into contact in this piece while it closes.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
+    """
     N = cell.speed.shape[0]
     gap = path.forms[N + p]
     softest, hardest = pressing(motion, p)
@@ -103,12 +123,22 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
-    """Return how a pair meets, and whether it can meet in this piece of time at all.
+    """Return how a pair meets, and whether it can meet in this piece at all.
 
-    ``front_stands`` selects the worlds in which the front vehicle stands at contact, or those in which it moves. For
-    closing speed w, closing acceleration b and gap g, the squared closing speed at contact is ``w^2 + 2 b g``, and the
+    With closing speed w, closing acceleration b and gap g, the squared closing speed at contact is ``w^2 + 2 b g``. The
     time until contact is ``2 g / (w + w')`` with the closing speed w' at contact. If the front vehicle stops first, its
     stopping distance is added to g.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+        front_stands: True: consider the worlds in which the front vehicle stands at contact; False: those in which it
+            moves.
+
     """
     N, width = cell.speed.shape[0], cell.speed.shape[1]
     slack, vague = noise(cell, path, p, False), motion.vague[p] + motion.vague[p + 1]
@@ -158,7 +188,16 @@ def approach(
 
 @compiled(apart=True)
 def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
-    """Return the stopping distance of a braking vehicle that stops within the piece of time."""
+    """Return the stopping distance, an affine form [W] in m, of a braking vehicle that stops within a piece.
+
+    Args:
+        moving: True if the command of any vehicle builds up.
+        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        pull: affine form [W] of the mean acceleration, m/s2.
+        vague: largest deviation of the acceleration from ``pull``, m/s2.
+        length: length of the piece, s.
+
+    """
     if not high(pull) + vague < 0.0 or (vague > 0.0 and not moving):
         fastest = max(high(speed), 0.0) + max(high(pull) + vague, 0.0) * length
         return between(0.0, fastest * length, speed.shape[0])

@@ -26,10 +26,20 @@ from ethbrake_marl.physics.state import Floats
 def spring_apart(
     cell: Cell, path: Path, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Set speeds and distances of a pair that separates after its impact.
+    """Set speed and distance of both vehicles of a pair that separates after an impact, up to the end of the piece.
 
-    ``jump`` is the change of relative speed by the impact, ``left`` the time from the impact to the end of the piece of
-    time.
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        jump: affine form [W] (centre, slopes, remainder) of the change of the pair's relative speed by the impact, m/s.
+        left: affine form [W] of the time from the impact to the end of the piece, s.
+        after: receives the speeds at the end of the piece.
+        way: [N, W] receives the distances travelled in the piece, m.
+
     """
     front, rear = product(cell.share[p, 0], jump), product(cell.share[p, 1], jump)
     after.forms[p + 1] = difference(motion.onward[p + 1], rear)
@@ -52,7 +62,17 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Let a braking vehicle stand from the time at which its speed would become negative."""
+    """Let a braking vehicle stand from the time at which its speed would become negative.
+
+    Args:
+        cell: the box of worlds.
+        pull: affine form [W] (centre, slopes, remainder) of the mean acceleration after the impact, m/s2.
+        vague: largest deviation of the acceleration from ``pull``, m/s2.
+        left: longest time from the impact to the end of the piece (time interval of constant command), s.
+        speed: affine form [W] of the speed at the end of the piece, m/s; corrected in place.
+        way: affine form [W] of the distance travelled in the piece, m; corrected in place.
+
+    """
     least = low(speed)
     if cell.moving and low(pull) - vague < 0.0 < high(pull) + vague:  # it may drive off again, as in ``hold``
         least -= (high(pull) + vague) * left
@@ -69,7 +89,24 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 def stay(
     cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Set speeds and distances of a pair that stays in contact after its impact: those of its centre of mass."""
+    """Set speed and distance of both vehicles of a pair that stays in contact after an impact, up to the end of the
+    piece.
+
+    Both vehicles get the speed of the pair's centre of mass.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+        left: affine form [W] of the time from the impact to the end of the piece, s.
+        after: receives the speeds at the end of the piece and the state of the pair in contact.
+        way: [N, W] receives the distances travelled in the piece, m.
+
+    """
     N, touch = cell.speed.shape[0], after.touch[p]
     pull, vague = common(cell, p, motion.pull[p], motion.pull[p + 1]), max(motion.vague[p], motion.vague[p + 1])
     gap = path.forms[N + p]

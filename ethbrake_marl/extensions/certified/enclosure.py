@@ -54,17 +54,25 @@ class Known(NamedTuple):
     """Quantities that are the same in all worlds of a box."""
 
     vehicle: int  # index of the shielded vehicle
-    constant: Floats  # [N] command of each other vehicle; NaN: full braking
-    limit: Floats  # [N] speed limits
-    restitution: float
-    begin_s: float  # time at which the worlds begin
-    time_step_s: float
-    horizon_s: float
+    constant: Floats  # [N] command of each other vehicle, m/s2; NaN: full braking
+    limit: Floats  # [N] speed limits, m/s
+    restitution: float  # coefficient of restitution, 0 to 1
+    begin_s: float  # time at which the worlds begin, s
+    time_step_s: float  # time between two decisions, s
+    horizon_s: float  # time at which the episode ends, s
 
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """Return the affine form of number ``which`` of a box; ``free`` [K] lists the uncertain numbers."""
+    """Return the affine form [K + 2] (centre, slopes, remainder) of one number of a box.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        which: index of the number in the box.
+        free: [K] indices of the uncertain numbers, each with a slope of its own.
+
+    """
     out = np.zeros(free.shape[0] + 2)
     out[0] = 0.5 * (low_[which] + high_[which])
     half = 0.5 * (high_[which] - low_[which])
@@ -78,18 +86,19 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 
 @compiled(apart=True)
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
-    """Return the cell of a box, and the time from the alert to its first piece of time (s) as an affine form.
+    """Return the cell of a box, and the time from the alert to the first piece (s) as an affine form [W].
 
-    Time is counted from the first decision, because the first decision falls at a different time in each world where
-    the latency of the shielded vehicle is uncertain. The first piece starts before it by the shortest time that any
-    world needs from the alert to the first decision.
+    A *cell* is the box as affine forms, with the commands cut into pieces (time intervals of constant command). Time
+    counts from the first decision, because that decision falls at a different time in each world if the shielded
+    vehicle's latency is uncertain. The first piece starts before it by the shortest time that any world needs from the
+    alert to the first decision.
 
     Args:
-        low_: least values of the box, [Q].
-        high_: largest values, [Q].
-        free: the uncertain numbers, [K].
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
         known: the certain quantities.
-        plan: actions of the shielded vehicle, [L].
+        plan: [L] action of the shielded vehicle at each decision.
 
     """
     N, W = known.limit.shape[0], free.shape[0] + 2
@@ -139,9 +148,16 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
 @compiled(apart=True)
 def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
-    """Fill in the forces of vehicle ``i`` before the first piece of time (``late``) and in every piece.
+    """Compute ``cell.forces`` of vehicle ``i``, in place, for the time before the first piece and for every piece.
 
-    The force is 0 at the alert. ``rates`` [2, W] are the rates of building up and of releasing the brakes.
+    The force is 0 at the alert. A *piece* is a time interval of constant command.
+
+    Args:
+        cell: the box of worlds; only its ``forces`` change.
+        i: index of the vehicle.
+        late: affine form [W] (centre, slopes, remainder) of the time from the alert to the first piece, s.
+        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+
     """
     forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
     last, there = 0.0, True  # last action; whether the force has reached it
@@ -185,12 +201,24 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """Move ``force`` towards ``wanted`` for ``duration``, in place, and add its effect on speed and distance.
+    """Move a force towards its target during a time, and add its effect on speed and distance.
 
     For a difference d to ``wanted`` at the start and e at the end, and a time m during which the force changes, the
-    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by
-    ``m t (d + e) / 2 - m^2 (d + 2 e) / 6``. ``swing`` [2] receives the largest deviation from the mean. Returns whether
-    the force has reached ``wanted`` at the end in every world.
+    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by ``m t (d
+    + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
+
+    Args:
+        force: affine form [W] (centre, slopes, remainder) of the acceleration at the start, m/s2; becomes the
+            acceleration at the end.
+        wanted: affine form [W] of the acceleration that the command asks for, m/s2.
+        duration: affine form [W] of the time for which the command acts, s.
+        longest: upper limit of ``duration``, s.
+        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+        rise: affine form [W] of the change of speed, m/s; increased in place.
+        gain: affine form [W] of the distance beyond the starting speed times the time, m; increased in place.
+        swing: [2] receives the largest deviation of the acceleration from its mean where it falls (0) and rises (1),
+            m/s2.
+
     """
     start, there = difference(force, wanted), True
     force[:] = wanted
@@ -221,10 +249,11 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Move the worlds of a cell from the alert to the first piece of time, which takes ``late`` (s) in each world.
+    """Advance the speeds and gaps of a cell, in place, from the alert to the first piece (time interval of constant
+    command).
 
-    Returns False if the motion until then may be more than undisturbed motion: a contact, a stop, the speed limit, or a
-    command that takes effect on the way.
+    Returns False if something may disturb the motion until then: a contact, a stop, the speed limit, or a command that
+    takes effect on the way. ``late`` [W] is the time from the alert to the first piece, s.
     """
     if high(late) <= 1e-12:
         return True
@@ -256,9 +285,11 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Return the acceleration of another vehicle from the alert until ``late``, and whether it is certain.
+    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether it is certain.
 
-    It is not certain where the command may take effect within that time.
+    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. It is
+    not certain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W]
+    is the time from the alert to the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -276,7 +307,17 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Return the limits of the pieces of time (s after the first decision), and the action in each of them."""
+    """Return the J pieces (time intervals of constant command): their limits [J + 1], and the action in each, [J].
+
+    The limits are in s after the first decision.
+
+    Args:
+        known: the certain quantities.
+        onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
+        earliest: earliest possible time of the first decision, s.
+        plan: [L] action of the shielded vehicle at each decision.
+
+    """
     N = onset.shape[0]
     before = earliest - known.begin_s
     first = math.ceil(before / LONGEST_PIECE_S) if before > 0.0 else 0
@@ -309,10 +350,21 @@ def bound_of(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
     most: float,
 ) -> float:  # fmt: skip
-    """Return an upper bound on the harm of a plan over one box.
+    """Return an upper bound on the harm of a plan over one box, m2/s2.
 
-    If the result is above ``most`` it is no bound, only larger than ``most``. ``out`` receives the affine form that
-    reaches it.
+    A result above ``most`` is no bound; it only says that the harm may exceed ``most``.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+        stack: memory for the sets of worlds that are followed separately.
+        motion: memory for the motion of each vehicle.
+        out: [K + 2] receives the affine form of the harm that reaches the bound.
+        most: harm above which the search stops, m2/s2.
+
     """
     cell, late = cell_of(low_, high_, free, known, plan)
     # rough bound for all worlds, whose first piece begins ``late`` after the alert
@@ -336,11 +388,21 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Return an upper bound on the harm of a plan [L] over a box [Q], and the number of cells that were examined.
+    """Return an upper bound on the harm of a plan over a box (m2/s2), and the number of parts of the box that were
+    examined.
 
-    The box is halved where the bound is largest until the bound is at most ``enough`` or ``cells`` were examined. With
-    ``only_enough`` the search in a part stops once its harm is above ``enough``; a result above ``enough`` is then no
-    bound.
+    The part with the largest bound is halved until the bound is at most ``enough`` or ``cells`` parts were examined.
+
+    Args:
+        low_: [Q] least values of the box.
+        high_: [Q] largest values of the box.
+        free: [K] indices of the uncertain numbers.
+        known: the certain quantities.
+        plan: [L] action of the shielded vehicle at each decision.
+        enough: bound that needs no refinement, m2/s2.
+        cells: largest number of parts to examine.
+        only_enough: True: stop in a part once its harm is above ``enough``; a result above ``enough`` is then no bound.
+
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
     stack, motion = new_stack(N, K + 2), new_motion(N, K + 2)
@@ -382,24 +444,33 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """The boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``."""
+    """The boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. ``Q = 8 N - 1`` numbers."""
 
-    low: Floats  # [n, Q] capacities, latency, mass, rates and speed of each vehicle, then the gaps
-    high: Floats  # [n, Q]
+    # [n, Q] least values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
+    # vehicle, then the gaps
+    low: Floats
+    high: Floats  # [n, Q] largest values, in the same order
     limit: Floats  # [n, N] speed limits, m/s
-    restitution: Floats  # [n]
-    begin_s: Floats  # [n] time at which the worlds begin
+    restitution: Floats  # [n] coefficient of restitution, 0 to 1
+    begin_s: Floats  # [n] time at which the worlds begin, s
     constant: Floats  # [n, N] command of each other vehicle, m/s2; NaN: full braking
     vehicle: int  # index of the shielded vehicle
-    time_step_s: float
-    horizon_s: float
+    time_step_s: float  # time between two decisions, s
+    horizon_s: float  # time at which the episode ends, s
 
     @staticmethod
     def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
         """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
-        These are total harm, more than three vehicles, an obstacle ahead, and other vehicles that do anything else than
-        brake fully, coast, or hold one deceleration.
+        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle whose script is not
+        to brake fully, to coast, or to hold one deceleration.
+
+        Args:
+            robust: ``corners`` (never raises) or ``interior``.
+            scenario: the scenario of the worlds.
+            harm_count: ``first`` or ``total``.
+            others: script of each other vehicle, by its index.
+
         """
         if robust != INTERIOR:
             return
@@ -422,11 +493,19 @@ class Boxes(NamedTuple):
     def of(
         cls, possible: Worlds, problem: ProfileProblem, n: int, scenario: Scenario, others: Mapping[int, Script]
     ) -> Boxes:
-        """Return the boxes of ``n`` worlds at the alert; ``possible`` [n * M] holds the M members of each world.
+        """Return the boxes of ``n`` worlds at the alert.
 
         Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a braking profile in
         pieces, brakes that began to build up before the alert, or another vehicle whose command differs within the box.
         ``check_possible`` covers what does not depend on the worlds.
+
+        Args:
+            possible: [n * M] worlds, M consecutive ones for each box: the reported world and the corners of its box.
+            problem: the same worlds as columns of numbers, with the commands of the other vehicles.
+            n: number of boxes.
+            scenario: the scenario of the worlds.
+            others: script of each other vehicle, by its index.
+
         """
         v, N, vehicle, members = possible.vehicles, possible.N, int(problem.vehicles[0]), possible.n // n
         if possible.obstacle_ahead.any():
@@ -460,14 +539,18 @@ class Boxes(NamedTuple):
         )  # fmt: skip
 
     def take(self, rows: Ints) -> Boxes:
-        """Return the boxes of some worlds."""
+        """Return the boxes of the worlds with the indices ``rows`` [m]."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[:6]}
         return self._replace(**arrays)
 
     def placed(self, old: Boxes | None, rows: Ints) -> Boxes:
-        """Return the boxes of a batch after new episodes begin in ``rows`` with these boxes.
+        """Return the boxes of all running episodes after new episodes begin in ``rows``.
 
-        If ``rows`` covers the whole batch these boxes replace ``old``; else they replace only its ``rows``.
+        Args:
+            old: boxes of all episodes before; None at the first start.
+            rows: [m] indices of the new episodes; this object holds their boxes. If they cover all episodes, ``old`` is
+                unused.
+
         """
         if old is None or len(rows) >= len(old.low):
             return self.take(np.argsort(rows))
@@ -477,20 +560,30 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def at_alert(self, plans: Floats, harm: Floats) -> Floats:
-        """Return an upper bound on the harm of each plan [n, L] at the alert, [n] m2/s2.
+        """Return an upper bound on the harm of each world's plan at the alert, [n] m2/s2.
 
-        ``harm`` [n] is the largest harm of the plan in a corner of the box.
+        Args:
+            plans: [n, L] action of the shielded vehicle at each decision, for each world.
+            harm: [n] largest harm of the plan in a corner of the box, m2/s2; a bound close to it is not refined.
+
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
 
     def bound(
         self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
     ) -> Floats:
-        """Return an upper bound on the harm of each plan [m, L] over all worlds of its box, [m] m2/s2.
+        """Return an upper bound on the harm of each plan over all worlds of its box, [m] m2/s2.
 
-        The harm counts from the alert on. ``rows`` [m] are the boxes. A bound of at most ``enough`` [m] is not refined,
-        and at most ``cells`` parts of a box are examined. With ``only_enough`` a result above ``enough`` is no bound:
-        it only says that no bound of at most ``enough`` was established.
+        The harm counts from the alert on.
+
+        Args:
+            rows: [m] indices of the boxes.
+            plans: [m, L] action of the shielded vehicle at each decision, for each box.
+            enough: [m] bound that needs no refinement, m2/s2.
+            cells: largest number of parts of a box to examine.
+            only_enough: True: a result above ``enough`` is no bound; it only says that no bound of at most ``enough``
+                was established.
+
         """
         bounds = np.empty(len(rows))
         for j, k in enumerate(rows.tolist()):
@@ -512,7 +605,10 @@ def _refusal(what: str) -> InvalidInput:
 
 
 def checked_robust(robust: object, where: str) -> str:
-    """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise."""
+    """Return ``robust`` if it is ``corners`` or ``interior``; raise ``UnknownName`` otherwise.
+
+    ``where`` names the setting at the start of the error message.
+    """
     if robust not in CERTAINTIES:
         raise unknown_name(f"{where}: robust", robust, CERTAINTIES)
     return str(robust)

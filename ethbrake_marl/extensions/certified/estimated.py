@@ -46,7 +46,10 @@ OF_OTHERS = (
 
 
 class Told(NamedTuple):
-    """What one vehicle has received about the others by now. Columns of unknown vehicles are meaningless."""
+    """Information that one vehicle has received about the others by now. Columns of unknown vehicles are meaningless.
+
+    A vehicle is *known* if its message has arrived or it is in sight.
+    """
 
     known: Bools  # [n, N] True where place and speed are known; always True for the vehicle itself
     pieces: Bools  # [n, N, len(PIECES)] True for each known piece; nothing of a vehicle without news
@@ -60,7 +63,7 @@ class Told(NamedTuple):
 
     @property
     def reacts(self) -> Bools:
-        """Vehicles that are known to have a command in force, [n, N]."""
+        """True for vehicles that are known to have a command in force, [n, N]."""
         reacts: Bools = self.known & self.pieces[..., ACCELERATION] & (self.command_mps2 != 0.0)
         return reacts
 
@@ -71,7 +74,9 @@ class Told(NamedTuple):
 
     @classmethod
     def to(cls, worlds: Worlds, vehicle: int) -> Told:
-        """Return what ``vehicle`` has received."""
+        """Return the information that the vehicle with index ``vehicle`` has received in ``worlds`` by their present
+        time.
+        """
         n, N = worlds.speeds_mps.shape
         known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
         known[:, vehicle] = True
@@ -96,7 +101,11 @@ class Told(NamedTuple):
         return told
 
     def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
-        """Replace the present state of the others by their newest message, except where they are in sight."""
+        """Replace, in place, the present state of other vehicles by their newest message, except where they are in
+        sight.
+
+        ``periodic`` [n] is True for worlds in which vehicles send messages periodically.
+        """
         newest = Messages.of(worlds).newest_told(vehicle)
         other = periodic[:, np.newaxis] & (np.arange(worlds.N) != vehicle)
         stale = other & (newest.at_s < worlds.time_s[:, np.newaxis])
@@ -111,7 +120,10 @@ class Told(NamedTuple):
 
 
 def _places_of(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the positions of all vehicles ahead of ``vehicle``, [n, N] m. Direct neighbours are one exact gap away."""
+    """Return the position of each vehicle ahead of ``vehicle``, [n, N] m; negative behind it.
+
+    The positions come from the gaps of ``worlds``. Direct neighbours are exactly one gap away.
+    """
     ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
     place: Floats = ahead - ahead[:, [vehicle]]
     for j, step in ((vehicle - 1, -1), (vehicle + 1, 1)):
@@ -122,25 +134,27 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Ranges that a scenario declares for vehicles that ``vehicle`` does not know.
+    """Ranges that a scenario declares for the vehicles that ``vehicle`` does not know.
 
-    Median, least and largest value are [N] each. Keys: ``place`` is the position ahead of the vehicle's own position at
-    the alert (m), ``latency_s`` the own part of a latency, and ``news_s`` the time at which a vehicle has received the
-    alert, before which it does not react (0 without a channel).
+    Keys of the mappings: ``place`` (position ahead of the vehicle's own position at the alert, m), ``speeds_mps``,
+    ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (a vehicle's own part of the latency) and ``news_s`` (time at
+    which a vehicle has received the alert, before which it does not react; 0 without a channel). Each value is [N].
     """
 
-    vehicle: int
-    others: Mapping[int, Script]  # known scripts of the others; a vehicle without a script brakes fully
-    middle: Mapping[str, Floats]  # median of each quantity
-    low: Mapping[str, Floats]  # least value of each quantity
-    high: Mapping[str, Floats]  # largest value of each quantity
-    obstacle_gap_m: float  # infinite without an obstacle
+    vehicle: int  # index of the estimating vehicle
+    others: Mapping[int, Script]  # scripts of the other vehicles, by index; a vehicle without a script brakes fully
+    middle: Mapping[str, Floats]  # median of each quantity, [N] each
+    low: Mapping[str, Floats]  # least value of each quantity, [N] each
+    high: Mapping[str, Floats]  # largest value of each quantity, [N] each
+    obstacle_gap_m: float  # gap of vehicle_1 to the obstacle, m; infinite without an obstacle
 
     @classmethod
     def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Return the ranges of a scenario for ``vehicle``. ``others`` None means the scenario's scripts.
+        """Return the ranges that ``scenario`` declares for all vehicles, as the vehicle with index ``vehicle`` sees
+        them.
 
-        Raises ``InvalidInput`` for a mixture, because an unknown vehicle could belong to any of its scenarios.
+        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts. Raises ``InvalidInput``
+        for a mixture of scenarios, because an unknown vehicle could belong to any of them.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
@@ -172,9 +186,14 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return a quantity of every vehicle, [N]: its median, or the share of its range that ``share`` names.
+        """Return a value of one quantity for every vehicle, [N]: its median, unless ``share`` selects a point of its
+        range.
 
-        A share of 0 is the least value, a share of 1 the largest.
+        Args:
+            share: maps (quantity, vehicle index) to a position in the range: 0 is the least value, 1 the largest. None:
+                all medians.
+            key: the quantity, a key of ``middle``.
+
         """
         value = self.middle[key].copy()
         for (name, j), part in () if share is None else share.items():
@@ -184,7 +203,7 @@ class Ranges:
 
     @property
     def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """Uncertain numbers, as pairs of quantity and vehicle: all numbers that the scenario does not fix."""
+        """Pairs (quantity, vehicle index) of all numbers of other vehicles that the scenario leaves open."""
         others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
 
@@ -195,14 +214,15 @@ class Ranges:
         share: Mapping[tuple[str, int], float] | None = None,
         foretold: tuple[Worlds, Bools] | None = None,
     ) -> Worlds:
-        """Return the estimated worlds of the vehicle at the present time.
+        """Return the estimated worlds of the vehicle at the present time, [n].
 
         Args:
             worlds: the true worlds; only what the vehicle received is read.
             way_m: [n] the vehicle's own distance since the alert, m.
-            share: position of each uncertain number in its range, 0 to 1; None: the median.
-            foretold: the worlds as they were predicted for now (impacts included), and the vehicles [n, N] for which
-                this prediction is better than their last message.
+            share: maps (quantity, vehicle index) to a position in its range, 0 to 1; None: the median of every
+                quantity.
+            foretold: the worlds as they were predicted for now (impacts included), and a mask [n, N] of the vehicles
+                for which this prediction is better than their last message. None: no prediction.
 
         """
         worlds.refuse_build_up(":believed")
@@ -261,16 +281,27 @@ class Ranges:
 
 
 def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
-    """Return the positions of all vehicles ahead of ``vehicle``, [N].
+    """Return the position of each vehicle ahead of ``vehicle``, [N] m; negative behind it.
 
-    ``ahead_m`` and ``behind_m`` [P] give the gaps in front of the vehicle and behind it.
+    Args:
+        ahead_m: [P] gaps; used for the pairs in front of the vehicle.
+        behind_m: [P] gaps; used for the pairs behind the vehicle.
+        vehicle: index of the vehicle at position 0.
+
     """
     front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
     return np.concatenate([front, [0.0], -np.cumsum(behind_m[vehicle:])])
 
 
 def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
-    """Correct positions [n, N] so that the vehicles stand in line order. Known vehicles keep their positions."""
+    """Correct positions so that the vehicles stand in line order; return the corrected array, [n, N] m.
+
+    Args:
+        place: [n, N] position of each vehicle ahead of ``vehicle``, m; changed in place.
+        known: [n, N] True for vehicles whose position is certain; they keep it.
+        vehicle: index of the vehicle at position 0.
+
+    """
     N = place.shape[1]
     for way in (-1, 1):  # first the vehicles ahead, then those behind
         side = np.arange(vehicle + way, -1 if way < 0 else N, way)

@@ -41,7 +41,10 @@ SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """Restore the harm so far after a new beginning in ``rows``, and keep the old plan's rest if it harms no more."""
+    """After a restart of the shield in ``rows``, restore the harm so far, and keep the old plan where it is no worse.
+
+    ``shield`` was just restarted and is changed; ``before`` is its copy from before the restart.
+    """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
     at, plan, width = running.rows_of(rows), backup.plan[rows].copy(), held.plan.shape[1]
@@ -59,19 +62,22 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
 
 
 class BelievedShield:
-    """``StepShield`` that certifies the proposals of one vehicle in its estimated world.
+    """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
-    It begins at the first decision, and again whenever another vehicle becomes known, is known to react, or moves
+    It starts at the first decision, and again whenever another vehicle becomes known, is known to react, or moves
     otherwise than predicted. The rest of the previous plan is then a candidate for the new plan. After the first
     decision ``predicted_harm`` [n] is the first bound; it is infinite where the vehicle had an impact before, because
     its harm is unknown.
 
-    ``robust`` selects the worlds to certify: None for the median of everything unknown; ``corners`` also for all
-    corners of the ranges; ``interior`` for all worlds of the box around the corners, once, at the first decision.
-    ``others`` are the scripts of the other vehicles by index; None means the scenario's scripts.
+    Args:
+        scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
+        vehicle: index of the shielded vehicle.
+        harm_count: ``first`` or ``total`` impacts.
+        robust: worlds to certify. None: the median of everything unknown. ``corners``: also all corners of the ranges;
+            more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the corners,
+            once, at the first decision.
+        others: scripts of the other vehicles by index; None: the scenario's scripts.
 
-    Raises ``InvalidInput`` for a mixture, for a scenario with more than ``MOST_CORNERS`` corners, and for what interior
-    mode cannot certify.
     """
 
     def __init__(
@@ -113,7 +119,7 @@ class BelievedShield:
 
     @property
     def members(self) -> int:
-        """Number of certified worlds for each true world: the median, and all corners."""
+        """Number of worlds that are certified for each true world: 1 for the median, plus 1 for each corner."""
         return 1 + len(self._corners())
 
     def __copy__(self) -> BelievedShield:
@@ -126,7 +132,7 @@ class BelievedShield:
         return apart
 
     def take(self, rows: Ints) -> BelievedShield:
-        """Return an independent shield for some rows."""
+        """Return an independent shield for the episodes with the indices ``rows``."""
         apart = copy.copy(self)
         if self.shield.memory.running is not None:
             apart.shield = self.shield.take(rows)
@@ -136,7 +142,10 @@ class BelievedShield:
         return apart
 
     def begin(self, worlds: Worlds, rows: Ints) -> None:
-        """Start episodes in ``rows``. The shield itself begins at the first decision, on what was received by then."""
+        """Start episodes in the batch at indices ``rows``; ``worlds`` [m] are their worlds at the alert.
+
+        The certification itself starts at the first decision, with the information received by then.
+        """
         if len(rows) >= len(self._wanted):
             self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
         n, N, fresh = len(rows), worlds.N, self._wanted.size == 0
@@ -151,17 +160,17 @@ class BelievedShield:
     def decide(
         self, worlds: Worlds, proposed: Floats, proposer: Proposer | None = None, *, only: Bools | None = None
     ) -> Floats:
-        """Return the certified actions, [n]; 0 before the vehicle's latency has elapsed.
+        """Return the certified actions, [n], from -1 (full braking) to 1; 0 before the vehicle's latency has elapsed.
 
-        A repeated call at the same time returns the same actions.
+        A repeated call at the same time returns the same actions. Raises ``InvalidInput`` for an episode without
+        ``begin``.
 
         Args:
             worlds: the true worlds; only what the vehicle received is read.
-            proposed: proposed actions, [n].
-            proposer: policy to roll out in the estimated worlds where nothing else certifies its proposal.
-            only: worlds that decide now; None: all.
-
-        Raises ``InvalidInput`` if an episode was not begun.
+            proposed: [n] proposed actions.
+            proposer: the policy and its memory. Where nothing else certifies a proposal, its rollout in the estimated
+                worlds is tried. None: no rollout.
+            only: [n] True for worlds that decide now; None: all.
 
         """
         shield, vehicle = self.shield, self.vehicle
@@ -184,7 +193,15 @@ class BelievedShield:
         return self._wanted.copy()
 
     def _begin_anew(self, worlds: Worlds, believed: Worlds, way_m: Floats, due: Bools) -> None:
-        """Begin the shield where it has not begun, or where received information was not predicted."""
+        """Restart the inner shield in worlds where it has not started, or where a message contradicts the prediction.
+
+        Args:
+            worlds: the true worlds.
+            believed: the estimated worlds.
+            way_m: [n] the vehicle's distance since the alert, m.
+            due: [n] True for worlds that decide now.
+
+        """
         shield, vehicle = self.shield, self.vehicle
         told = Told.to(worlds, vehicle)
         heard = np.concatenate([told.heard, told.reacts], axis=1)
@@ -214,7 +231,18 @@ class BelievedShield:
     def _begin_shield(
         self, worlds: Worlds, believed: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Begin the inner shield in ``rows``, with the median of everything unknown and, if robust, its corners."""
+        """Start the inner shield in ``rows``, with the median of everything unknown and, if robust, the corners of its
+        ranges.
+
+        Args:
+            worlds: the true worlds of these rows.
+            believed: their estimated worlds.
+            way_m: the vehicle's distance since the alert in each of them, m.
+            rows: indices of the episodes in the batch.
+            keeps: mask of vehicles, [rows, N], whose predicted state is better than their received state.
+            before: the inner shield before the restart; None at the first start.
+
+        """
         parts = []
         for m, share in enumerate([None, *self._corners()]):
             foretold = None
@@ -228,9 +256,10 @@ class BelievedShield:
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
     def _keeps(self, told: Told, time_s: Floats) -> Bools:
-        """Return the vehicles whose predicted state is better than their received state, [n, N].
+        """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
 
         These are unknown vehicles, and known vehicles without a message since their last predicted impact or contact.
+        ``told`` is the received information, ``time_s`` [n] the present time.
         """
         running = self.shield.memory.running
         if running is None:
@@ -247,7 +276,9 @@ class BelievedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the time for vehicles that had an impact in any member since the last decision."""
+        """Store the present time of ``worlds`` for vehicles that had an impact in any certified world since the last
+        decision.
+        """
         running = self.shield.memory.running
         assert running is not None
         pairs = running.problem.mass.shape[1] - 1
@@ -260,7 +291,13 @@ class BelievedShield:
         self._totals = totals.copy()
 
     def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
-        """Return the worlds [n] in which a vehicle of ``heard`` [n, N] is outside the predicted range."""
+        """Return a mask [n] of the worlds in which a vehicle is outside the range of its predicted states.
+
+        Args:
+            believed: the estimated worlds now, [n].
+            heard: [n, N] True for vehicles whose received state is compared.
+
+        """
         running = self.shield.memory.running
         assert running is not None
         seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)

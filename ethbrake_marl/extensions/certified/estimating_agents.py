@@ -19,19 +19,19 @@ from ethbrake_marl.shield.paper_hybrid import HybridAgent
 
 
 class Odometer(NamedTuple):
-    """Distance of a vehicle since the alert, from its own speed and command at its decisions."""
+    """Distance of a vehicle since the alert, computed from its own speed and command at its decisions."""
 
-    way_m: Floats  # [n] distance since the alert
-    time_s: Floats  # [n] time of the last decision
-    speed_mps: Floats  # [n] speed at the last decision
+    way_m: Floats  # [n] distance since the alert, m
+    time_s: Floats  # [n] time of the last decision, s
+    speed_mps: Floats  # [n] speed at the last decision, m/s
 
     @classmethod
     def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer at the start of episodes."""
+        """Return the odometer of vehicle ``vehicle`` (index) at the start of episodes in the worlds ``alert``, [n]."""
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer now.
+        """Return the odometer after the time since the last decision; ``worlds`` [n] are the present ones.
 
         The distance is exact under a constant command, also if the vehicle stops. In other cases the mean speed is
         used.
@@ -44,13 +44,17 @@ class Odometer(NamedTuple):
 
 
 class Believing(AgentAround):
-    """Agent that lets ``policy``, any agent that reads the line, drive in the estimated world of its vehicle.
+    """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
 
-    The policy begins when it is first asked, from what was received by then. It begins again in worlds where something
-    unpredicted is received: another vehicle becomes known, or a message over a channel says that it reacts. In the
-    estimate, the others follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected when
-    it was first asked. With ``shows`` the policy sees the estimated world at every decision, not only where it begins.
-    Raises ``InvalidInput`` for a mixture scenario.
+    The policy starts when it is first asked, on the information received by then. It starts again in worlds where
+    another vehicle becomes known, or where a message over a channel says that it reacts. In the estimate, the others
+    follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected when it was first asked.
+
+    Args:
+        policy: any agent that reads the state of the line.
+        scenario: declares the ranges of everything unknown; a mixture raises ``InvalidInput``.
+        shows: True: the policy sees the estimated world at every decision. False: only where it starts.
+
     """
 
     def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
@@ -61,11 +65,19 @@ class Believing(AgentAround):
 
     @property
     def knows(self) -> Knowledge:
-        """What the agent knows: received information, completed by the scenario's model of the line."""
+        """Information that the agent uses: received messages, completed by the scenario's model of the line."""
         return Knowledge((Source.BELIEFS,))
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the memory at the start of episodes. The policy has not begun, because nothing was received yet."""
+        """Return the memory at the start of episodes, as a mapping. The policy has not started, because nothing was
+        received yet.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the agent's vehicle.
+            scripts: scripts of the other vehicles; not used.
+
+        """
         return {
             "way": Odometer.begun(alert, vehicle),
             "heard": np.full((alert.n, 2 * alert.N), np.nan),  # news on which the policy began; NaN: not begun
@@ -74,7 +86,14 @@ class Believing(AgentAround):
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the policy's command, [n] m/s2, and the new memory."""
+        """Return the policy's command, [n] m/s2, and the new memory.
+
+        Args:
+            worlds: the true worlds; only what the vehicle received is read.
+            memory: memory from ``begin`` or the previous ``act``.
+            vehicle: index of the agent's vehicle.
+
+        """
         way, heard = Odometer(*memory["way"]).look(worlds, vehicle), self._heard(worlds, vehicle)
         policy, predicted = memory["policy"], memory["predicted_harm"]
         rows = np.flatnonzero((heard != memory["heard"]).any(axis=1))
@@ -93,7 +112,11 @@ class Believing(AgentAround):
         return believed
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return the news for which the policy begins again, [n, 2 N]: who is known, and who reacts."""
+        """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether a message says that this
+        vehicle reacts already.
+
+        Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
+        """
         told = Told.to(worlds, vehicle)
         # a latency that was told predicts the reaction, unless a channel may extend it
         unforetold = told.reacts & (self.scenario.v2x.delays | ~told.pieces[..., LATENCY])
@@ -106,17 +129,23 @@ class Believing(AgentAround):
 
 
 class BelievingHybrid(Believing):
-    """The paper's Algorithm 1 in the estimated world: it compares the policy with E-V2X-BM at the first decision."""
+    """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM, the
+    best constant deceleration.
+
+    The one that predicts less harm controls the vehicle for the whole episode.
+    """
 
     policy: HybridAgent
 
     @property
     def knows(self) -> Knowledge:
-        """What the agent knows: the policy's knowledge, and the estimated world for the comparison."""
+        """Information that the agent uses: the policy's information, and the estimated world for the comparison."""
         return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
 
     def _shown_at_first(self, believed: Worlds) -> Worlds:
-        """Return the same line with its clock at 0 and without impacts, as the rollouts of the comparison need it."""
+        """Return the estimated worlds with their clock at 0 and without past impacts, because the rollouts that compare
+        the policy with E-V2X-BM start there.
+        """
         v, n = believed.vehicles, believed.n
         latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
         vehicles = Vehicles.at_once(

@@ -16,7 +16,15 @@ from ethbrake_marl.shield.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust`` or ``+robust:interior`` against the uncertainty of the settings."""
+    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``: it certifies actions in the corners or the
+    whole interior of an uncertainty (an interval around each quantity).
+
+    Args:
+        policy: the agent to shield.
+        argument: ``corners``, ``interior``, or None for ``corners``.
+        settings: scenario, uncertainty, harm to bound, and the agent's spec for error messages.
+
+    """
     where = f"agent {settings.spec!r}"
     robust, uncertainty = checked_robust(argument or CORNERS, where), settings.uncertainty
     return ShieldedDriver(
@@ -26,7 +34,15 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make ``+robust:believed`` or ``+robust:interior:believed``: robust against everything that was not received."""
+    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: the same shield for the ranges of what the
+    vehicle did not receive.
+
+    Args:
+        policy: the agent to shield.
+        argument: ``corners``, ``interior``, or None for ``corners``.
+        settings: scenario, harm to bound, and the agent's spec for error messages.
+
+    """
     where = f"agent {settings.spec!r}"
     return ShieldedDriver(
         policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count, where=where,
@@ -35,7 +51,16 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make ``+step:believed``: every action is certified in the estimated world."""
+    """Make the shield ``+step:believed``: every action of ``policy`` is certified in the estimated world.
+
+    Raises ``InvalidInput`` for a team or several learners.
+
+    Args:
+        policy: the agent to shield.
+        argument: not used.
+        settings: scenario, harm to bound, and the agent's spec for error messages.
+
+    """
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
         raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
@@ -43,7 +68,20 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``+episode:believed`` or ``+episode:pairwise:believed``: Algorithm 1 compares in the estimated world."""
+    """Make the shield ``+episode:believed`` or ``+episode:pairwise:believed``: the paper's Algorithm 1 in the estimated
+    world.
+
+    At the first decision it predicts the harm of ``policy`` and of E-V2X-BM (the best constant deceleration) in that
+    world; the better one controls the whole episode.
+
+    Raises ``InvalidInput`` for an agent that already decides on received information.
+
+    Args:
+        policy: the agent that E-V2X-BM is compared with.
+        argument: ``pairwise`` or None.
+        settings: scenario, and the agent's spec for error messages.
+
+    """
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Believing):
         raise InvalidInput(f"agent {settings.spec!r}: {policy.name} decides on what was received itself; take +step")
@@ -51,7 +89,11 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM in the estimated world."""
+    """Make the agent ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM (the best constant deceleration)
+    in the estimated world.
+
+    ``argument`` is ``pairwise`` or None; ``settings`` hold the scenario.
+    """
     return Believing(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 
 

@@ -19,24 +19,31 @@ from ethbrake_marl.shield.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """Code of mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the other codes."""
+    """Number that stands for mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the other modes."""
 
     ROBUST = 2
 
 
 class RobustGuard(StepGuard):
-    """Guard of mode ``robust``: a ``StepGuard`` around a ``RobustShield``."""
+    """Guard of mode ``robust``: lets a ``RobustShield`` decide on the actions in each step of a running engine."""
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a certified step, and the number of certified worlds for each world (``members``)."""
+        """Return the infos of a step as a mapping, with ``members``: the number of certified worlds for each world.
+
+        Args:
+            memory: shield and policies after the step.
+            ruling: decision of the step; None at the reset.
+
+        """
         return super().tell(memory, ruling) | {"members": memory.shield.memory.running.members}
 
 
 class BelievedGuard(ShieldGuard):
-    """Guard of modes ``step`` and ``robust`` in the estimated world, around a ``BelievedShield``.
+    """Guard of modes ``step`` and ``robust`` in the estimated world: lets a ``BelievedShield`` decide on the actions in
+    each step of a running engine.
 
-    Its bound exists from the first decision on and holds in the estimated world. The motion is not compared with the
-    prediction, because an estimate may be wrong without a fault of the system.
+    Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
+    with the prediction, because an estimate may be wrong without a fault of the system.
     """
 
     def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
@@ -44,7 +51,14 @@ class BelievedGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Ask the shield, and apply the actions that it certifies in the estimated worlds."""
+        """Return the proposed actions and the actions to apply, which the shield certifies in the estimated worlds.
+
+        Args:
+            running: the engine before the step.
+            memory: shield and policies before the step.
+            proposed: [n, 1] proposed actions.
+
+        """
         worlds = running.worlds
         proposed, memories = self._asked(worlds, memory.policies, proposed)
         after = copy.copy(memory.shield)
@@ -54,9 +68,10 @@ class BelievedGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step that is certified in the estimated worlds.
+        """Return, as a mapping, the infos of a step that is certified in the estimated worlds.
 
         ``trusted`` is true if the mode is ``robust``, so that the bound also says something about the true world.
+        ``memory`` holds the shield after the step, ``ruling`` its decision (None at the reset).
         """
         estimated: BelievedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield

@@ -68,19 +68,24 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """The mode as written after the ``+`` of an agent spec."""
+        """Text of the mode in an agent spec, after the ``+``: ``robust:interior:believed`` in
+        ``ppo+robust:interior:believed``.
+        """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
         return f"{self.mode}{robust}{':believed' if self.believed else ''}"
 
     @property
     def adds(self) -> Source:
-        """What the shield knows about the line in addition to the policy's knowledge."""
+        """Source of information that the shield uses in addition to the policy's information."""
         return Source.BELIEFS if self.believed else super().adds
 
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a new shield of one vehicle, before any episode."""
+        """Return a new shield for ``vehicle`` (an index; several for modes that shield several), before any episode.
+
+        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts.
+        """
         if self.believed:
             assert isinstance(vehicle, int)
             robust = self.robust if self.mode == "robust" else None
@@ -93,7 +98,10 @@ class RobustOptions(ShieldOptions):
         return super().shield(scenario, vehicle, others)
 
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
-        """Raise ``InvalidInput`` if the shield of an agent refuses the scenario."""
+        """Raise ``InvalidInput`` if a shield with these settings refuses the scenario.
+
+        ``several`` is True for one shield of all learners together.
+        """
         one = one_learner(scenario)
         if self.believed:  # the scenario's scripts apply only if it has exactly one learner
             self.shield(scenario, one or 0, {} if one is None else None)
@@ -101,7 +109,15 @@ class RobustOptions(ShieldOptions):
             super().check_in(scenario, several=several)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent], *, several: bool = False, **how: Any) -> ShieldGuard:
-        """Return the guard of these settings for all learners of an engine."""
+        """Return the guard that connects a shield with these settings to an engine.
+
+        Args:
+            engine: the engine whose learners are shielded.
+            policies: agents that propose the actions, by vehicle index.
+            several: True: one shield for several learners.
+            how: further keyword arguments of ``StepGuard``.
+
+        """
         scenario, scripts, where = as_scenario(engine.scenario), engine.scripts, self.where
         if self.believed:
             if len(engine.learners) > 1:
@@ -120,7 +136,8 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return an ``Uncertainty`` from an object or its written form; None stays None.
+    """Return ``given`` as an ``Uncertainty``: an object, its written form such as ``"gaps_m=0.5"``, or None, which
+    stays None.
 
     Raises ``InvalidInput`` for anything else.
     """
@@ -132,7 +149,11 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
-    """Return the uncertainty for a mode. Raises ``InvalidInput`` if ``robust`` has none, or another mode has one."""
+    """Return the checked uncertainty for a shield mode, or None if there is none.
+
+    Raises ``InvalidInput`` if mode ``robust`` has none, or another mode has one; ``where`` begins the message.
+    ``given`` is an ``Uncertainty``, its written form, or None.
+    """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
         what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"

@@ -63,17 +63,17 @@ STACK = 256  # largest number of waiting paths
 
 
 class Stack(NamedTuple):
-    """Stack of paths (sets of worlds with the same impacts) that wait to be followed."""
+    """Stack of paths that wait to be followed. A *path* is a set of worlds with the same impacts so far."""
 
-    forms: Floats  # [STACK, N + P + 1, W]
-    touch: Floats  # [STACK, P, TOUCH_WIDTH]
-    marks: Ints  # [STACK, 2 P + 1]
-    size: Ints  # [1]
+    forms: Floats  # [STACK, N + P + 1, W] ``Path.forms`` of each path
+    touch: Floats  # [STACK, P, TOUCH_WIDTH] ``Path.touch`` of each path
+    marks: Ints  # [STACK, 2 P + 1] ``Path.marks`` of each path
+    size: Ints  # [1] number of paths on the stack
 
 
 @compiled(apart=True)
 def new_stack(N: int, width: int) -> Stack:
-    """Return an empty stack of paths."""
+    """Return an empty stack of paths for ``N`` vehicles and affine forms of length ``width``."""
     P = N - 1
     return Stack(
         np.zeros((STACK, N + P + 1, width)),
@@ -85,7 +85,11 @@ def new_stack(N: int, width: int) -> Stack:
 
 @compiled(apart=True)
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
-    """Return the larger of ``worst`` and the largest value of ``harm``. A new maximum is copied to ``out``."""
+    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W] (centre, slopes, remainder),
+    m2/s2.
+
+    If ``harm`` reaches a new maximum, it is copied to ``out`` [W].
+    """
     if not high(harm) <= worst:
         out[:] = harm
         return high(harm)
@@ -94,7 +98,18 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
-    """Record the rough bound on the harm of a path that is not followed any further; return the new ``worst``."""
+    """Record a bound on the harm of a path that is not followed any further; return the largest harm recorded so far.
+
+    The bound is ``rough_harm``, which uses only the largest speeds that are still possible.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
 
 
@@ -102,10 +117,24 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Handle the worlds in which pair ``p`` has an impact in this piece of time; return the new ``worst``.
+    """Record the harm of the worlds in which pair ``p`` has an impact in the present piece, or follow them as a new
+    path.
 
-    If their harm is final it is recorded, else they become a path of their own. Where that path cannot be followed, the
-    rough bound is recorded instead.
+    If no other impact can follow, their harm is final and recorded. Else they are put on the stack as a path of their
+    own. Where that path cannot be followed, ``rough_harm`` is recorded instead: a bound from the largest speeds that
+    are still possible. Returns the largest harm recorded so far.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
     """
     P = cell.gap.shape[0]
     harm = path.forms[-1].copy()
@@ -138,7 +167,11 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """Record a harm to which at most ``rest`` will be added; return the new ``worst``."""
+    """Record the affine form ``harm`` [W] (centre, slopes, remainder), to which at most ``rest`` (m2/s2) will be added;
+    return the largest harm recorded, m2/s2.
+
+    ``worst`` is the largest harm recorded so far; ``out`` [W] receives the affine form of a new largest harm.
+    """
     whole = harm.copy()
     whole[0] += rest
     return keep_worst(whole, worst, out)
@@ -146,7 +179,21 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed of the other pair if it may meet in the same piece of time, after pair ``p``; else 0."""
+    """Return the closing speed of the other pair of three vehicles if it may meet in the same piece after pair ``p``.
+
+    The result is an affine form [W] (centre, slopes, remainder) in m/s; it is 0 if that pair cannot meet.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        speed: affine form [W] of the closing speed at the impact of pair ``p``, m/s.
+        time: affine form [W] of the time of that impact, s after the start of the piece.
+        length: length of the piece, s.
+
+    """
     N, other = cell.speed.shape[0], 1 - p
     push = product(cell.share[p, other], speed)  # change of the middle vehicle's speed, towards the other pair
     push *= 1.0 + cell.restitution
@@ -169,9 +216,22 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
 def strike(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, speed: Floats, harm: Floats
 ) -> bool:
-    """Put the worlds in which pair ``p`` has its impact in this piece of time on the stack as a new path.
+    """Put the worlds in which pair ``p`` has its impact in the present piece on the stack as a new path.
 
-    Returns False if this path cannot be followed.
+    Returns False, and puts nothing on the stack, if the stack is full or the rear vehicle may move backwards
+    (``thrown_back``).
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+        harm: affine form [W] of the harm including this impact, m2/s2.
+
     """
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     size = stack.size[0]
@@ -238,9 +298,18 @@ def strike(
 
 @compiled(apart=True)
 def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach) -> bool:
-    """Return whether the pair may reach gap 0 with closing speed 0 exactly when it begins to be pressed together.
+    """Return whether pair ``p`` may reach gap 0 with closing speed 0 exactly when it begins to be pressed together.
 
     This needs a change in how the pair is pressed: a command changes, or a force builds up.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     softest, hardest = pressing(motion, p)
@@ -261,16 +330,34 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
 
 @compiled(apart=True)
 def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
-    """Return whether forces that build up may press a pair together harder.
+    """Return whether forces that build up may press pair ``p`` together harder within a piece.
 
     That is so if the front vehicle's acceleration may fall or the rear vehicle's may rise.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        piece: index of the piece, 0 to J - 1.
+
     """
     return may_move(cell, motion, p, piece, 0) or may_move(cell, motion, p + 1, piece, 1)
 
 
 @compiled(apart=True)
 def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool:
-    """Return whether an acceleration may fall (``which`` 0) or rise (1) within the piece of time by brake build-up."""
+    """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        i: index of the vehicle.
+        piece: index of the piece, 0 to J - 1.
+        which: 0 or 1.
+
+    """
     if not cell.forces.build[i] or motion.vague[i] > cell.forces.swing[i, piece + 1].max():
         return cell.moving and motion.vague[i] > 0.0
     return bool(cell.forces.swing[i, piece + 1, which] > 0.0)
@@ -280,8 +367,18 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
 def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
     """Push a second path: the worlds in which pair ``p`` met and stayed in contact without an impact.
 
-    With brake build-up the pair may open and have its first impact within the piece of time; the path below on the
-    stack covers these worlds.
+    With brake build-up the pair may open and have its first impact within the piece; the path below on the stack covers
+    these worlds. Returns False if the stack is full.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
     """
     size = stack.size[0]
     if size >= STACK:
@@ -303,9 +400,19 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
 
 @compiled(apart=True)
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
-    """Return whether the rear vehicle may move backwards after the impact, so that it could be hit again.
+    """Return whether the rear vehicle may move backwards after the impact of pair ``p``, so that it could be hit again.
 
     False for the last vehicle of the line if it never drives: nobody is behind it, so it may as well stand.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        how: closing speed and time of the contact (from ``approach``).
+        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+
     """
     P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
     slowest = 0.0
@@ -321,10 +428,18 @@ MOST_PATHS = 4000  # most paths to follow in one cell
 
 @compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
-    """Return an upper bound on the harm of every world of the cell (m2/s2).
+    """Return an upper bound on the harm of every world of the cell, m2/s2.
 
-    A result above ``most`` is no bound: the search then stopped early. ``out`` [W] receives the affine form that
-    reaches the bound.
+    A result above ``most`` is no bound: the search then stopped early.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        stack: memory for paths (sets of worlds with the same impacts).
+        motion: memory for the motion of each vehicle.
+        out: [W] receives the affine form of the harm that reaches the bound.
+        most: harm above which the search stops, m2/s2.
+
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     worst, paths = -math.inf, 0
@@ -350,7 +465,18 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 
 @compiled(apart=True)
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm of paths that end earlier."""
+    """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm that branches off on the way.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: memory for the motion of each vehicle.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     quiet = 0  # first piece from which on no vehicle drives
     for j in range(cell.action.shape[0]):
@@ -375,9 +501,16 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
 
 @compiled(apart=True)
 def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Return whether a pair in contact without an impact so far may have its first impact in this piece of time.
+    """Return whether a pair in contact, without an impact so far, may have its first impact in the present piece.
 
     For this the pair must open first.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+
     """
     P = cell.gap.shape[0]
     for p in range(P):
@@ -390,9 +523,20 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
 
 @compiled(apart=True)
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Treat the pairs in contact, and those that may come into contact, in one piece of time.
+    """Move the pairs in contact through the present piece, and branch off the worlds in which a pair has an impact.
 
-    Return the new ``worst``.
+    Pairs in contact move as one from here on, or separate. The worlds with an impact are recorded or put on the stack
+    (``branch``). Returns the largest harm recorded so far.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        stack: paths that wait to be followed; new paths are put on top.
+        motion: motion of each vehicle in the present piece; changed in place.
+        worst: largest harm recorded so far, m2/s2.
+        out: [W] receives the affine form of the harm if it is a new largest one.
+
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     length = cell.times[path.marks[2 * P] + 1] - cell.times[path.marks[2 * P]]
@@ -438,7 +582,15 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the piece of time without an impact. Return False if no world can do so."""
+    """Advance the path to the end of the present piece without an impact. Return False if every world has an impact.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     for p in range(P):
         if path.marks[P + p] == TOUCHES:

@@ -33,8 +33,10 @@ class RobustShield(StepShield):
     Args:
         scenario: the scenario of all worlds.
         vehicle: index of the shielded vehicle. An uncertainty allows only one.
-        uncertainty: the uncertainty; None: ``begin`` receives the ``possible`` worlds.
-        robust: ``corners`` or ``interior``.
+        uncertainty: intervals around the reported quantities; None: ``begin`` receives the ``possible`` worlds.
+        robust: worlds to certify: ``corners`` or ``interior``.
+        harm_count: ``first`` or ``total`` impacts.
+        others: scripts of the other vehicles by index; None: the scenario's scripts.
         settings: further keywords of ``StepShield``.
 
     Raises ``InvalidInput`` as ``StepShield`` does, for several vehicles or a cap with an uncertainty, and for settings
@@ -62,23 +64,36 @@ class RobustShield(StepShield):
 
     @property
     def possible_are(self) -> str:  # type: ignore[override]  # a constant there
-        """Description of a world's members (possible worlds) for error messages."""
+        """Words for a world's members (possible worlds) in error messages, for instance "uncertainty: gaps_m=0.5"."""
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """Return the members of worlds at the alert, [n * M]: each world followed by its corners."""
+        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its uncertainty."""
         return worlds if self.uncertainty is None else self.uncertainty.members(worlds)
 
     @property
     def boxes(self) -> Boxes | None:
-        """The boxes of ``interior``, once episodes have begun; else None."""
+        """The boxes of mode ``interior`` (range of every number of each world), once episodes have begun; else None."""
         boxes: Boxes | None = self.memory.enclosure
         return boxes
 
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Boxes | None]:
-        """Return the bound at the alert; in interior mode over all worlds of each box."""
+        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes (None in
+        corners mode).
+
+        In interior mode the bound covers all worlds of each box, else only its members (the reported world and the
+        corners of its box).
+
+        Args:
+            possible: [m * M] members of the new worlds, M consecutive ones for each.
+            problem: the same worlds as columns of numbers.
+            rows: [m] indices of the new episodes.
+            plan: [m, L] action at each decision.
+            harm: [m] largest harm of the plan in a member, m2/s2.
+
+        """
         if possible.n == len(rows) or self.robust != INTERIOR:
             return harm, self.boxes
         boxes = Boxes.of(possible, problem, len(rows), self.scenario, self._others)
@@ -87,12 +102,22 @@ class RobustShield(StepShield):
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """In interior mode, replace plans that are not certified for all worlds of their box."""
+        """Return the decision; in interior mode, plans that are not certified for all worlds of their box are replaced.
+
+        Args:
+            now: state of the members (the corners of the boxes) before the decision.
+            memory: memory of the shield.
+            budget: [n] largest harm that a new plan may have, m2/s2.
+            decision: the decision, certified in the members only.
+            asked: [n] True for episodes that decide now.
+
+        """
         boxes = memory.enclosure
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return the worlds [n] that may leave the range spanned by their members.
+        """Return a mask [n] of the worlds that may leave the range spanned by their members (the reported world and the
+        corners of its uncertainty), now in the states ``running``.
 
         Besides the worlds of ``StepShield``: worlds whose own latency is uncertain, because a decision then falls at a
         different time in each world of the box, and all worlds if one uncertain number moves several quantities
@@ -112,8 +137,15 @@ def certify_inside(
 ) -> Decision:
     """Replace each plan of a decision that is not certified for every world of its box by the held plan.
 
-    ``decision`` is certified in the corners. ``held`` is the backup from before the decision. Episodes of ``asked``
-    rows end at the horizon only, because a box may hold moving worlds when all its corners are at rest.
+    Args:
+        boxes: range of every number of each world.
+        running: state of the members (corners of the boxes) before the decision.
+        held: plans and bounds from before the decision.
+        budget: [n] largest harm that a new plan may have, m2/s2.
+        decision: the decision, certified in the corners only.
+        asked: [n] True for episodes that decide now. Such an episode counts as ended only at the horizon, because a box
+            may hold moving worlds when all its corners are at rest.
+
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
     bound = np.where(asked & ~other, held.harm, decision.bound)  # an unchanged plan keeps its bound

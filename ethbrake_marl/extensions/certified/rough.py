@@ -22,7 +22,11 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def driven(cell: Cell, i: int, speed: float, since: float) -> float:
-    """Return the largest speed that a vehicle with at most ``speed`` at time ``since`` can reach by driving."""
+    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if it has at most ``speed`` at time
+    ``since``.
+
+    ``since`` counts from the first decision, in s. ``cell`` holds the box of worlds and the commands.
+    """
     drive, rest = 0.0, cell.times[-1] - since
     if i == cell.vehicle:
         for j in range(cell.action.shape[0]):
@@ -37,9 +41,16 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
 
 @compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
-    """Return an upper bound on the harm of all worlds of a path, from the present piece of time on.
+    """Return an upper bound on the harm of all worlds of a path, from the present piece on, m2/s2.
 
-    ``hit`` is a pair that counts as hit already; -1: only the pairs marked in the path.
+    It uses only the largest speeds that the vehicles can still reach.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        hit: index of a pair that counts as hit already; -1: only the pairs marked in the path.
+
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     since = cell.times[path.marks[2 * P]]
@@ -56,7 +67,17 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
 
 @compiled(apart=True)
 def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
-    """Return the largest sum of squared closing speeds of the first impacts that are still to come."""
+    """Return the largest sum of squared closing speeds of the first impacts that are still to come, m2/s2.
+
+    Args:
+        cell: the box of worlds.
+        own: [N] largest speed of each vehicle without an impact, m/s.
+        backwards: largest backward speed of any vehicle now, m/s.
+        since: present time, s after the first decision.
+        path: marks the pairs that had an impact.
+        hit: index of a further pair that counts as hit; -1: none.
+
+    """
     P, e = cell.gap.shape[0], cell.restitution
     first = path.marks[0] == 1 or hit == 0
     if P == 1:

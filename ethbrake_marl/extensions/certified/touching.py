@@ -48,7 +48,11 @@ UNEVEN = 3.0  # largest ratio of closing to separating speed of a flight for the
 
 @compiled(apart=True)
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
-    """Return the value of the pair's centre of mass, from the values of the front and the rear vehicle."""
+    """Return the value of the centre of mass of pair ``p`` (speed, acceleration or distance) as an affine form [W]
+    (centre, slopes, remainder).
+
+    ``front`` and ``rear`` are the values of the two vehicles; ``cell`` holds their shares of the mass.
+    """
     out = product(cell.share[p, 1], front)
     add(out, 1.0, product(cell.share[p, 0], rear))
     return out
@@ -56,7 +60,10 @@ def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
 
 @compiled(apart=True)
 def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest closing acceleration of a pair if both commands act."""
+    """Return the least and the largest closing acceleration of pair ``p`` if both commands act, m/s2.
+
+    ``motion`` is the motion of all vehicles in the present piece (time interval of constant command).
+    """
     vague = motion.vague[p] + motion.vague[p + 1]
     least = low(motion.pull[p + 1]) - high(motion.pull[p]) - vague
     return least, high(motion.pull[p + 1]) - low(motion.pull[p]) + vague
@@ -64,45 +71,72 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def apart(touch: Floats) -> float:
-    """Return the largest difference of speeds of a pair in contact."""
+    """Return the largest difference of speeds of a pair in contact, m/s.
+
+    ``touch`` [TOUCH_WIDTH] is its state, a row of ``Path.touch``.
+    """
     return float(max(touch[OPENING], touch[CLOSING], 0.0))
 
 
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
-    """Return the largest factor on the rear vehicle's speed that impacts may give the front vehicle, at least 1."""
+    """Return by which factor, at least 1, an impact may make the front vehicle of pair ``p`` faster than the rear one
+    was.
+
+    ``cell`` holds the coefficient of restitution and the shares of mass.
+    """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
 
 @compiled(apart=True)
 def backwards(cell: Cell, p: int) -> float:
-    """Return the largest backward speed of the rear vehicle after an impact, as a multiple of its speed before.
+    """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of its speed
+    before.
 
-    It is at least 0.
+    It is at least 0. ``cell`` holds the coefficient of restitution and the shares of mass.
     """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
 
 @compiled(apart=True)
 def stray(cell: Cell, touch: Floats, p: int) -> float:
-    """Return the largest difference between the speed of a pair's centre of mass and its affine form.
+    """Return the largest difference between the speed of a pair's centre of mass and the speed in its affine form, m/s.
 
-    In a world that creeps, the form's speed lies between 0 and ``CREEP``, the rear vehicle's between minus
-    ``backwards`` and 1 times ``CREEP``, and the front vehicle's between 0 and ``faster`` times ``CREEP``: no impact
-    makes a rear vehicle faster.
+    It is above 0 only if one of the two vehicles may stand or move backwards. The form's speed then lies between 0 and
+    ``CREEP``, the rear vehicle's between minus ``backwards`` and 1 times ``CREEP``, and the front vehicle's between 0
+    and ``faster`` times ``CREEP``: no impact makes a rear vehicle faster.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+
     """
     return float(max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP])
 
 
 @compiled(apart=True)
 def blur(cell: Cell, path: Path, p: int, side: int) -> float:
-    """Return the largest deviation of a vehicle's speed from the affine form of its pair in contact."""
+    """Return the largest deviation of a vehicle's speed from the affine form of its pair in contact, m/s.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        side: 0 for the front vehicle of the pair, 1 for the rear one.
+
+    """
     return float(high(cell.share[p, side]) * path.touch[p, SPREAD] + stray(cell, path.touch[p], p))
 
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset the state of a pair in contact, except the columns of the present piece of time."""
+    """Reset the state of a pair in contact, in place; the columns of the present piece (SPREAD, REACH) stay.
+
+    ``touch`` [TOUCH_WIDTH] is the state, a row of ``Path.touch``.
+    """
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
     touch[SPREAD], touch[REACH], touch[SOFTEST] = spread, reach, math.inf
@@ -110,9 +144,19 @@ def begin_touch(touch: Floats) -> None:
 
 @compiled(apart=True)
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Move a pair in contact through one piece of time.
+    """Move pair ``p``, which is in contact, through the present piece (time interval of constant command).
 
-    ``motion`` holds both vehicles as if alone on entry, and as one on return.
+    On entry ``motion`` holds both vehicles as if alone. On return it holds them moving as one, or apart if they
+    separate.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        motion: motion of each vehicle in the present piece, as if alone (``move_alone``); changed in place.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
     """
     touch, front, rear = path.touch[p], p, p + 1
     touch[SPREAD], touch[REACH] = apart(touch), touch[WIDE]
@@ -146,25 +190,41 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
-    """Return by how much a speed may fall below its values at both ends of a piece of time.
+    """Return by how much (m/s) a speed may fall below its values at both ends of a piece.
 
-    This can happen if the vehicle's force changes sign in it.
+    This can happen if the vehicle's force changes sign in it. ``vague`` is the largest deviation of the acceleration
+    from its mean (m/s2), ``length`` the length of the piece (s).
+
+    A piece is a time interval of constant command; ``cell`` is the box of worlds.
     """
     return 0.5 * vague * length if cell.moving else 0.0
 
 
 @compiled(apart=True)
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest acceleration by the commands of either vehicle of a pair."""
+    """Return the least and the largest acceleration (m/s2) by the commands of either vehicle of pair ``p`` in a
+    piece.
+
+    ``motion`` is the motion of all vehicles in the piece (time interval of constant command).
+    """
     weakest = min(low(motion.pull[p]) - motion.vague[p], low(motion.pull[p + 1]) - motion.vague[p + 1])
     return weakest, max(high(motion.pull[p]) + motion.vague[p], high(motion.pull[p + 1]) + motion.vague[p + 1])
 
 
 @compiled(apart=True)
 def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
-    """Update the bounds for worlds that may creep. ``slowest`` is the least speed of the centre of mass.
+    """Update the state of a pair in contact for worlds that may creep: one of its vehicles stands or moves backwards.
 
-    A world creeps once one vehicle of a pair in contact stands or moves backwards.
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        slowest: least speed of the centre of mass in the piece, m/s.
+        weakest: least acceleration by either command, m/s2.
+        hardest: largest acceleration by either command, m/s2.
+        length: length of the piece, s.
+
     """
     largest = max(
         high(cell.share[p, 0]), high(cell.share[p, 1])
@@ -185,9 +245,23 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
 
 @compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Update a pair whose affine form stands: each of its worlds stands, or creeps and is braked.
+    """Update pair ``p``, which is in contact, over a piece in which the affine form of its speed stands at 0.
+
+    In each world either both vehicles stand, or the world *creeps* and the brakes slow it. A world creeps if one
+    vehicle of the pair stands or moves backwards.
 
     The brakes b reduce the rear vehicle's speed. The front vehicle's speed is at most ``faster`` times the rear one's.
+
+    The motion of the pair in ``path`` and ``motion`` is changed in place.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        motion: motion of each vehicle in the present piece; changed in place.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
     """
     touch = path.touch[p]
     touch[CREEP] = max(touch[CREEP], touch[SPREAD])
@@ -203,7 +277,17 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Separate a pair that was in contact and opens in this piece of time: both vehicles move alone from now on."""
+    """Separate pair ``p``, which was in contact and opens in the present piece: both vehicles move alone from then on.
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        path: worlds of the box that had the same impacts so far; changed in place.
+        motion: motion of each vehicle in the present piece; changed in place.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
+    """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
     touch, width = path.touch[p], cell.speed.shape[1]
     opening, wide, astray = max(touch[OPENING], 0.0), touch[WIDE], stray(cell, touch, p)
@@ -226,13 +310,24 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
 
 @compiled(apart=True)
 def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
-    """Update the relative speed and the gap of a pair in contact over one piece of time.
+    """Update the relative speed and the gap of pair ``p``, which is in contact, over the present piece.
 
-    The closing acceleration is between ``least`` and ``most``. An impact never increases the relative speed, so it
-    grows at most by what the commands add. While the pair is pressed together by b between b- and b+, it does not grow:
-    from gap g and relative speed w, a flight never exceeds the gap h = g + w^2 / (2 b-) and closes with at most sqrt(2
-    b+ h); the impact leaves the share e of that. This is less than before if e sqrt(b+ / b-) < 1. (Where a vehicle
-    creeps, its holding brakes make a flight lower and slower.)
+    An impact never increases the relative speed, so it grows at most by what the commands add. While the pair is
+    pressed together by b between b- (``least``) and b+ (``most``), it does not grow: from gap g and relative speed w, a
+    *flight* (the time between two impacts) never exceeds the gap h = g + w^2 / (2 b-) and closes with at most sqrt(2 b+
+    h); the impact leaves the share e (restitution) of that. This is less than before if e sqrt(b+ / b-) < 1. (Where one
+    vehicle stands or moves backwards, its holding brakes make a flight lower and slower.)
+
+    Args:
+        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
+            constant command).
+        touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        least: least closing acceleration, m/s2.
+        most: largest closing acceleration, m/s2.
+        length: length of the piece, s.
+        vague: largest deviation of an acceleration from its mean, m/s2.
+
     """
     e, fastest, wide = cell.restitution, apart(touch), touch[WIDE]
     if fastest == 0.0 and wide == 0.0 and least >= 0.0:
@@ -260,9 +355,19 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 
 @compiled(apart=True)
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
-    """Start a new phase of a contact when the pair is pressed together outside the previous range of accelerations.
+    """Start a new phase of a contact: the pair is now pressed together harder or less hard than in the phase before.
 
-    The new range covers both phases if the bound by flights allows it, else the new phase alone.
+    The new phase covers the accelerations of both if the relative speed then still decays from impact to impact, else
+    its own accelerations alone.
+
+    Args:
+        touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
+        e: coefficient of restitution.
+        softest: least closing acceleration of both phases, m/s2.
+        hardest: largest closing acceleration of both phases, m/s2.
+        least: least closing acceleration of the new phase, m/s2.
+        most: largest closing acceleration of the new phase, m/s2.
+
     """
     if not e * math.sqrt(hardest / softest) < 1.0:
         softest, hardest = least, most
@@ -278,10 +383,17 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 
 @compiled(apart=True)
 def settle(touch: Floats, e: float, length: float) -> None:
-    """Reset the contact if the pair certainly moves as one by the end of the piece of time.
+    """Reset the state of a contact if the pair certainly moves as one by the end of the present piece.
 
-    A flight that begins with separating speed s takes at most 2 s / b- and closes with at most s sqrt(b+ / b-). So
-    after 2 s / (b- (1 - e sqrt(b+ / b-))) the two move as one, unless one of them creeps.
+    The closing acceleration lies between b- and b+. A *flight* (the time between two impacts) that begins with
+    separating speed s takes at most 2 s / b- and closes with at most s sqrt(b+ / b-). So after 2 s / (b- (1 - e sqrt(b+
+    / b-))) the two move as one, unless one of them stands or moves backwards.
+
+    Args:
+        touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
+        e: coefficient of restitution.
+        length: length of the piece (time interval of constant command), s.
+
     """
     if touch[SOFTEST] == math.inf or touch[CREEP] > 0.0:
         touch[SINCE] = 0.0
@@ -294,7 +406,19 @@ def settle(touch: Floats, e: float, length: float) -> None:
 
 @compiled(apart=True)
 def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
-    """Return whether a pair may meet again at such a wide range of times that it is better treated as in contact."""
+    """Return whether the gap of pair ``p`` is too uncertain to follow a further impact in this piece.
+
+    That is so if the uncertainty of the gap exceeds the distance that the pair can close in the piece. The pair is then
+    treated as in contact from the start of the piece.
+
+    Args:
+        path: worlds of the box that had the same impacts so far.
+        motion: motion of each vehicle in the present piece (time interval of constant command).
+        N: number of vehicles.
+        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        length: length of the piece, s.
+
+    """
     if motion.rest[p] != MOVES or motion.rest[p + 1] != MOVES:
         return False
     closing = difference(path.forms[p + 1], path.forms[p])

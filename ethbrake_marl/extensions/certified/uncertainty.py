@@ -54,12 +54,12 @@ _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Half-width of one quantity's interval, for one vehicle or pair, or for each of them (``place`` None)."""
+    """Half-width of one quantity's interval, for one vehicle or pair, or for each of them."""
 
     quantity: str  # one of QUANTITIES
     half_width: float  # in the quantity's unit, or a share of its value below 1
-    relative: bool = False
-    place: int | None = None  # index from 0
+    relative: bool = False  # True: ``half_width`` is a share of the value
+    place: int | None = None  # index of the vehicle or pair from 0; None: all of them
 
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
@@ -89,7 +89,7 @@ class Uncertainty:
     Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
     """
 
-    intervals: tuple[Interval, ...]
+    intervals: tuple[Interval, ...]  # one entry for each uncertain quantity
 
     def __post_init__(self) -> None:
         if not isinstance(self.intervals, tuple) or not all(isinstance(each, Interval) for each in self.intervals):
@@ -109,16 +109,18 @@ class Uncertainty:
 
     @property
     def moves_together(self) -> bool:
-        """Whether one uncertain number changes several quantities; gaps and speeds are then not extreme in corners."""
+        """True if one uncertain number (friction) changes several quantities; gaps and speeds are then not extreme in
+        corners.
+        """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
     def members(self, worlds: Worlds) -> Worlds:
-        """Return the members of worlds at the alert, [n * M]: each world followed by its corners.
+        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
-        Corners come in the order of binary numbers; the first interval is the lowest bit. Intervals of width 0 add no
-        corners. Friction changes all capacities together and harm is not monotone in it, so it has eight values instead
-        of two ends. Raises ``InvalidInput`` for a vehicle that does not exist, a capacity or mass that may be 0, or
-        more than ``MOST_CORNERS`` corners.
+        The *box* of a world is the set of all values in its intervals. Corners come in the order of binary numbers; the
+        first interval is the lowest bit. Intervals of width 0 add no corners. Friction changes all capacities together
+        and harm is not monotone in it, so it has eight values instead of two ends. Raises ``InvalidInput`` for a
+        vehicle that does not exist, a capacity or mass that may be 0, or more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -134,12 +136,21 @@ class Uncertainty:
 
     @staticmethod
     def interleaved(parts: list[Worlds]) -> Worlds:
-        """Return the worlds [n] of M parts as one list [n * M]: world 0 of each part, then world 1 of each part, ..."""
+        """Merge M lists of n worlds each into one list [n * M]: world 0 of each list, then world 1 of each list, and so
+        on.
+        """
         order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
-        """Draw one world from each box, [n]: uniformly from the inside, or one of the ``corners``."""
+        """Draw one world from the box of intervals around each of ``worlds``, [n].
+
+        Args:
+            worlds: the reported worlds, [n].
+            rng: source of randomness.
+            corners: True: draw one of the corners; False: draw uniformly from the inside.
+
+        """
         sides = self._sides(worlds)
         shares = rng.random((len(sides), worlds.n))
         if corners:
@@ -147,7 +158,9 @@ class Uncertainty:
         return _placed(worlds, sides, lambda k: shares[k])
 
     def _sides(self, worlds: Worlds) -> list[_Side]:
-        """Return the uncertain numbers of these worlds."""
+        """Return the uncertain numbers of ``worlds``: quantity, index of vehicle or pair, least and largest value [n]
+        of each.
+        """
         sides: list[_Side] = []
         for interval in self.intervals:
             every, name = _values(worlds, interval.quantity), interval.quantity
@@ -182,7 +195,7 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Parse ``quantity=half-width`` entries separated by commas, for instance ``UNCERTAINTY_EXAMPLE``.
+    """Parse a text of ``quantity=half-width`` entries separated by commas, for instance ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
     the quantity limits the entry to one vehicle or pair. Blanks around entries and ``=`` are ignored. Raises
@@ -207,7 +220,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of a quantity: [n, N], [n, P], or [n, 1] for friction.
+    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1].
 
     Capacities are those on a dry road.
     """
@@ -222,10 +235,17 @@ def _of(quantity: str, place: int) -> str:
 
 
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
-    """Return the worlds with each uncertain number at ``share(k)`` of its interval: 0 is its least value.
+    """Return the worlds with each uncertain number at a position in its interval.
 
     Without a V2X channel an uncertain latency also changes what others receive and when. With a channel, only the
     reaction is uncertain. Friction limits the capacities of all vehicles together.
+
+    Args:
+        worlds: the reported worlds, [n].
+        sides: the uncertain numbers, from ``_sides``.
+        share: maps the index of an uncertain number to its position, a number or [n]: 0 is the least value, 1 the
+            largest.
+
     """
     changed: dict[str, Any] = {}
     for k, (quantity, place, low, high) in enumerate(sides):

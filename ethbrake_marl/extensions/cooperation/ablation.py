@@ -1,4 +1,4 @@
-"""Run an ablation over levels of cooperation, and estimate its cost."""
+"""Run an ablation, a comparison of trainings at several levels of cooperation, and estimate its cost."""
 
 from __future__ import annotations
 
@@ -22,10 +22,17 @@ from ethbrake_marl.training.team import load_team
 def run_ablation(
     plan: Plan, jobs: int = 1, machine: str = "", tell: OnProgress | None = None
 ) -> tuple[Json, list[Path]] | None:
-    """Run all trainings, ``jobs`` at a time, measure the results, and write all files. Existing files are replaced.
+    """Run all trainings of an ablation, measure the trained policies, and write all files, replacing existing ones.
+
+    Args:
+        plan: settings of the ablation.
+        jobs: number of trainings at once.
+        machine: description of this machine, which is recorded.
+        tell: called with the progress; None: silent.
 
     Returns the content of ``ablation.json``, and the paths of page, Markdown and figures. Returns None if Ctrl-C
     stopped the trainings. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
+
     """
     with plan.study_folder().work():
         if not train_all([training for _, _, training in plan.trainings()], jobs, tell):
@@ -34,11 +41,14 @@ def run_ablation(
 
 
 def ablation_cost(plan: Plan) -> str:
-    """Describe the remaining work in seconds of one core, with a line for each damaged part of a search.
+    """Return a text for users that estimates the remaining work of an ablation in time of one core.
 
-    A short training of each level and recipe, an evaluation and a search are timed by the wall clock, so other work on
-    the machine makes the estimate larger. Raises the exceptions of ``TrainingJob.steps_left``, and those of
-    ``load_team`` for a finished training whose policies cannot be loaded.
+    To estimate it, a short training of each level and recipe, an evaluation and a search are timed by the wall clock,
+    so other work on the machine makes the estimate larger. If results of earlier searches for the joint optimum are
+    damaged, the text has a line for each of them.
+
+    Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a finished training whose
+    policies cannot be loaded.
     """
     left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in plan.trainings()]
     decisions: Counter[tuple[str, str]] = Counter()

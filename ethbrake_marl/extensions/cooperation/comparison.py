@@ -1,4 +1,7 @@
-"""Compare levels of cooperation: harm per level, value of each step, who pays, distance to the joint optimum.
+"""Compare levels of cooperation: harm per level, change from level to level, who pays, distance to the joint optimum.
+
+A *level* is a scenario; the *ladder* is the sequence of levels, each compared with the one before. The *joint optimum*
+is the least known harm that all learners of a level can achieve together.
 
 Confidence intervals cover other training seeds and other worlds: both are resampled (``evaluation.seeds``).
 """
@@ -19,13 +22,18 @@ from ethbrake_marl.shield.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Return the comparison as plain data for JSON; docs/ablate-cooperation.md describes it.
+    """Return the comparison of all levels as plain data for JSON; docs/ablate-cooperation.md describes it.
 
-    Keys: ``levels``, ``steps`` of the ladder (each level against the one before), ``channels`` (levels that differ only
-    in ``v2x``), and ``undertrained``: a sentence for each level whose trained policies do worse than full braking.
+    Keys: ``levels`` (results of each level), ``steps`` (each level against the one before), ``channels`` (each level
+    with a worse V2X channel against the level that it varies), and ``undertrained`` (a sentence for each level whose
+    trained policies do worse than full braking). Steps are compared for one algorithm at a time; a level without
+    learners counts in the comparison of every algorithm.
 
-    The joint optimum was searched in the first ``searched`` worlds, so figures compared with it cover the same worlds.
-    Each algorithm has its own ladder; levels without learners belong to all ladders.
+    Args:
+        measured: results of ``measure``.
+        searched: number of worlds, from the first on, in which the joint optimum was searched. Figures compared with it
+            cover the same worlds.
+
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
     steps, channels = [], []
@@ -52,7 +60,7 @@ def _undertrained(one: Measured, goal: Goal) -> str:
 
 
 def _level(one: Measured, searched: int) -> Json:
-    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the ``searched`` worlds.
+    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the first ``searched``.
 
     The ``searched`` part also has the joint optimum and the share of the possible reduction.
     """
@@ -94,7 +102,15 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """Return the results of the same teams in the same worlds behind the shield that guards this count."""
+    """Return the results of a level's teams behind a shield as plain data, compared with those without a shield.
+
+    Args:
+        one: results of the level without a shield.
+        shielded: results of the same teams in the same worlds, behind a shield that bounds the harm ``harm_count``.
+        harm_count: impacts that harm counts: each pair's first one (``first``) or all (``total``).
+        searched: number of worlds, from the first on, over which the part ``searched`` of the result averages.
+
+    """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
     actions = shielded.decisions * shielded.replaced.shape[2]
     return {
@@ -115,7 +131,11 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return the change from one level to another on the same worlds; positive means more harm."""
+    """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm.
+
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``, with
+    the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
+    """
     found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
@@ -132,5 +152,5 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
-    """Return the harm of each vehicle, each [seeds, worlds]."""
+    """Return the harm of each vehicle, front to rear, as arrays [seeds, worlds]."""
     return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

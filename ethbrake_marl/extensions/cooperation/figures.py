@@ -41,7 +41,9 @@ Json = dict[str, Any]
 
 
 def ablation_figures(found: Json, caption: str) -> list[Figure]:
-    """Return the figures of an ablation: harm per level, change by each step, and who pays.
+    """Return three figures of an ablation: harm per level, change from level to level, and change for each vehicle.
+
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below each figure.
 
     Red text above a figure names the levels that are not trained enough.
     """
@@ -58,9 +60,10 @@ def ablation_figures(found: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curve(found: Json, caption: str) -> Figure:
-    """Draw the harm of each level under both counts, between full braking and the joint optimum.
+    """Draw first-impact and total harm at each level, between full braking and the joint optimum.
 
-    All values are over the worlds in which the joint optimum was searched.
+    All values are over the worlds in which the joint optimum was searched. ``found`` is the content of
+    ``ablation.json``; ``caption`` is the text below.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     ladder = list(dict.fromkeys(level["level"] for level in found["levels"] if level["clear"] is None))
@@ -87,7 +90,10 @@ def _harm_curve(found: Json, caption: str) -> Figure:
 
 
 def _change_figure(found: Json, caption: str) -> Figure:
-    """Draw the change by each step and each worse channel, with its interval; left of the line is less harm."""
+    """Draw the change of harm from level to level, and by each worse V2X channel, with intervals; left: less harm.
+
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    """
     changes = found["steps"] + found["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -115,7 +121,10 @@ def _change_figure(found: Json, caption: str) -> Figure:
 
 
 def _who_pays(found: Json, caption: str) -> Figure:
-    """Draw the change of each vehicle's harm from level to level as a matrix; blue is less harm."""
+    """Draw the change of each vehicle's harm from level to level as a matrix; blue is less harm.
+
+    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    """
     changes = found["steps"] + found["channels"]
     figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
     grids = {
@@ -141,7 +150,10 @@ def _who_pays(found: Json, caption: str) -> Figure:
 
 
 def signed_ticks(low: float, high: float) -> list[float]:
-    """Return a few round numbers between ``low`` and ``high``, with 0, for an axis that is linear up to ``LINEAR``."""
+    """Return a few round numbers, and 0, between ``low`` and ``high`` as ticks.
+
+    They are for an axis that is linear between -0.1 and 0.1 and logarithmic beyond (``LINEAR``).
+    """
     first = -1 if max(-low, high) > LINEAR else -3
     found: list[float] = []
     for steps in ((1,), (1, 3), (1, 2, 5)):
@@ -153,14 +165,29 @@ def signed_ticks(low: float, high: float) -> list[float]:
 
 
 def _place(level: Json, ladder: Sequence[str]) -> float:
-    """Return the x position of a level: its index in the ladder; a worse channel is to the right of its level."""
+    """Return the x position of a level: its index in ``ladder``, the names of the compared levels in order.
+
+    A level with a worse V2X channel stands to the right of the level that it varies.
+    """
     return ladder.index(level["clear"] or level["level"]) + (0.0 if level["clear"] is None else _BESIDE)
 
 
 def _reached(
     axes: Axes, levels: Sequence[Json], ladder: Sequence[str], harm_count: HarmCount, algorithm: str, number: int
 ) -> None:
-    """Draw the harm of one algorithm on the ladder, and on worse channels beside it. Each seed is a dot."""
+    """Draw the harm that one algorithm reaches at each level, and over worse V2X channels beside it.
+
+    Each training seed is a dot.
+
+    Args:
+        axes: axes to draw on.
+        levels: results of all levels, from ``ablation.json``.
+        ladder: names of the levels, in order of their x positions.
+        harm_count: harm to draw.
+        algorithm: name of the algorithm.
+        number: index of the algorithm, which chooses colour and offset.
+
+    """
     own = [level for level in levels if level["algorithm"] in (None, algorithm)]
     style = series_style(number + 1 if number == 0 else number + 3)
     hollow = {**style, "linestyle": "none", "markerfacecolor": "white"}
@@ -192,7 +219,16 @@ def _reached(
 def _with_intervals(
     axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
 ) -> None:
-    """Draw marks with whiskers at the positions ``at``; ``upright``: values are on the y axis."""
+    """Draw estimates as marks with whiskers for their intervals.
+
+    Args:
+        axes: axes to draw on.
+        at: position of each estimate on the other axis.
+        estimates: values and intervals.
+        upright: whether values are on the y axis; False: on the x axis.
+        style: keyword arguments of ``Axes.errorbar``.
+
+    """
     values = np.array([each.value for each in estimates])
     errors = np.abs(np.array([each.ends for each in estimates]).T - values)
     if upright:
@@ -206,12 +242,12 @@ def _algorithms(found: Json) -> list[str]:
 
 
 def _short(name: str) -> str:
-    """Return ``cooperation-2-paper`` as two lines, ``2`` and ``paper``."""
+    """Return the name of a level without ``cooperation-``, in two lines: ``2`` and ``paper``."""
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 
 def _of_changes(found: Json) -> list[str]:
-    """Return a label for each step and each worse channel."""
+    """Return a label ``LEVEL → LEVEL`` for each change between levels, then for each worse V2X channel."""
     changes, several = found["steps"] + found["channels"], len(_algorithms(found)) > 1
     words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
     return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]

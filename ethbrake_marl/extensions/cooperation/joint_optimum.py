@@ -34,16 +34,21 @@ from ethbrake_marl.training.training import Training
 
 @dataclass(frozen=True, slots=True)
 class LevelOptimum:
-    """What is known about the optimum of one level: its search, and its trained teams (of all recipes and seeds)."""
+    """What is known about the joint optimum of one level: a search result, and trained teams that may be better."""
 
-    level: Level
-    worlds: Worlds
-    searched: BestHarmTable
-    teams: tuple[Team, ...]
+    level: Level  # the level
+    worlds: Worlds  # worlds in which the optimum was searched
+    searched: BestHarmTable  # best harm and profiles that the search found in these worlds
+    teams: tuple[Team, ...]  # trained teams of the level, of all recipes and seeds
 
 
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
-    """Return each distinct search problem: the first level with it, the worlds to search, and all levels with it."""
+    """Return the searches for a joint optimum that are needed, one for all levels with the same optimum.
+
+    Levels have the same optimum if worlds and learners are alike for the search. Each item is: the first such level,
+    the worlds to search, and all such levels. Levels without learners need no search. ``samples`` holds the worlds of
+    each level of ``plan``, in the same order.
+    """
     found: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
     rows = np.arange(plan.search_episodes)
     for level, sample in zip(plan.levels, samples, strict=True):
@@ -55,7 +60,17 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
 
 
 def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
-    """Return the search results by level name, for every level with learners. Parts that exist already are reused."""
+    """Search the joint optimum of every level with learners, and return the results by the level's name.
+
+    Parts that were searched before are read from the plan's folder.
+
+    Args:
+        plan: settings of the ablation.
+        samples: worlds of each level of the plan.
+        jobs: number of threads.
+        tell: called with the progress.
+
+    """
     found: dict[str, BestHarmTable] = {}
     for level, part, alike in questions(plan, samples):
         table = search_list(
@@ -75,9 +90,13 @@ def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 
 def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
-    """Return the least harm [n] of each count over all ``answers`` that the learners of ``own`` can achieve too.
+    """Return the least known harm [n] in each world of a level, under each count of harm (m2/s2).
 
-    ``answers`` includes ``own``.
+    Args:
+        own: the level, with the result of its search and its trained teams.
+        answers: the same for all levels, including ``own``. A result of another level counts only in worlds in which
+            the learners of ``own`` can brake in the same way.
+
     """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
     for other in answers:
@@ -90,11 +109,11 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 
 
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
-    """Return the worlds [n] in which the learners of ``own`` can do whatever the learners of ``other`` do.
+    """Return in which worlds, [n] bool, the learners of ``own`` can do whatever the learners of ``other`` do.
 
-    This needs: the same learners or more, the same scripts for all others, equal latencies, and decisions of ``other``
-    that fall on decisions of ``own``. ``other`` may lack an obstacle, because its result is driven again with the
-    obstacle.
+    Conditions: ``own`` has the same learners or more, the other vehicles have the same scripts, latencies are equal,
+    and at every decision time of ``other`` the learners of ``own`` decide too. ``other`` may lack an obstacle, because
+    its result is driven again with the obstacle.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -109,7 +128,10 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
 
 
 def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
-    """Yield the harm of both counts that the search and every team of ``other`` cause in worlds ``rows`` of ``own``."""
+    """Yield the harm by the search result and by every team of ``other`` in the worlds ``rows`` of ``own``.
+
+    Each item maps a count of harm to the harm [rows] (m2/s2).
+    """
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
     for best in other.searched.best.values():
@@ -123,25 +145,30 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm by several trainings (or by one script) on the same worlds."""
+    """Harm of several trainings of one level (or of its scripts, as a single seed) on the same worlds."""
 
-    world: dict[HarmCount, Floats]  # [seeds, worlds] harm of all vehicles (m2/s2)
-    vehicle: dict[HarmCount, Floats]  # [seeds, worlds, N] harm of each vehicle (m2/s2)
-    collided: Bools  # [seeds, worlds]
+    world: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds] harm of the whole line (m2/s2)
+    vehicle: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds, N] harm of each vehicle (m2/s2)
+    collided: Bools  # [seeds, worlds] whether at least one impact happened
     policies: tuple[Mapping[str, str], ...] = ()  # for each seed: vehicle -> SHA-256 of its policy's manifest
-    ledgers: tuple[Ledger, ...] = ()  # one ledger for each seed
+    ledgers: tuple[Ledger, ...] = ()  # harm of all impacts, one ledger for each seed
 
 
 class Goal(NamedTuple):
-    """What the trainings of a level minimise, as a mean over seeds, worlds and learners, also for full braking."""
+    """The quantity that the trainings of a level minimise: its mean for the trained policies and for full braking."""
 
-    name: str
-    reached: float
-    full_brake: float
+    name: str  # name of the quantity: ``objective``, ``first-impact harm`` or ``total harm``
+    reached: float  # mean over seeds, worlds and learners, driven by the trained policies
+    full_brake: float  # the same mean if all vehicles brake fully
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """Return the goal of a training's reward: the harm of the line, or each learner's objective."""
+        """Return the quantity that ``training`` minimises, with its means.
+
+        It is the harm of the whole line, or, if recipe or scenario give the learners objectives of their own, the mean
+        of these. ``reached`` and ``full_brake`` are the harms by the trained policies and by full braking of all
+        vehicles.
+        """
         reward, scenario = training.recipe.reward, training.scenario
         objectives = reward.settled(scenario.objective, scenario.vehicles)[1]
 
@@ -155,30 +182,40 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether full braking by everybody does better than the trained policies."""
+        """Whether full braking by all vehicles does better than the trained policies."""
         return self.reached > self.full_brake + TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Results of one level with one training algorithm: harm, best known harm, shielded results and goal."""
+    """Results of one level of cooperation with one training algorithm on the same worlds as all other levels."""
 
-    level: Level
-    algorithm: str | None  # None: the level has no learner
+    level: Level  # the level
+    algorithm: str | None  # name of the algorithm (recipe and scheme); None: the level has no learner
     reached: Harms  # harm by the trained policies (or by the scripts)
     full_brake: Harms  # harm if all vehicles brake fully, whatever their roles
-    best: dict[HarmCount, Floats] | None  # [1, search_episodes] best known harm; None: the level has no learner
-    identity: Mapping[str, Any] = field(default_factory=dict)  # identity of worlds, scenario and software
-    shielded: dict[HarmCount, Shielded] | None = None  # [seeds, worlds] results behind the shield of each count
-    goal: Goal | None = None  # None: the level has no learner
+    # Count of harm -> [1, search_episodes] least known harm (m2/s2); None: the level has no learner.
+    best: dict[HarmCount, Floats] | None
+    identity: Mapping[str, Any] = field(default_factory=dict)  # hashes of worlds and scenario, and versions
+    # Count of harm -> results [seeds, worlds] behind a shield that bounds that harm; None: no shield requested.
+    shielded: dict[HarmCount, Shielded] | None = None
+    goal: Goal | None = None  # what the training minimises; None: the level has no learner
 
 
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
-    """Let all trained policies drive the common worlds, and search the joint optima. Existing parts are reused.
+    """Let the trained policies of all levels drive the same worlds, and search the joint optimum of each level.
 
-    Returns the results level by level in the plan's order, algorithm by algorithm. Where a policy does better than the
-    search, its harm becomes the best known harm of that world. Raises the exceptions of loading teams and of
-    ``common_worlds`` before any long work.
+    Parts of a search that exist already are reused. Where a policy does better than the search, its harm becomes the
+    best known harm of that world.
+
+    Args:
+        plan: settings of the ablation, whose trainings have finished.
+        jobs: number of threads of the search.
+        tell: called with the progress; None: silent.
+
+    Returns the results level by level in the plan's order, algorithm by algorithm. Raises the exceptions of loading
+    teams and of ``common_worlds`` before any long work.
+
     """
     say = tell or (lambda progress: None)
     teams: dict[tuple[str, str], list[Team]] = {}
@@ -223,7 +260,10 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 
 
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
-    """Return the harm by several drivers of one level on the same worlds."""
+    """Let each of ``drivers`` (agents or teams) drive the worlds of ``sample``, and return their harm.
+
+    Each of them counts as one seed.
+    """
     outcomes = []
     for driver in drivers:
         result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()

@@ -56,10 +56,11 @@ _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One level of an ablation: a scenario, and the level that it varies."""
+    """One level of cooperation in an ablation: a scenario, compared with others on the same lines of vehicles."""
 
-    scenario: Scenario
-    clear: str | None = None  # name of the level that differs only in ``v2x``; None: this level is on the ladder
+    scenario: Scenario  # who learns, who has which information, and whose harm counts
+    # Name of an earlier level from which this one differs only in its V2X channel (``v2x``); None: there is none.
+    clear: str | None = None
 
     @property
     def name(self) -> str:
@@ -68,11 +69,17 @@ class Level:
 
 
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
-    """Load the levels by name or path, in this order; ``settings`` override keys in each.
+    """Load the levels of an ablation, in this order.
 
-    A level that differs from an earlier one only in ``v2x`` is that level over another channel. The other levels form
-    the ladder; each is compared with the one before. Raises ``InvalidInput`` for fewer than two levels or a repeated
-    level, and the exceptions of ``load_runnable``.
+    A level that differs from an earlier one only in ``v2x`` is compared with that level (``Level.clear``). Each of the
+    other levels is compared with the one before; they form the *ladder*.
+
+    Args:
+        names: names or paths of scenarios.
+        settings: settings ``KEY=VALUE`` that override keys in each of them.
+
+    Raises ``InvalidInput`` for fewer than two levels or a repeated level, and the exceptions of ``load_runnable``.
+
     """
     levels: list[Level] = []
     for name in names:
@@ -94,7 +101,7 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
 
 
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
-    """Return the list of worlds of each level. World k is the same line with the same physics in all levels.
+    """Draw ``episodes`` worlds from ``seed`` for each level; world k is the same line of vehicles in all levels.
 
     Latencies may differ where ``v2x`` differs, and an obstacle ahead may be present or not. Raises ``InvalidInput``
     with the level and the quantity that differs, if another quantity differs.
@@ -125,7 +132,10 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
 
 
 def _values(name: str, level: Level, sample: Sample) -> Floats:
-    """Return a quantity of the worlds with one row per world, or a number of the scenario as one row."""
+    """Return the quantity called ``name``, such as ``gaps_m``, in the worlds of ``sample``: one row per world.
+
+    A number of the level's whole scenario, such as ``time_step_s``, gives a single row.
+    """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)
     values: Floats = getattr(sample.worlds if name in _WORLD else sample.worlds.vehicles, name)
@@ -141,27 +151,30 @@ _FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_ep
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Settings of an ablation."""
+    """Settings of an ablation, a comparison of trainings at several levels of cooperation."""
 
-    levels: tuple[Level, ...]
-    recipes: tuple[TrainingRecipe, ...]  # recipes with a scheme for several learners, see ``with_scheme``
+    levels: tuple[Level, ...]  # the compared levels, in order
+    recipes: tuple[TrainingRecipe, ...]  # how to train; each recipe names its scheme for several learners
     seeds: int  # trainings per level and recipe
     steps_per_learner: int  # decisions of each learner in a training
     episodes: int  # number of common worlds
-    list_seed: int  # seed of the list of worlds
-    search_episodes: int  # number of these worlds in which the joint optimum is searched
-    budget: int  # candidates per world and count of the search
-    folder: Path
+    list_seed: int  # seed of the common worlds
+    search_episodes: int  # number of these worlds, from the first on, in which the joint optimum is searched
+    budget: int  # candidate profiles that the search tries per world and count of harm
+    folder: Path  # folder of all results
     noted: tuple[str, ...] = ()  # overrides of scenarios and recipes, for ``config.json``
-    shield: str | None = None  # "step": everything also drives behind the step shield
+    shield: str | None = None  # "step": the trained policies also drive behind a shield in step mode; None: no shield
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Names of the compared algorithms: recipes with their scheme."""
+        """Names of the compared algorithms, ``RECIPE-SCHEME`` each."""
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Yield level, algorithm and training, seed by seed, so that a first result over all levels exists early."""
+        """Yield all trainings as (level, name of the algorithm, training), seed by seed.
+
+        So a first result over all levels exists early. Levels without learners are omitted.
+        """
         for seed in range(self.seeds):
             for recipe in self.recipes:
                 for level in self.levels:
@@ -169,7 +182,10 @@ class Plan:
                         yield level, algorithm(recipe), self.training(level, recipe, seed)
 
     def training(self, level: Level, recipe: TrainingRecipe, seed: int) -> TrainingJob:
-        """Return the training of one seed. Raises ``InvalidInput`` if recipe and level do not fit together."""
+        """Return the training of one recipe at one level with one seed, with its folder.
+
+        Raises ``InvalidInput`` if recipe and level do not fit together.
+        """
         learners = len(level.scenario.learners)
         changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
         if learners == 1:  # the scheme has no effect with one learner
@@ -179,7 +195,7 @@ class Plan:
         return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, self.noted)
 
     def settings(self) -> dict[str, Any]:
-        """Return all settings that affect the results, as plain data."""
+        """Return all settings that affect the results as plain data: levels, recipes, numbers and the shield."""
         numbers = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
         return {
             "levels": [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels],
@@ -189,18 +205,24 @@ class Plan:
         }
 
     def study_folder(self) -> StudyFolder:
-        """Return the folder of the study. It refuses to hold an ablation with other settings, to keep its results."""
+        """Return the object that guards the ablation's folder.
+
+        It refuses a folder with the results of an ablation with other settings.
+        """
         advice = f"give another folder (--output), or, to use its trainings, a copy of it without {SETTINGS}"
         written = (*FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 
     def optimum_folder(self, level: Level) -> Path:
-        """Return the folder with the parts of a level's search."""
+        """Return the path of the folder with the results of a level's search for the joint optimum."""
         return self.folder / "optimum" / level.name
 
 
 def with_scheme(recipe: TrainingRecipe, scheme: str | None = None) -> TrainingRecipe:
-    """Return the recipe with this scheme for several learners; None: its own scheme, or ``shared``."""
+    """Return the recipe with a scheme for several learners.
+
+    This is ``scheme``, or if it is None the recipe's own, or else ``shared``.
+    """
     return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
 
@@ -217,11 +239,19 @@ def plan_ablation(
     tell: Callable[[str], None] | None = None,
     **given: Any,
 ) -> Plan:
-    """Return the plan of an ablation.
+    """Return the plan of an ablation from the options of its command.
 
-    ``given`` are fields of ``Plan``; None means the value of ``quick``, or the default. Raises ``InvalidInput`` for
-    recipes with the same name, numbers below 1, an unknown shield, levels without any learner, and levels that cannot
-    be trained or compared.
+    Args:
+        levels: names or paths of scenarios with commas between them; None: the shipped levels.
+        recipes: names or paths of recipes with commas between them.
+        settings: settings ``KEY=VALUE`` of scenarios and recipes; None: none.
+        quick: use few seeds, worlds and decisions by default.
+        tell: called with notes about settings that do not fit together.
+        given: other fields of ``Plan``; None means the default.
+
+    Raises ``InvalidInput`` for recipes with the same name, numbers below 1, an unknown shield, levels without any
+    learner, and levels that cannot be trained or compared.
+
     """
     names = [*(LADDER if quick else STANDARD)] if levels is None else split_names(levels, os.path.isfile)
     loaded = [load_recipe(each.strip()) for each in split_names(recipes, os.path.isfile)]

@@ -30,7 +30,11 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 
 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
-    """Choose example worlds by the total harm that the ladder's last level saves against its first (first seed)."""
+    """Choose example worlds to watch, by the total harm that the last level of ``measured`` saves against the first.
+
+    These are the worlds with the largest, a median and the least saving by the policies of the first seed. Levels with
+    a worse V2X channel do not count.
+    """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]
     before, after = (one.reached.world["total"][0] for one in (first, last))
@@ -49,7 +53,7 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
 
 
 def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
-    """Return the page section with episodes to watch, level beside level.
+    """Return a section of the page with episodes to watch, level beside level, in the worlds of ``choose_worlds``.
 
     Each trained level drives with its first seed.
     """
@@ -77,7 +81,7 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """Return a CSV with one row per level, algorithm and seed: means over the worlds (m2/s2).
+    """Return CSV text with one row per level, algorithm and seed: means over the worlds (m2/s2).
 
     Columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
     Without a shield its columns are empty.
@@ -122,14 +126,25 @@ _ALGORITHM = "Algorithm"
 
 
 def markdown(found: Json, conditions: str) -> str:
-    """Return all tables as Markdown, with their conditions below."""
+    """Return all tables of an ablation as Markdown.
+
+    ``found`` is the content of ``ablation.json``; ``conditions`` is the text below the tables.
+    """
     blocks = [f"**{line}**" for line in found["undertrained"]]
     blocks += [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
 def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], episodes: Sequence[Section] = ()) -> str:
-    """Return one HTML page with the conditions, the figures (by file name), episodes to watch, and all tables."""
+    """Return the HTML page of an ablation.
+
+    Args:
+        found: content of ``ablation.json``.
+        conditions: text about worlds, seeds and machine.
+        figures: file name -> figure.
+        episodes: sections with episodes to watch.
+
+    """
     drawn = [
         Part.drawing(figure, *FIGURES[name], alone=name == "ablation-who-pays.png", known=conditions)
         for name, figure in figures.items()
@@ -151,7 +166,7 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
 
 
 def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
-    """Return titled groups of tables. The path of a column, keys separated by blanks, leads to its value in a row."""
+    """Return the tables of an ablation in groups, each as (title, tables); ``found`` is from ``ablation.json``."""
     levels = [{**level, "level": f"`{level['level']}`"} for level in found["levels"]]
     steps, channels = (
         [{**change, "from": f"`{change['from']}`", "to": f"`{change['to']}`"} for change in found[key]]
@@ -223,7 +238,11 @@ _Columns = list[tuple[Column | str, str]]
 
 
 def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
-    """Return a table; the algorithm's column is left out if there is only one algorithm."""
+    """Return a table with one line for each of ``rows`` (nested objects from ``ablation.json``).
+
+    A column is a pair of its heading, and the path to its value in a row: ``first harm`` leads to
+    ``row["first"]["harm"]``. The algorithm's column is left out if there is only one algorithm.
+    """
     if len({row["algorithm"] for row in rows} - {None}) == 1:
         columns = [(column, path) for column, path in columns if column != _ALGORITHM]
     cells: list[list[Any]] = []
@@ -238,7 +257,7 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
 
 def interval_words(seeds: int) -> str:
-    """Return a sentence on what confidence intervals over this number of seeds cover."""
+    """Return a phrase for captions about what 95 % intervals over this number of seeds cover."""
     if seeds == 1:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
@@ -250,7 +269,16 @@ def _share(heading: str) -> Column:
 
 
 def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:
-    """Write all files, replacing existing ones. Return the content of ``ablation.json``, and the other files' paths."""
+    """Write page, Markdown, CSV, JSON and figures of an ablation, replacing existing files.
+
+    Args:
+        plan: settings of the ablation.
+        measured: results of ``measure``.
+        machine: description of this machine, for the caption.
+
+    Returns the content of ``ablation.json``, and the paths of page, Markdown and figures.
+
+    """
     settings = {
         **plan.settings(),
         "levels": [level.name for level in plan.levels],

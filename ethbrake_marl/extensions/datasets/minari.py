@@ -55,11 +55,11 @@ _DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
 
 
 def check_folder(path: Path, *, force: bool = False) -> None:
-    """Check before any work that ``path`` can become the folder of a Minari dataset.
+    """Check, before any work, that a Minari dataset can be written to the folder ``path``.
 
-    Raises ``AlreadyExists`` if ``path`` exists and ``force`` is off. Raises ``InvalidInput`` if the name is not
-    ``NAME-vNUMBER``, if the parent is missing or cannot be written, or if ``force`` would replace something other than
-    a Minari dataset.
+    ``force``: a dataset that exists there may be replaced. Raises ``AlreadyExists`` if ``path`` exists and ``force`` is
+    off. Raises ``InvalidInput`` if the name is not ``NAME-vNUMBER``, if the parent is missing or cannot be written, or
+    if ``force`` would replace something other than a Minari dataset.
     """
     if _DATASET_NAME.fullmatch(path.name) is None:
         raise InvalidInput(f"{path}: a dataset of Minari is a folder called NAME-vNUMBER, for instance brakes-v0")
@@ -80,10 +80,19 @@ def check_folder(path: Path, *, force: bool = False) -> None:
 def minari_folder(
     path: Path, task: Task, told: Mapping[str, Any], *, force: bool
 ) -> Iterator[Callable[[Recording], None]]:
-    """Open a new Minari dataset; yield the function that adds a recording to it.
+    """Context manager: open a new Minari dataset, and yield the function that adds a recording to it.
 
-    The folder appears at ``path`` only when the block ends without an exception. ``told`` (what was recorded) is read
-    at that moment and stored in the dataset's metadata under ``KEY``, as JSON. Raises ``MissingExtra``.
+    The folder appears at ``path`` only when the block ends without an exception.
+
+    Args:
+        path: the folder, called ``NAME-vNUMBER``.
+        task: scenario, seed, reward and observation of the recordings.
+        told: metadata (``tell``), stored as JSON under the key ``ethbrake_marl``. It is read when the block ends, so
+            entries may be added until then.
+        force: replace an existing dataset.
+
+    Raises ``MissingExtra`` without minari or h5py.
+
     """
     with naming_extras():
         import h5py  # noqa: F401  # imported here so that a missing h5py raises our message, not Minari's
@@ -119,7 +128,7 @@ def minari_folder(
 
 
 def env_spec(task: Task) -> EnvSpec:
-    """Return the Gymnasium spec from which ``gymnasium.make`` makes the recorded environment.
+    """Return the Gymnasium spec from which ``gymnasium.make`` makes the environment of a recording's task.
 
     The spec holds plain data only, so it survives JSON. Raises ``InvalidInput`` unless exactly one vehicle learns.
     """
@@ -135,7 +144,7 @@ def env_spec(task: Task) -> EnvSpec:
 
 
 def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
-    """Yield the fields of an ``EpisodeBuffer`` for each world."""
+    """Yield the keyword arguments of Minari's ``EpisodeBuffer`` for each recorded episode."""
     vehicle, seed = recording.learners[0], recording.task.seed
     infos = _infos(recording, vehicle)
     reward, terminated, truncated = (np.stack([getattr(step, name) for step in recording.steps]) for name in OF_STEPS)
@@ -153,7 +162,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """Return the environment's infos by name, each [T + 1, n, ...]."""
+    """Return the infos that the environment gives to ``vehicle`` (0 = front), by name, each [T + 1, n, ...]."""
     told = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -178,14 +187,16 @@ _NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",
 
 @dataclass(frozen=True, slots=True)
 class DatasetSummary:
-    """Summary of a dataset that ``write_dataset`` wrote."""
+    """What ``write_dataset`` wrote: the file, its format, and numbers of episodes and decisions."""
 
-    path: Path
-    format: DatasetFormat
-    episodes: Mapping[str, int]  # number of episodes, by agent
-    decisions: int  # number of decisions in all episodes
-    off_by: Mapping[str, float]  # largest change of a world's harm by rounding to actions (m2/s2), by agent
-    left_out: tuple[LeftOut, ...]  # worlds that the physics could not advance
+    path: Path  # the file or folder
+    format: DatasetFormat  # ``parquet`` or ``minari``
+    episodes: Mapping[str, int]  # agent's name -> number of recorded episodes
+    decisions: int  # number of decisions in all episodes of all agents
+    # Agent's name -> largest difference (m2/s2) in a world between the harm of the recorded episode, whose actions are
+    # rounded to float32, and the harm with the agent's exact commands.
+    off_by: Mapping[str, float]
+    left_out: tuple[LeftOut, ...]  # worlds that were not recorded, because the physics could not advance them
 
 
 def write_dataset(
@@ -203,7 +214,8 @@ def write_dataset(
 ) -> DatasetSummary:
     """Record agents in the same worlds of an evaluation list, as a Parquet file or a Minari dataset.
 
-    The recorded actions replay bit for bit. docs/datasets.md describes the content.
+    An environment that takes the recorded actions repeats the episodes bit for bit. docs/datasets.md describes the
+    content.
 
     Args:
         path: the file (``.parquet``) or the folder (``NAME-v0``) to write.
@@ -266,9 +278,10 @@ def write_dataset(
 def check_dataset(
     path: str | Path, scenario: Scenario, format: str | None = None, *, force: bool = False
 ) -> DatasetFormat:
-    """Return the format of a dataset that can be written to ``path``.
+    """Check that a dataset of this scenario can be written to ``path``, and return its format.
 
-    Raises the exceptions that ``write_dataset`` raises before its work begins.
+    ``format`` None: chosen by the ending of ``path``. ``force``: an existing dataset may be replaced. Raises the
+    exceptions that ``write_dataset`` raises before its work begins.
     """
     target = Path(path)
     is_file = target.suffix.lower() == ".parquet"
@@ -293,7 +306,14 @@ def check_dataset(
 
 
 def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, Any]:
-    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and versions."""
+    """Return the metadata of a dataset as plain data: scenario, seed, agents, observation, reward and versions.
+
+    Args:
+        task: scenario, seed, reward and observation of the recordings.
+        agents: recorded agents by name.
+        episodes: number of worlds that each agent drives.
+
+    """
     scenario = task.scenario
     teams = {name: Team.of(driver, scenario.learners).drivers for name, driver in agents.items()}
     return {

@@ -24,10 +24,17 @@ OF_STEPS = ("reward", "terminated", "truncated")
 
 @contextmanager
 def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
-    """Open a new Parquet file; yield the function that adds a recording to it.
+    """Context manager: open a new Parquet file, and yield the function that adds a recording to it.
 
-    The file appears at ``path`` only when the block ends without an exception. ``told`` (what was recorded) is read at
-    that moment and stored in the file's metadata under ``KEY``. Raises ``MissingExtra``.
+    The file appears at ``path`` only when the block ends without an exception.
+
+    Args:
+        path: the file.
+        told: metadata (``tell``), stored as JSON under the key ``ethbrake_marl``. It is read when the block ends, so
+            entries may be added until then.
+
+    Raises ``MissingExtra`` without pyarrow.
+
     """
     with naming_extras():
         import pyarrow
@@ -42,16 +49,19 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 
 
 def decision_columns(recording: Recording) -> Columns:
-    """Return the columns of a recording: one row per decision, world by world. docs/datasets.md lists the columns."""
+    """Return a recording as table columns by name, one row per decision, world by world.
+
+    docs/datasets.md lists the columns.
+    """
     running = recording.running
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Return values [T or T + 1, n, ...] at the time of each decision, one row per decision."""
+        """Return values [T or T + 1, n, ...] as one row per decision that was made, world by world."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """Repeat a value of each episode, [n], in every row of the episode."""
+        """Return ``values`` [n], one per episode, repeated in every row (decision) of the episode."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

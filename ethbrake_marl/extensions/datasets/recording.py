@@ -39,12 +39,12 @@ SLACK = 1e-6  # m2/s2; no other rounding is tried for a smaller difference of ha
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Scenario, list of worlds, reward and observation of a recording."""
+    """What is recorded: scenario, seed of the worlds, reward and observation."""
 
-    scenario: Scenario
-    seed: int  # of the list of worlds
-    reward: RewardParams
-    observation: ObservationSpec
+    scenario: Scenario  # scenario of the worlds, whose learners are recorded
+    seed: int  # seed from which the worlds are drawn
+    reward: RewardParams  # reward that the learners receive
+    observation: ObservationSpec  # features that each learner observes
 
 
 @dataclass(frozen=True)
@@ -55,36 +55,39 @@ class Recording:
     features. Values after the end of an episode are meaningless.
     """
 
-    agent: str
-    task: Task
-    index: Ints  # [n] numbers of the worlds in their list
+    agent: str  # name of the agent
+    task: Task  # scenario, seed, reward and observation
+    index: Ints  # [n] number of each world in the list of the seed
     decisions: Ints  # [n] number of decisions of each episode
-    observations: Float32s  # [T + 1, n, L, F]; the last observation is at the end of the episode
-    actions: Float32s  # [T, n, L]
-    steps: tuple[Step, ...]  # T
-    reports: tuple[Report, ...]  # T + 1; ``reports[t + 1]`` holds the infos after step t
+    observations: Float32s  # [T + 1, n, L, F] observations at each decision, then at the end of the episode
+    actions: Float32s  # [T, n, L] actions in [-1, 1]
+    steps: tuple[Step, ...]  # T results of ``Engine.step``, with rewards and ends of episodes
+    reports: tuple[Report, ...]  # T + 1 sets of infos; ``reports[t + 1]`` is after step t, ``reports[0]`` at the alert
     positions_m: Floats  # [T + 1, n, N] positions of the front bumpers; Vehicle 1 is at 0 at the alert
-    speeds_mps: Floats  # [T + 1, n, N]
-    ledger: Ledger  # harm of the episodes
-    off_by: float  # largest change of a world's harm by rounding the commands to actions (m2/s2)
+    speeds_mps: Floats  # [T + 1, n, N] speeds
+    ledger: Ledger  # harm of all impacts of each episode
+    off_by: float  # largest change of a world's harm because commands were rounded to float32 actions (m2/s2)
 
     @property
     def learners(self) -> tuple[int, ...]:
-        """Indices of the controlled vehicles."""
+        """Indices (0 = front) of the L recorded learners."""
         return self.task.scenario.learners
 
     @cached_property
     def running(self) -> Bools:
-        """Mask of the decisions that were made, [n, T]."""
+        """Whether each decision was made before the end of its episode, [n, T] bool."""
         mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
         return mask
 
     def told(self, column: str) -> Floats:
-        """Return one column of the infos of all vehicles, [T + 1, n, N]."""
+        """Return the column of the environment's infos with this name, such as ``time_s``, [T + 1, n, N]."""
         return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
-        """Return each term of the reward before its weight, after every step, [T + 1, n, L]. Row 0 is 0."""
+        """Return each term of the reward, without its weight, by name: [T + 1, n, L].
+
+        Entry t + 1 belongs to step t; entry 0 is 0.
+        """
         shape = (len(self.index), self.task.scenario.vehicles)
         found = {}
         for name in self.reports[0].terms:
@@ -95,9 +98,18 @@ class Recording:
 
 
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
-    """Let ``driver`` control the scenario's learners in these worlds; record the episodes of its rounded actions.
+    """Let an agent control the scenario's learners in these worlds, and record the episodes.
+
+    The agent's commands are rounded to float32 actions; the recorded episodes are those with the rounded actions.
+
+    Args:
+        sample: the worlds at the alert.
+        driver: agent or team.
+        name: name of the agent in the recording.
+        task: scenario, seed, reward and observation to record.
 
     Raises ``PhysicsError`` with the worlds that could not be advanced, and whatever ``episode_engine`` raises.
+
     """
     scenario, learners = task.scenario, task.scenario.learners
     engine = episode_engine(sample.worlds, Team.of(driver, learners), scenario)
@@ -134,7 +146,17 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 
 
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
-    """Return the actions to play, [T, n, L], and how much they change the harm of the commands, [n] m2/s2."""
+    """Round commands to float32 actions so that harm changes least.
+
+    Args:
+        commanded: [T, n, L] commands as exact actions in [-1, 1] (float64).
+        worlds: the worlds at the alert.
+        evaluated: harm of the episodes with the exact commands.
+        task: scenario, seed, reward and observation.
+
+    Returns the rounded actions [T, n, L], and how much they change the harm of each world, [n] m2/s2.
+
+    """
     nearest = commanded.astype(np.float32)
     best, off_by = nearest.copy(), _off_by(nearest, worlds, evaluated, task)
     rows = np.flatnonzero(off_by > SLACK)
@@ -149,7 +171,10 @@ def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -
 
 
 def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
-    """Return how much these actions change the evaluated harm: the larger of the two counts, [n] m2/s2."""
+    """Return how much these actions [T, n, L] change the ``evaluated`` harm of each world, [n] m2/s2.
+
+    It is the larger change of first-impact and total harm.
+    """
     engine = _learners_engine(worlds, task)
     step = 0
     while not engine.ended.all():
@@ -162,7 +187,10 @@ def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) ->
 
 
 def _learners_engine(worlds: Worlds, task: Task) -> Engine:
-    """Return an engine at the alert of ``worlds`` in which the learners take actions, as in an environment."""
+    """Return an engine at the alert of ``worlds`` in which the learners take actions, as in an environment.
+
+    Scenario, reward, observation and seed are those of ``task``.
+    """
     engine = Engine(
         task.scenario,
         worlds.n,

@@ -29,7 +29,7 @@ _SAME_S = 1e-9  # tolerance for rounding in an elapsed time
 
 
 class Parameters:
-    """Parameters of one law as attributes, in SI units."""
+    """Parameters of one law (a controller's formula) as attributes, in SI units; ``LAWS`` lists their names."""
 
     def __init__(self, **values: float) -> None:
         self.__dict__.update(values)
@@ -45,16 +45,16 @@ class Seen(NamedTuple):
     is one. Without an obstacle, and for a vehicle that has received nothing, the road ahead is free.
     """
 
-    gap_m: Floats  # gap to the vehicle or obstacle ahead; infinite if nothing is ahead
-    speed_mps: Floats  # own speed
-    front_mps: Floats  # speed of the vehicle or obstacle ahead
-    front_mps2: Floats  # acceleration in force of the vehicle ahead
-    own_mps2: Floats  # own acceleration in force
-    step_s: float  # time to the next decision
+    gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
+    speed_mps: Floats  # [n] own speed
+    front_mps: Floats  # [n] speed of the vehicle or obstacle ahead
+    front_mps2: Floats  # [n] present commanded acceleration of the vehicle ahead
+    own_mps2: Floats  # [n] own present commanded acceleration
+    step_s: float  # time until the next decision (s)
 
     @classmethod
     def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
-        """Return what ``vehicle`` (0 = front) knows in these worlds."""
+        """Return what ``vehicle`` (0 = front) knows in these worlds; ``step_s`` is the time between decisions (s)."""
         told, own, none = Told.to(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
         gap, front, force = told.obstacle_m, none, none
         if vehicle:
@@ -84,7 +84,11 @@ class Seen(NamedTuple):
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the next command towards ``wanted_mps2`` when braking grows by at most ``rate_mps3``."""
+        """Return the command [n] (m/s2) for the next time step, if braking can only build up gradually.
+
+        It is ``wanted_mps2`` [n], but the deceleration exceeds the vehicle's present one by at most ``rate_mps3`` times
+        the time step.
+        """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
@@ -133,13 +137,17 @@ def _human_notices(seen: Seen, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """Return 0 beyond the safe distance, 1 within the unsafe distance, and a linear value between."""
+    """Return a fuzzy degree of danger [n]: 0 beyond the safe distance, 1 within the unsafe one, linear between."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
 
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
-    """Return the proactive and the critical fuzzy criterion of the fuzzy safety model, each [n] from 0 to 1."""
+    """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n] from 0 to 1.
+
+    0 means no danger, 1 full danger. ``seen`` is what the vehicle knows about the one ahead, and ``p`` the parameters
+    of the law ``r157_fsm``.
+    """
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
     proactive = _share(
@@ -175,14 +183,16 @@ def _aeb(seen: Seen, p: Parameters) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """One controller: a formula for the acceleration, [n] m/s2, its parameters and its source."""
+    """One controller from the literature: a formula for the acceleration, its parameters and its source."""
 
-    about: str
-    source: str
-    parameters: Mapping[str, float]  # SI units
-    command: Callable[[Seen, Parameters], Floats]
-    notices: Callable[[Seen, Parameters], Bools] | None = None  # where the law sees a danger; None: it always acts
+    about: str  # name of the controller, for lists
+    source: str  # publication
+    parameters: Mapping[str, float]  # default value of each parameter, in SI units
+    command: Callable[[Seen, Parameters], Floats]  # formula that returns the acceleration, [n] m/s2
+    # Formula that returns for each world whether the law sees a danger, [n] bool; None: it acts from the start.
+    notices: Callable[[Seen, Parameters], Bools] | None = None
     stays: bool = False  # whether the reaction continues after the danger is over
+    # Names of parameters that may be 0; all others must be above 0.
     may_be_zero: frozenset[str] = field(default=frozenset({"T", "s0", "rho", "reaction", "perception", "release"}))
 
 
@@ -225,20 +235,31 @@ LAWS: dict[str, Law] = {
 
 
 class Controller:
-    """Agent that follows a ``Law``. Its memory is the time at which it noticed the danger, [n] s.
+    """Agent that follows a ``Law``, a controller's formula from the literature.
+
+    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet; NaN: before its first
+    decision.
 
     The reaction time runs from the decision at which the controller notices the danger. A danger that exists at the
-    first decision counts as noticed at the alert, so reaction time and latency overlap. The human model continues a
-    reaction once it has begun. The fuzzy model starts over when the danger is gone.
+    first decision counts as noticed at the alert, so reaction time and latency overlap. If
+    ``law.stays``, a reaction that has begun goes on after the danger is over (law ``r157_human``); else the controller
+    waits for the next danger (law ``r157_fsm``).
+
+    Args:
+        name: spec of the agent.
+        law: the formula.
+        parameters: value of each of the law's parameters.
+        step_s: time between two decisions (s).
+
     """
 
-    knows = Source.MESSAGES
+    knows = Source.MESSAGES  # it decides from the messages that have reached it
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Return the initial memory: NaN, because no decision was made yet.
+        """Return the initial memory [n]: NaN, because no decision was made yet.
 
         Raises ``InvalidInput`` where messages of the vehicle ahead lack what a law reads, and no sensor measures it.
         """
@@ -248,7 +269,11 @@ class Controller:
         return np.full(alert.n, np.nan)
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
-        """Return the command of the law within the vehicle's capacities, [n] m/s2, and the new memory."""
+        """Return the command of the law within the vehicle's capacities, [n] m/s2, and the new memory [n].
+
+        ``memory`` is the new memory of the last call, or that of ``begin``; ``vehicle`` is this vehicle's index (0 =
+        front).
+        """
         seen, p, vehicles = Seen.of(worlds, vehicle, self.time_step_s), self.parameters, worlds.vehicles
         command = self.law.command(seen, p)
         if self.law.notices is not None:
@@ -264,10 +289,16 @@ class Controller:
 
 
 def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
-    """Return the controller named by ``settings.spec``. ``argument`` sets parameters: ``T=1.0`` or ``T=1.0:a=2``.
+    """Return the controller of a spec such as ``idm:T=1.0``.
+
+    Args:
+        argument: the part of the spec after the name, which sets parameters: ``T=1.0`` or ``T=1.0:a=2``; None: all
+            parameters have their default values.
+        settings: the whole spec, and the scenario's time step.
 
     Raises ``UnknownName`` for a parameter that the law does not have, and ``InvalidInput`` for a value that is not a
     number in range.
+
     """
     name = settings.spec.partition(":")[0]
     law, where = LAWS[name], f"agent {settings.spec!r}"

@@ -8,8 +8,8 @@ rest, resolves impacts and keeps the ledger of harm. Every step has three parts:
 3. *Meet.* Pairs that overlap and still close exchange velocity, unless the host resolves impacts itself and reports
    them.
 
-Latencies are rounded up to whole steps of the host, and agents know the rounded value, so no decision falls between
-two steps.
+Latencies are rounded up to whole steps of the host, and agents know the rounded value, so no decision falls between two
+steps.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ SNAP = 1e-6  # times closer than this share of a step count as equal
 
 
 class HostState(NamedTuple):
-    """State that a host reports of its ``n`` lines of ``N`` vehicles, from front to rear.
+    """State that a host (another simulator or a test bench) reports of its ``n`` lines of ``N`` vehicles.
 
     >>> import ethbrake_marl as eb
 
@@ -74,12 +74,12 @@ class HostState(NamedTuple):
 
     time_s: ArrayLike  # a number or [n]: time on the host's own clock, which may start anywhere
     gaps_m: ArrayLike  # [n, N - 1] bumper to bumper; below 0 where bodies overlap
-    speeds_mps: ArrayLike  # [n, N]
+    speeds_mps: ArrayLike  # [n, N] speed of each vehicle, front to rear
     impacts: Impacts | None = None  # impacts since the last state, if the host resolves impacts itself
 
 
 class HostCommand(NamedTuple):
-    """Command to a host for one step.
+    """Command to a host (the simulator that moves the vehicles) for one step.
 
     >>> import ethbrake_marl as eb
 
@@ -89,17 +89,19 @@ class HostCommand(NamedTuple):
 
     """
 
-    acceleration_mps2: Floats  # [n, N] constant over the step; respects latency, rest and the speed limit
-    speeds_mps: Floats  # [n, N] at the start of the step: the reported speeds, except after an impact
-    wanted_mps2: Floats  # [n, N] the decided command, for a host that handles rest and latencies itself
+    acceleration_mps2: Floats  # [n, N] acceleration over the step, with latency, rest and speed limit applied
+    speeds_mps: Floats  # [n, N] speeds at the start of the step: the reported ones, or others after an impact
+    wanted_mps2: Floats  # [n, N] acceleration that agents decided, for a host that handles rest and latencies itself
     until_s: Floats  # [n] time since the alert at which the step ends
 
 
 class Host(Protocol):
-    """Interface of a simulator that moves ``n`` lines of vehicles. It starts at the alert.
+    """Interface of a host, a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
 
-    ``dt``: length of every step (s). With ``math.inf`` each world moves to its own ``command.until_s``, the time of its
-    next decision; a world that is already there does not move.
+    A host needs the attribute ``dt`` and the methods ``state`` and ``apply``; it need not inherit from this class.
+
+    ``dt`` is the length of every step (s). With ``math.inf`` each world moves to its own ``command.until_s``, the time
+    of its next decision; a world that is already there does not move.
 
     >>> import ethbrake_marl as eb
 
@@ -124,14 +126,16 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present state of the vehicles."""
+        """Return the present time, gaps and speeds, and impacts since the last call if the host reports impacts."""
 
     def apply(self, command: HostCommand) -> None:
-        """Move all vehicles by one step."""
+        """Move all vehicles by one step, as ``command`` says."""
 
 
 class HostFailed(EthBrakeError):
-    """Raised if a host raises or reports an impossible state. ``ledger`` and ``worlds`` hold the state until then.
+    """Raised if a host raises an exception or reports an impossible state.
+
+    Its attributes ``ledger`` and ``worlds`` hold the harm and the last valid state; ``reason`` is the message.
 
     >>> import ethbrake_marl as eb
 
@@ -147,16 +151,16 @@ class HostFailed(EthBrakeError):
 
 
 class Hosted(NamedTuple):
-    """Result of an agent in a host."""
+    """Result of an agent that drove vehicles in a host (another simulator)."""
 
-    outcome: Outcome
-    # [n] True where the host moved otherwise than the shield predicted, so that its promise does not hold; None unless
-    # a shield of mode step or robust compares its prediction with the host
+    outcome: Outcome  # harm and final state of each world
+    # [n] whether the host moved otherwise than the shield predicted, so that the shield's bound does not hold. None
+    # without a shield of mode step or robust, because only these compare their prediction with the host.
     distrusted: Bools | None
 
     @classmethod
     def join(cls, parts: list[Hosted]) -> Hosted:
-        """Join the results of consecutive batches of worlds."""
+        """Join the results of consecutive batches of worlds, in their order, into one result."""
         distrusted = [part.distrusted for part in parts if part.distrusted is not None]
         outcome = Outcome.join([part.outcome for part in parts])
         return cls(outcome, np.concatenate(distrusted) if distrusted else None)
@@ -172,9 +176,9 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
         scenario: the scenario; its scripts control the other vehicles, and agents know these scripts.
         worlds: the worlds at the alert with which the host was set up. Only gaps and speeds are read from the host.
 
-    Returns the ``outcome``, and in which worlds a shield ``distrusted`` the host. Raises ``InvalidInput`` for a
-    scenario, agent or worlds that a host does not support, and ``HostFailed`` if the host raises or reports an
-    impossible state.
+    Returns the outcome, and the worlds in which the host moved otherwise than a shield predicted. Raises
+    ``InvalidInput`` for a scenario, agent or worlds that a host does not support, and ``HostFailed`` if the host raises
+    or reports an impossible state.
 
     """
     scenario = load_scenario(scenario)
@@ -189,9 +193,15 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 
 
 class _Grid:
-    """Decision times of vehicles that decide together: ``first_s`` [n] and every time step after it.
+    """Decision times of vehicles that decide together: a first time in each world, and every time step after it.
 
     ``made`` [n] counts the decisions so far, ``all`` [n] the decisions until the horizon.
+
+    Args:
+        first_s: [n] time of the first decision.
+        vehicles: indices (0 = front) of the vehicles.
+        scenario: scenario, for time step and horizon.
+
     """
 
     def __init__(self, first_s: Floats, vehicles: list[int], scenario: Scenario) -> None:
@@ -201,16 +211,19 @@ class _Grid:
 
     @property
     def next_s(self) -> Floats:
-        """Time of the next decision, [n]; the horizon after the last decision."""
+        """Time of the next decision in each world, [n] s; after the last decision, the horizon."""
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Return where the next decision, or the horizon, is due at ``time_s``."""
+        """Return whether the next decision, or the horizon, is due at the times ``time_s`` [n], as [n] bool."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
 class _Run:
-    """Running episodes in a host: decisions, latencies, impacts and harm, around the host's steps."""
+    """Running episodes in a host: decisions, latencies, impacts and harm, around the host's steps.
+
+    The arguments are those of ``drive_host``; ``team`` holds the agent of each learner.
+    """
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -242,7 +255,7 @@ class _Run:
         self.at_rest: Bools = np.zeros(worlds.n, np.bool_)
 
     def to_the_end(self) -> Hosted:
-        """Run every world to the end of its episode."""
+        """Run every world to the end of its episode, and return the result."""
         if self.exact:
             self._move()  # to the first decision
         while not self.ended.all():
@@ -257,7 +270,7 @@ class _Run:
 
     # decisions
     def _decide(self) -> None:
-        """Ask every vehicle whose decision is due. All of them see the same state."""
+        """Let every vehicle decide whose decision is due. All of them see the same state."""
         each = [~self.ended & (grid.made < grid.all) & grid.is_due(self.time_s) for grid in self.grids]
         if not np.any(each):
             return
@@ -276,7 +289,14 @@ class _Run:
             grid.made = grid.made + due
 
     def _ask_guard(self, worlds: Worlds, due: Bools, idle: Ints) -> None:
-        """Let the policies behind the shield propose actions, and adopt the actions that the shield applies."""
+        """Let the policies behind the shield propose actions, and use the actions that the shield applies.
+
+        Args:
+            worlds: the present state.
+            due: [n] whether a decision is due in each world.
+            idle: row numbers of the other worlds, whose memories stay as they are.
+
+        """
         engine = self.engine
         assert engine.guard is not None
         engine.place(worlds, self.ledger, ended=~due)
@@ -289,7 +309,7 @@ class _Run:
             self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
 
     def _seen(self) -> Worlds:
-        """Return the worlds as agents see them."""
+        """Return the present state as agents see it: nearly standing vehicles stand, and gaps are at least 0."""
         latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
         in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
         if not self.exact:
@@ -298,7 +318,7 @@ class _Run:
         return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
 
     def _end(self) -> None:
-        """Mark the episodes that end with this step. Their controlled vehicles brake fully from now on."""
+        """Mark the episodes that end with the last step. Their controlled vehicles brake fully from now on."""
         first = self.grids[0]
         if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
             return
@@ -313,7 +333,7 @@ class _Run:
 
     # the host's steps
     def _move(self) -> None:
-        """Let the host make one step, then resolve impacts unless the host reported them."""
+        """Let the host make one step, check the state that it reports, and resolve impacts unless it reported them."""
         if self.exact:
             until = np.minimum.reduce([grid.next_s for grid in self.grids])
             until = np.where(self.ended, self.time_s, np.maximum(until, self.time_s))
@@ -344,8 +364,15 @@ class _Run:
 
         A pair has an impact if its gap is at most 0 and still closes. At the end of the step let w be the closing
         speed, g <= 0 the gap, and b the mean closing acceleration of the step. A pair that was apart before the step
-        met with the closing speed ``sqrt(w^2 + 2 b g)``; this speed counts as harm and enters eq. (13). Returns the
-        impacts.
+        met with the closing speed ``sqrt(w^2 + 2 b g)``; this speed counts as harm and enters eq. (13).
+
+        Args:
+            before_m: [n, P] gaps before the step.
+            begin: [n, N] speeds at the start of the step.
+            step_s: [n] length of the step.
+
+        Changes ``speeds_mps``, and returns the impacts.
+
         """
         v, gaps, speeds, told = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
         first, total, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
@@ -365,7 +392,11 @@ class _Run:
         return Impacts(first, total, count, *Impacts.no_obstacle(len(gaps)))
 
     def _read(self) -> tuple[Floats, Floats, Floats, Impacts | None]:
-        """Return the host's time since the alert, gaps, speeds and impacts, as checked copies."""
+        """Read the host's state, and return checked copies.
+
+        These are the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: not reported). Raises
+        ``HostFailed`` for an exception, a wrong shape or a number that is not finite.
+        """
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
         try:
             state = HostState(*self.host.state())
@@ -392,7 +423,10 @@ class _Run:
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:
-        """Return gaps and speeds at the alert, and set the origin of the host's clock."""
+        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and set the origin of its clock.
+
+        Raises ``HostFailed`` if they differ from the worlds with which the host was set up.
+        """
         self.origin_s, gaps, speeds, _ = self._read()
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
             if not (close := np.abs(told - given) <= STARTS_WITHIN).all():
@@ -404,7 +438,7 @@ class _Run:
         return np.maximum(gaps, 0.0), speeds
 
     def _check_clock(self, time_s: Floats, until: Floats) -> None:
-        """Raise ``HostFailed`` unless the host's clock is at ``until``, to half a step."""
+        """Raise ``HostFailed`` unless the host's clock ``time_s`` [n] is at ``until`` [n], to half a step."""
         within = SNAP * self.scenario.time_step_s if self.exact else self.dt / 2.0
         if not (good := np.abs(time_s - until) <= within).all():
             k = int(np.argmin(good))
@@ -422,17 +456,19 @@ class _Run:
 class _Step(NamedTuple):
     """One step of a host: its command and the state that it reported at the end."""
 
-    wanted_mps2: Floats  # [n, N]
-    begin_mps: Floats  # [n, N] commanded speeds at the start
-    until_s: Floats  # [n] commanded end
-    clock_s: Floats  # [n] length on the host's clock
-    gaps_m: Floats  # [n, N - 1]
-    speeds_mps: Floats  # [n, N]
-    impacts: Impacts | None
+    wanted_mps2: Floats  # [n, N] acceleration that the agents decided
+    begin_mps: Floats  # [n, N] speeds at the start of the step, as commanded to the host
+    until_s: Floats  # [n] time since the alert at which the step should end
+    clock_s: Floats  # [n] length of the step on the host's own clock (s)
+    gaps_m: Floats  # [n, N - 1] reported gaps at the end; below 0 where bodies overlap
+    speeds_mps: Floats  # [n, N] reported speeds at the end
+    impacts: Impacts | None  # impacts in the step; None: the host does not report impacts
 
 
 class _Motion:
-    """Ranges in which the vehicles of a host can be, given the commands since the alert.
+    """Ranges in which the gaps and speeds of a host's vehicles can be, given the commands since the alert.
+
+    ``alert`` are the worlds at the alert, ``dt`` is the length of the host's steps (s; infinite: each to a decision).
 
     Three rules refuse an impossible state:
 
@@ -455,7 +491,10 @@ class _Motion:
         self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # tolerance of led_mps, without the delay
 
     def refusal(self, step: _Step) -> tuple[int, str] | None:
-        """Return a world and what is impossible in it, or None if every reported state is possible."""
+        """Check the state that the host reported at the end of ``step``.
+
+        Returns the row number of a world and what is impossible in it, or None if every state is possible.
+        """
         acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
         command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
         met = self._met(step)
@@ -479,7 +518,7 @@ class _Motion:
         return self.time_s[:, np.newaxis]
 
     def _met(self, step: _Step) -> Bools:
-        """Return which vehicles may have pushed one another, [n, N]."""
+        """Return which vehicles may have pushed one another during the step, [n, N] bool."""
         met = np.zeros(step.speeds_mps.shape, np.bool_)
         if step.impacts is not None:
             touch = (step.impacts.count > 0) | (np.minimum(step.gaps_m, self.gaps_m) <= READ_WITHIN)
@@ -488,7 +527,10 @@ class _Motion:
         return met
 
     def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
-        """Return the least and the greatest possible speed at the end of the step, each [n, N] m/s."""
+        """Return the least and the greatest possible speed at the end of the step, each [n, N] m/s.
+
+        ``met`` [n, N]: vehicles that may have pushed one another.
+        """
         # a host that handles latencies itself does not round them up to whole steps
         begun = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
         command = np.where(begun, step.wanted_mps2, 0.0)
@@ -524,7 +566,13 @@ class _Motion:
     def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
         """Return the first reported speed that the commands since the alert rule out, and what is wrong with it.
 
-        ``change`` [n, N] m/s is what the command alone adds to the speed in this step.
+        Args:
+            step: the step.
+            met: [n, N] vehicles that may have pushed one another, which are not checked.
+            change: [n, N] m/s that the command alone adds to the speed in this step.
+
+        Returns the row number of the world and a message; None if all speeds are possible.
+
         """
         began = self.led_mps + step.begin_mps - self.speeds_mps
         led = held_speeds(began, change, self.vehicles.speed_limit_mps, 1.0)
@@ -543,7 +591,10 @@ class _Motion:
 def _refused(
     values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
 ) -> tuple[int, str] | None:
-    """Return the world of the first value outside its range and a description of the fault, or None."""
+    """Find the first of ``values`` [n, entries] outside its range from ``low`` to ``high``.
+
+    Returns its row, and ``describe(row, entry, range in words)``; None if all values are in range.
+    """
     good = (low <= values) & (values <= high)
     if good.all():
         return None
@@ -552,7 +603,7 @@ def _refused(
 
 
 def _checked_dt(host: Host, scenario: Scenario) -> float:
-    """Return the host's step length.
+    """Return the length of the host's steps (s), its ``dt``.
 
     Raises ``InvalidInput`` for an object that is not a host, and for a step that does not divide the scenario's time
     step.
@@ -572,9 +623,9 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
 
 
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
-    """Raise ``InvalidInput`` if the worlds have brake build-up, columns of messages or an obstacle.
+    """Raise ``InvalidInput`` if the worlds have brakes that build up, columns of messages or an obstacle.
 
-    A host provides gaps and speeds only, so it cannot represent these.
+    A host provides gaps and speeds only, so it cannot represent these. ``vehicles``: indices of controlled vehicles.
     """
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
@@ -583,7 +634,7 @@ def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) 
 
 
 def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
-    """Return the vehicles with latencies rounded up to whole steps of ``dt``."""
+    """Return the vehicles of these worlds with all latencies rounded up to whole steps of ``dt`` (s)."""
 
     def up(seconds: Floats) -> Floats:
         return np.ceil(seconds / dt - SNAP) * dt

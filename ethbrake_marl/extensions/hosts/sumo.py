@@ -71,7 +71,7 @@ class SumoHost:
         self._speeds: Floats = np.array(self.state().speeds_mps)
 
     def state(self) -> HostState:
-        """Return gaps and speeds as SUMO reports them."""
+        """Return time, gaps and speeds as SUMO reports them."""
         vehicle = self._sumo.vehicle
         place = np.array([[vehicle.getLanePosition(name) for name in line] for line in self._names])
         self._speeds = np.array([[vehicle.getSpeed(name) for name in line] for line in self._names])
@@ -79,7 +79,7 @@ class SumoHost:
         return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
 
     def apply(self, command: HostCommand) -> None:
-        """Set the speeds at the end of the step and let SUMO make the step."""
+        """Set the speed of every vehicle at the end of the step from ``command``, and let SUMO make the step."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
         end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
@@ -90,12 +90,12 @@ class SumoHost:
         self._sumo.simulationStep()
 
     def close(self) -> None:
-        """End the simulation."""
+        """End the SUMO simulation, so that this process can start another one."""
         self._sumo.close()
 
 
 def _net(edges: int) -> str:
-    """Return SUMO's network: straight edges of one lane, side by side."""
+    """Return the XML of SUMO's network: ``edges`` straight roads of one lane, side by side, one for each world."""
     lines = []
     for k in range(edges):
         y = 10.0 * k
@@ -113,7 +113,11 @@ def _net(edges: int) -> str:
 
 
 def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
-    """Return SUMO's routes: all vehicles at their start, the last of each line at ``_SUMO_EDGE_M / 10``."""
+    """Return the XML of SUMO's routes file: all vehicles with their positions and speeds at the alert.
+
+    ``names`` holds the names of the vehicles of each world, front to rear. The last vehicle of each line stands at a
+    tenth of its edge.
+    """
     lines = [
         f'<vType id="v" length="{_SUMO_LENGTH_M}" minGap="0" tau="0.001" sigma="0" accel="1000" decel="1000"'
         ' emergencyDecel="1000" maxSpeed="200"/>'
@@ -132,10 +136,10 @@ def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
 
 
 class FoundHost(NamedTuple):
-    """A host by name: ``name`` for tables, and ``open`` to start a host with the given worlds."""
+    """A kind of host (a simulator that moves the vehicles), chosen by its name on a command line."""
 
-    name: str
-    open: Callable[[Worlds], AbstractContextManager[Host]]
+    name: str  # name and version, for tables
+    open: Callable[[Worlds], AbstractContextManager[Host]]  # starts a host at the alert of these worlds, for ``with``
 
     def evaluate(
         self,
@@ -147,9 +151,19 @@ class FoundHost(NamedTuple):
         at_once: int = 100,
         on_progress: Callable[[str, int], None] = lambda agent, done: None,
     ) -> tuple[Evaluation, dict[str, Bools | None]]:
-        """Evaluate agents in hosts of ``at_once`` worlds each.
+        """Let agents drive the scenario's learners in hosts, in the same worlds.
 
-        Returns the evaluation, and for each agent the worlds in which its shield distrusted the host.
+        Args:
+            sample: the worlds at the alert.
+            agents: agents or teams by name.
+            scenario: scenario of the worlds.
+            seed: seed of the worlds, which is recorded; None for worlds of other origin.
+            at_once: number of worlds in one host.
+            on_progress: called with an agent's name and the number of its worlds done.
+
+        Returns the evaluation, and for each agent in which worlds [n] the host moved otherwise than its shield
+        predicted (None without such a shield).
+
         """
         found: dict[str, Hosted] = {}
         for spec, agent in agents.items():
@@ -169,7 +183,7 @@ class FoundHost(NamedTuple):
 
 
 def find_host(spec: str) -> FoundHost:
-    """Return the host of a spec: ``sumo``, or ``sumo:0.05`` with the step length in s.
+    """Return the kind of host that a spec names: ``sumo``, or ``sumo:0.05`` with the step length in s.
 
     Raises the exceptions of ``SumoHost``.
     """

@@ -23,22 +23,29 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 
 
 class Deterministic(BasePolicy):
-    """Policy without noise: its actions are its ``means``, clipped to [-1, 1]."""
+    """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1].
+
+    A subclass defines ``means`` and ``forward``, and ``expect`` if decisions are drawn by their expected gradient. It
+    can define ``act`` instead of ``means`` if it has no outputs to clip.
+    """
 
     def means(self, observation: Float32s) -> Float32s:
-        """Return the outputs [rows] of the learning weights for observations [rows, F], before clipping."""
+        """Return the outputs [rows] of the network in training for observations [rows, F], before clipping."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the expected size of the gradient, [rows]."""
+        """Return a prediction, [rows], of how strongly the return depends on the action at observations [rows, F].
+
+        It is the expected absolute gradient of the return with respect to the action.
+        """
         raise NotImplementedError
 
     def act(self, observation: Float32s) -> Float32s:
-        """Return the actions [rows], in [-1, 1]."""
+        """Return the actions [rows], in [-1, 1], for observations [rows, F]."""
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the driving weights, named as in a policy bundle with this network."""
+        """Return copies of the averaged weights, by their names in the policy bundle that ``network`` describes."""
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -47,9 +54,16 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor with weights that learn (``learning``) and the running average of these weights, which drives.
+    """Actor with two copies of its network: one in training (``learning``), and the running average of its weights.
 
-    The average has the parameter names of Stable-Baselines3's PPO.
+    A trained policy drives with the average. Its parameters have the same names as in Stable-Baselines3's PPO.
+
+    Args:
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: recipe of the training, with the shape of the network.
+
     """
 
     def __init__(
@@ -82,7 +96,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Load the tensors of a policy bundle into both sets of weights."""
+        """Copy ``tensors``, the weights of a policy bundle by name, into both copies of the network."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))
@@ -98,6 +112,6 @@ class AveragedActor(Deterministic):
         return self.scout.expect(observation)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions [rows, 1] of the averaged weights."""
+        """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
         means: Tensor = self.action_net(self.mlp_extractor["policy_net"](observation))
         return means.clamp(-1.0, 1.0)

@@ -28,25 +28,30 @@ Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F],
 
 
 class Offsets(NamedTuple):
-    """For each row, the learner whose actions are moved, by how much, and for how many steps."""
+    """Changed actions in n branches (copies of a running episode).
 
-    learner: Ints  # [n] index of the learner among the learners
-    size: Floats  # [n] offset of its action; the sum is clipped to [-1, 1]
-    steps: Ints  # [n] number of steps with the offset
+    In each branch, an offset is added to the actions of one learner during its first steps. For example, with
+    ``learner = [0, 0]``, ``size = [0.1, -0.1]``, ``steps = [3, 3]``, the foremost learner brakes less for three steps
+    in the first branch, and more in the second.
+    """
+
+    learner: Ints  # [n] for each branch: index of the changed learner among the learners (0 = foremost)
+    size: Floats  # [n] for each branch: offset added to its actions; the sum is clipped to [-1, 1]
+    steps: Ints  # [n] for each branch: number of steps with the offset, from the first step on
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every row to the end of its episode. Return the moved learner's return, and the sum of its offsets.
+    """Play every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
 
     Args:
-        engine: branches to play; changed in place.
-        act: policy of all learners, from observations alone.
-        offsets: for each row the learner whose actions are moved, how far, and for how many steps.
+        engine: engine whose n rows are the branches to play; it is changed.
+        act: policy of all learners, a function of observations alone.
+        offsets: for each row the learner whose actions are changed, by how much, and for how many steps.
         gamma: discount of one time step.
 
-    Returns the return [n] of the moved learner from now on (NaN for a row that could not be advanced), and the sum of
-    its offsets [n] after clipping actions to [-1, 1]. If the reward is harm alone, a row ends as soon as nothing can
-    change any more.
+    Returns two arrays [n]: the changed learner's discounted return from now on (NaN for a row that could not be
+    advanced), and the sum over the steps of the changes of its actions, after clipping to [-1, 1]. If the reward is
+    harm alone, a row ends as soon as nothing can change any more.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -66,9 +71,18 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
 
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Play every row to the end of its episode, but at least ``at_least`` steps. Return each learner's return, [n, L].
+    """Play every row of an engine to the end of its episode, and return each learner's discounted return, [n, L].
 
-    ``decide`` returns the learners' actions. See ``play_to_the_end`` for the other arguments.
+    Args:
+        engine: engine whose rows are played; it is changed.
+        decide: function of the observations [m, L, F], the row numbers [m] that still run, and the number of steps so
+            far. It returns the learners' actions [m, L].
+        gamma: discount of one time step.
+        at_least: number of steps before which no row ends early.
+
+    If the reward is harm alone, a row ends early as soon as nothing can change any more. The return is NaN for a row
+    that could not be advanced.
+
     """
     vehicles = np.array(engine.learners, np.int64)
     gained, actions = np.zeros((engine.n, len(vehicles))), np.zeros((engine.n, len(vehicles)))
@@ -90,7 +104,11 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row to its end with ``act``. Return the observations at each decision, [m, L, F], and the states."""
+    """Play every row of an engine to the end of its episode, and return what the policy met on the way.
+
+    ``act`` is the policy of all learners. The result covers the m decisions of all rows, in the order of time: the
+    observations [m, L, F], and the states of the worlds.
+    """
     seen_then, moments = [], []
 
     def decide(seen: Observations, rows: Ints, number: int) -> Floats:
@@ -103,10 +121,12 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Return the ``rows`` in which everything stands as it stood ``before``, and will keep standing.
+    """Return for each of ``rows`` [m] whether all vehicles stand and will keep standing, [m] bool.
 
-    A policy with the same observation acts the same. So a row counts only if no latency or message can change the
-    observation.
+    ``before`` [m, columns] is the packed state of these rows one step earlier; it must show the same standstill.
+
+    A policy with the same observation acts the same. So the answer is True only if no latency or message can change
+    the observation later.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # messages under way may change the observation; a profile, the braking
@@ -117,7 +137,16 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Fill ``stands`` [m] for ``rows`` [m] of ``state``; ``before`` [m] holds the rows one step earlier."""
+    """Write into ``stands`` [m] whether nothing can change any more in each of ``rows`` [m].
+
+    Args:
+        state: packed state of all rows of an engine.
+        before: [m, columns] packed state of ``rows`` one step earlier.
+        params: packed constants of all rows.
+        rows: [m] row numbers.
+        stands: [m] result, which is overwritten.
+
+    """
     column = columns(state)
     by_link = params.shape[1] > column.own_latency
     for m in range(rows.shape[0]):
@@ -136,12 +165,15 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """Return the harm count that is not ``count``."""
+    """Return the other count of harm: ``total`` (all impacts) for ``first`` (first impacts), and the reverse."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
-    """Return the rows in which some vehicle moves. A row in which everything stands teaches nothing."""
+    """Return for each of the n states ``moments`` whether at least one vehicle moves, [n] bool.
+
+    Decisions at which all vehicles stand are left out of training, because actions make no difference there.
+    """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)
     return moving

@@ -1,4 +1,4 @@
-"""Gating network of a mixture of experts: weights that learn, and their average, which decides."""
+"""Gating network of a mixture of experts, which chooses the expert that acts: learning weights and their average."""
 
 from __future__ import annotations
 
@@ -19,15 +19,23 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 
 
 class AveragedGate(nn.Module):
-    """Gating network that learns (``learning``), and the running ``average`` of its weights, which decides.
+    """Gating network, which chooses one of K experts (networks that drive) from an observation of F features.
 
-    A memory holds the last decisions at which experts were compared: the observation, and the extra cost of each expert
-    over the best one.
+    It has two copies: ``learning`` is in training, and ``average``, with the running average of its weights, chooses.
+
+    A memory of M places holds the last decisions at which the experts were compared: the observation, and the extra
+    cost of each expert over the best one.
+
+    Args:
+        inputs: number of features of an observation.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: recipe with the key ``modes``.
+
     """
 
     seen: Tensor  # [M, F] observations in memory
-    more: Tensor  # [M, K] extra cost of each expert
-    compared: Tensor  # [1] number of decisions added so far; new ones replace the oldest
+    more: Tensor  # [M, K] extra cost of each expert over the best one at these decisions
+    compared: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
 
     def __init__(self, inputs: int, rate: Schedule, recipe: CounterfactualRecipe) -> None:
         super().__init__()
@@ -45,18 +53,18 @@ class AveragedGate(nn.Module):
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Add compared decisions to the memory."""
+        """Add m decisions to the memory: observations ``seen`` [m, F], and each expert's extra cost ``more`` [m, K]."""
         places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
         self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
         self.compared += len(seen)
 
     def recall(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw remembered decisions: observations [count, F] and extra costs [count, K]."""
+        """Return randomly drawn decisions of the memory: observations [count, F] and extra costs [count, K]."""
         some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return the index of the expert that acts [rows] on observations [rows, F]."""
+        """Return the index of the expert that the averaged gate chooses for each of the observations [rows, F]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

@@ -17,7 +17,11 @@ NARROWEST = 4.0  # least ratio of the largest to the smallest offset, which take
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit that removes this share of the sum of the sizes [n]."""
+    """Return the limit to which large gradients are reduced, so that the sum of all sizes falls by ``share``.
+
+    ``sizes`` [n] are absolute gradients. For example, reducing ``[1, 1, 4]`` to at most 2 lowers the sum 6 to 4, so 2
+    is the limit for the share 1/3.
+    """
     rising = np.sort(sizes)
     kept = (
         np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising
@@ -26,11 +30,19 @@ def limit_that_cuts(sizes: Floats, share: float) -> float:
 
 
 def smallest_offset(measured: Floats, least: float, most: float) -> float:
-    """Return the smallest offset to draw: ``least``, or more if the spread of gradients falls steeply with the offset.
+    """Return the smallest offset (change of an action) with which gradients should be measured.
 
-    Where harm jumps, the spread falls with the square root of the offset; where harm is smooth, it is constant. The
-    slope is measured between the smaller and the larger half of the offsets. ``measured`` [n, 2] holds gradient sizes
-    and their offsets (0: no measurement yet).
+    Where harm jumps, gradients scatter more the smaller the offset; where harm is smooth, they do not. So the result is
+    the offset at which their root mean square is expected to be ``SPREAD`` times as large as at ``most``. It is limited
+    to ``most / NARROWEST``, and is never below ``least``. If gradients do not scatter more at small offsets, it is
+    ``least``.
+
+    Args:
+        measured: [n, 2] absolute value of each measured gradient, and the offset with which it was measured (0: no
+            measurement yet). The smaller half of the offsets is compared with the larger half.
+        least: lower end of the range of offsets.
+        most: upper end of the range of offsets.
+
     """
     known = measured[measured[:, 1] > 0.0]
     halves = np.array_split(known[np.argsort(known[:, 1], kind="stable")], 2)

@@ -1,4 +1,4 @@
-"""Train a mixture of experts: the first expert alone, further experts, the gating network, then all together."""
+"""Train a mixture of experts (several networks that drive, and a gating network that chooses one at each decision)."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ModesModel(CounterfactualModel):
-    """Model that trains the first expert alone, further experts in their own worlds, the gate, then all together.
+    """Model that trains a mixture of experts: several networks that drive, and a gate that chooses one of them.
 
-    The key ``modes`` of the recipe configures it.
+    It trains the first expert alone, further experts in worlds of their own, the gate, then all together. The key
+    ``modes`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
     """
 
     policy: ModesPolicy  # type: ignore[assignment]
@@ -86,7 +87,13 @@ class ModesModel(CounterfactualModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage. The result depends only on finished experts, so it is the same after a resume."""
+        """Prepare a stage of the training that begins, or is resumed, at update ``number``.
+
+        For a further expert, find the worlds that it will be trained in, and let it imitate templates (random braking
+        profiles) that do better than the experts so far.
+
+        The result depends only on finished experts, so it is the same after a resume.
+        """
         self._stage, self._own = stage, None
         if stage.does != "further":
             return
@@ -108,7 +115,7 @@ class ModesModel(CounterfactualModel):
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
 
     def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
-        """Train an expert to imitate the actions of templates."""
+        """Train the expert ``pupil`` to imitate the shown actions; ``seed`` orders the batches."""
         pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
@@ -121,9 +128,18 @@ class ModesModel(CounterfactualModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """Compare the experts at some decisions. Return observations [B, F], costs [B, K], and importance [B].
+        """Let each of the K experts play to the end from B of the visited decisions, and return what it costs.
 
-        Decisions at which all experts take the same action are left out, because the choice has no effect there.
+        The cost is minus the return, plus ``tie_break`` times the harm under the count that the reward does not use.
+        The B decisions are drawn; those at which all experts take the same action are
+        left out, because the choice has no effect there.
+
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+
+        Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision [B].
+
         """
         engine, members = self.engine, [actor.act for actor in self.policy.actors]
         observed = seen.reshape(-1, seen.shape[2])
@@ -142,7 +158,16 @@ class ModesModel(CounterfactualModel):
         return observed[rows[good]], costs[good], importance[good]
 
     def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
-        """Train the gate to choose the cheapest expert. A decision's weight is the extra cost of the other experts."""
+        """Train the gating network to choose the cheapest expert.
+
+        A decision's weight is the extra cost of the other experts.
+
+        Args:
+            seen: [B, F] observations.
+            costs: [B, K] cost of each expert.
+            importance: [B] factor of each decision; None: 1.
+
+        """
         importance = np.ones(len(seen), np.float32) if importance is None else importance
         gate = self.policy.gate
         self._update_learning_rate(gate.optimizer)

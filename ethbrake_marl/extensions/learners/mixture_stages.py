@@ -1,4 +1,4 @@
-"""Stages of training a mixture of experts: which updates train what."""
+"""Stages of training a mixture of experts: which updates train which of its networks."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ ROUNDING = 1e-6  # tolerance for rounding in sums of shares, in updates
 
 
 class Stage(NamedTuple):
-    """Range of updates, and what it trains."""
+    """One stage of training a mixture of experts: a range of updates, and what they train."""
 
+    # The first expert (``alone``), a further expert, the gating network (``gate``), or all of them ``together``.
     does: Literal["alone", "further", "gate", "together"]
-    network: int  # index of the expert that ``further`` trains
+    network: int  # index of the expert that a stage ``further`` trains, from 1; 0 in other stages
     first: int  # first update, counted from 0
     end: int  # first update after the stage
 
 
 def stages_of(plan: ModesPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training with this number of updates, in order. A stage may be empty."""
+    """Return the stages of a training with this number of updates, in order; a stage may be empty.
+
+    ``plan`` is the key ``modes`` of the recipe, with the share of each stage.
+    """
     shares, more = plan.shares, plan.networks - 1
     parts: list[tuple[Literal["alone", "further", "gate", "together"], int, float]] = [("alone", 0, shares.alone)]
     parts += [("further", k + 1, shares.further / more) for k in range(more)]

@@ -27,23 +27,31 @@ NO_DIFFERENCE = 1e-2  # returns closer than this are equal
 
 
 class Explored(NamedTuple):
-    """Worlds of the training, and the best results of the experts in them."""
+    """The first n worlds of the training, and the best results of the experts so far in them."""
 
-    alert: Worlds  # worlds at the alert
-    start: State  # state at the first decision
-    gained: Floats  # [n] highest return of an expert
-    harm: Floats  # [n] least harm of an expert (m2/s2)
+    alert: Worlds  # the worlds at the alert
+    start: State  # their states at the first decision
+    gained: Floats  # [n] highest return of any expert
+    harm: Floats  # [n] least harm of any expert (m2/s2)
 
 
 class Shown(NamedTuple):
-    """Observations and actions of templates, to imitate."""
+    """Observations and actions of m decisions of templates (random braking profiles), for an expert to imitate."""
 
-    seen: Float32s  # [m, F]
-    action: Float32s  # [m]
+    seen: Float32s  # [m, F] observations
+    action: Float32s  # [m] actions in [-1, 1]
 
 
 def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every expert drive the first worlds of the training from start to end. Return the best results."""
+    """Let every expert drive the first ``plan.worlds`` worlds of the training, and return the best results.
+
+    Args:
+        engine: engine of the training; it is not changed.
+        plan: the key ``modes`` of the recipe.
+        acts: function of each expert from observations [rows, F] to actions [rows].
+        gamma: discount of one time step.
+
+    """
     alert, start = engine.first_moments(plan.worlds)
     gained, harm = np.full(plan.worlds, -np.inf), np.full(plan.worlds, np.inf)
     for act in acts:
@@ -55,9 +63,17 @@ def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) 
 def drive_from(
     engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
-    """Return the first learner's return [n] (NaN for a row that could not be advanced), and the harm [n] (m2/s2).
+    """Play states to the end of their episodes with one policy.
 
-    The harm has the reward's count unless ``count`` is given.
+    Args:
+        engine: engine of the training; it is not changed.
+        start: the n states to continue from.
+        act: policy, from observations [rows, F] to actions [rows].
+        gamma: discount of one time step.
+        count: impacts that the harm counts; None: as the reward does.
+
+    Returns the first learner's return [n] (NaN for a row that could not be advanced), and the harm [n] (m2/s2).
+
     """
     rows = engine.branch(start)
     nowhere = np.zeros(rows.n, np.int64)
@@ -66,7 +82,18 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
-    """Return the actions of the best template in each world where it gains more than every expert by ``plan.gain``."""
+    """Draw templates (random braking profiles), and return the actions of those that do better than all experts.
+
+    In each world the best of ``plan.templates`` is taken, if its return exceeds every expert's by ``plan.gain``.
+
+    Args:
+        engine: engine of the training; it is not changed.
+        plan: the key ``modes`` of the recipe.
+        found: worlds and results of the experts, from ``explore``.
+        gamma: discount of one time step.
+        seed: seed of the templates.
+
+    """
     (vehicle,) = engine.learners
     problem = profile_problem(
         found.alert,
@@ -100,9 +127,19 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
 
 
 def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> State:
-    """Return the starting states of the worlds in which ``act`` is at most ``plan.margin`` worse than earlier experts.
+    """Return the starting states of the worlds in which a new expert is to be trained.
 
-    Worlds in which it makes no difference, or in which earlier experts do no harm, teach nothing and are left out.
+    These are the worlds in which its return is at most ``plan.margin`` below the best of the earlier experts. Worlds in
+    which it has the same return as the best one, or in which an earlier expert does no harm, are left out: it could
+    learn nothing there.
+
+    Args:
+        engine: engine of the training; it is not changed.
+        plan: the key ``modes`` of the recipe.
+        found: worlds and results of the earlier experts, from ``explore``.
+        act: the new expert, from observations [rows, F] to actions [rows].
+        gamma: discount of one time step.
+
     """
     gained, _ = drive_from(engine, found.start, act, gamma)
     more = gained - found.gained
@@ -111,4 +148,7 @@ def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma
 
 
 class NoOtherMode(EthBrakeError, ValueError):
-    """Raised if no template does better than the experts so far: a further expert has nothing to learn."""
+    """Raised if no template (random braking profile) does better than the experts so far.
+
+    A further expert would then have nothing to learn.
+    """

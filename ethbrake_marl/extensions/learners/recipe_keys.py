@@ -12,10 +12,13 @@ from ethbrake_marl.training.recipe import Rate
 
 
 class OffsetRange(FileModel):
-    """Range from which the offset of an action is drawn, log-uniformly."""
+    """Range from which a distance between two actions is drawn, uniformly in its logarithm.
 
-    smallest: Rate
-    largest: Rate
+    Actions are numbers from -1 (full braking) to 1.
+    """
+
+    smallest: Rate  # lower end of the range
+    largest: Rate  # upper end of the range
 
     @field_validator("largest")
     @classmethod

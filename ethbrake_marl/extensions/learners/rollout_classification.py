@@ -17,10 +17,13 @@ from ethbrake_marl.training.training import Training
 
 
 class Options(Algorithm):
-    """Rollout classification with one actor for all learners."""
+    """The algorithm rollout classification, with one actor for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> OptionsModel:
-        """Return the model. Before it learns, it brakes fully, or acts as the first policy of ``among``."""
+        """Return a new model for a training, which learns in ``environment``.
+
+        Before it learns, it brakes fully, or acts as the first policy of the recipe's key ``among``.
+        """
         recipe = training.recipe
         assert isinstance(recipe, OptionsRecipe)
         environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
@@ -28,6 +31,6 @@ class Options(Algorithm):
         return OptionsModel(environment, recipe, among)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights."""
+        """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found

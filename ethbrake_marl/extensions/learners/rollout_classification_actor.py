@@ -1,4 +1,4 @@
-"""Actor that scores actions, with a memory of what actions cost."""
+"""Actor that scores a number of actions and takes the best one, with a memory of what tried actions cost."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 
 
 class _TorchActor(Actor):
-    """``Actor`` with torch's matrix products: three times as fast, with different last bits."""
+    """``Actor`` (a policy's network) with torch's matrix products instead of numpy's.
+
+    It is three times as fast; the last bits differ.
+    """
 
     @torch.no_grad()
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
@@ -40,17 +43,29 @@ class _TorchActor(Actor):
 
 
 class ChoosingActor(Deterministic):
-    """Actor that scores actions, with a memory of what actions cost.
+    """Actor whose network scores a number of options; it takes the option with the highest score.
 
-    ``learning`` are the weights that learn; their running ``average`` drives. The memory holds the last decisions at
-    which actions were tried, with the extra cost of each tried action over the best one.
+    The first ``first`` options are policies, which then choose the action; the others are actions, evenly from -1 to 1.
+    The network ``learning`` is in training; ``average``, with the running average of its weights, drives.
+
+    The memory of M places holds the last decisions at which C options were tried, and how much more each cost than the
+    best one. F is the number of features.
+
+    Args:
+        observation_space: Gymnasium space of an observation.
+        action_space: Gymnasium space of an action.
+        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        recipe: the recipe.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
+        members: number of scenarios in the training's mixture; 1 without a mixture.
+
     """
 
     seen: Tensor  # [M, F] observations in memory
-    tried: Tensor  # [M, C] numbers of the tried actions; the first one was taken
-    more: Tensor  # [M, C] extra cost of each tried action
-    known: Tensor  # [1] number of decisions added so far; new ones replace the oldest
-    usual: Tensor  # [members] mean cost of the best tried action in each scenario of a mixture; 0: not measured yet
+    tried: Tensor  # [M, C] numbers of the tried options; the actor itself took the first of the C
+    more: Tensor  # [M, C] extra cost of each tried option over the best one
+    known: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
+    usual: Tensor  # [members] mean cost of the best tried option in each scenario of a mixture; 0: not measured yet
 
     def __init__(
         self,
@@ -85,7 +100,11 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Return the numbers of the actions to take [rows] for observations [rows, F]."""
+        """Return the number of the option with the highest score, [rows], for each of the observations [rows, F].
+
+        Numbers below the attribute ``first`` stand for policies. The other numbers stand for actions, evenly spread:
+        ``first`` is the action -1, and the largest number is the action 1.
+        """
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
 
@@ -94,7 +113,7 @@ class ChoosingActor(Deterministic):
         return found
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the actions [rows, 1] of the averaged weights."""
+        """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
         return torch.from_numpy(self.act(observation.numpy()))[:, None]
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
@@ -102,14 +121,30 @@ class ChoosingActor(Deterministic):
         return {**tensors_of_layers("policy", self.average), **among}
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
-        """Add decisions to the memory."""
+        """Add m decisions to the memory.
+
+        Args:
+            seen: [m, F] observations.
+            tried: [m, C] numbers of the tried options, as from ``choose``; the actor itself took the first of the C.
+            more: [m, C] extra cost of each tried option over the best one.
+
+        """
         places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
         self.seen[places], self.tried[places] = torch.from_numpy(seen), torch.from_numpy(tried)
         self.more[places] = torch.from_numpy(more.astype(np.float32))
         self.known += len(seen)
 
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yield remembered decisions for each gradient step, with their importance; ``focus`` as in ``draw_rows``."""
+        """Draw decisions from the memory; yield for each gradient step their rows and importance, both [count].
+
+        The importance is a decision's weight in the loss.
+
+        Args:
+            batches: number of gradient steps.
+            count: decisions per step.
+            focus: share that is drawn in proportion to how much the choice matters; 0: all are drawn uniformly.
+
+        """
         known = min(int(self.known), len(self.seen))
         if focus == 0.0 or batches == 0:
             for _ in range(batches):
@@ -121,10 +156,16 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Return the expected cost at remembered decisions if actions are drawn by a softmax of the scores.
+        """Return the loss at decisions of the memory: the expected cost of actions drawn by a softmax of the scores.
 
         Its gradient vanishes if the probabilities are nearly 0 or 1. So ``guide`` times a convex loss is added, which
         lowers the score of every action except the best, and more for a costlier action.
+
+        Args:
+            some: row numbers of the decisions in the memory.
+            importance: factor of each of them.
+            guide: weight of the convex loss.
+
         """
         more = self.more[some]
         scores = self.learning(self.seen[some]).gather(1, self.tried[some])

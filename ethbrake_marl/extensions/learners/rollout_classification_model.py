@@ -29,7 +29,14 @@ LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with 
 
 
 class OptionsModel(CounterfactualModel):
-    """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs."""
+    """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs.
+
+    Args:
+        environment: environment of the training.
+        recipe: the recipe.
+        among: for each trained policy that the actor can choose instead of an action, its weights by name.
+
+    """
 
     policy: ChoosingActor  # type: ignore[assignment]
     recipe: OptionsRecipe  # type: ignore[assignment]
@@ -72,9 +79,16 @@ class OptionsModel(CounterfactualModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try actions at some decisions. Return observations [B, F], numbers of the actions [B, C], and costs [B, C].
+        """Try several options (actions, or policies that act) at some visited decisions, each to the episode's end.
 
-        The first action is the one that the actor takes. The costs include ``caution``.
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+
+        Returns for B decisions and C options at each: observations [B, F], numbers of the options [B, C] as from
+        ``ChoosingActor.choose``, and their costs [B, C]. The first option is the one that the actor takes. A cost is
+        minus the return, changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
+
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
         observed, first, last = seen.reshape(-1, seen.shape[2]), actor.first, recipe.network.choices - 1
@@ -129,7 +143,15 @@ class OptionsModel(CounterfactualModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Return the usual cost of a decision in the scenario of each row [B], updated with the ``least`` costs [B]."""
+        """Update the running mean cost of each scenario of a mixture; return the mean that belongs to each decision.
+
+        Args:
+            rows: [B] indices of the decisions' worlds among all visited worlds.
+            least: [B] cost of the best tried option at each decision.
+
+        The result [B] has a lower limit, so that costs can be divided by it.
+
+        """
         numbers = self._numbers[rows]
         first = int(numbers.min())
         drawn = members_of(

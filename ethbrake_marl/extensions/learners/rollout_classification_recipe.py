@@ -25,11 +25,14 @@ class ChoosingShape(Shape):
     """Hidden layers of an actor that scores a number of actions, spread evenly from -1 to 1."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
-    activation: Activation = "relu"
+    activation: Activation = "relu"  # activation function of the hidden layers
     choices: int = Field(ge=2, le=4096, description="how many actions, evenly from -1 to 1, the network scores")
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the spec of the actor, which takes the action with the highest score."""
+        """Return the description of the network in a policy bundle: an actor that takes the action of highest score.
+
+        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        """
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
@@ -37,38 +40,48 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
 
 
 class OptionsRecipe(TrainingRecipe):
-    """Recipe that tries several actions at ``tried`` of the ``n_envs x n_steps`` decisions of a round.
+    """Recipe of rollout classification: the policy learns from several actions, each tried to the end of its episode.
 
-    The policy learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the policies
-    ``among``. At each such decision it tries: the action that it takes; one below and one above it for each distance of
-    ``near``; the actions ``fixed``; and ``drawn`` random ones (policies if there are any, else actions).
+    It learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the policies ``among``. In
+    a round (``n_envs x n_steps`` decisions, then an update), ``tried`` of the decisions are tried with: the action that
+    the policy takes; one below and one above it for each distance of ``near``; the actions ``fixed``; and ``drawn``
+    random ones (policies if there are any, else actions). The *cost* of an action is minus the return after it.
     """
 
     most_decisions = 2**22
 
     algorithm: Literal["options"]
+    # Trained policies, each of which can act at a decision. One that chooses among policies is replaced by those.
     among: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
         (), description="policies of which one can act at each decision; one that chooses among others stands for them"
     )
+    # Number of consecutive decisions in each world between two updates.
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
     tried: int = Field(ge=1, description="how many of the decisions of a round are tried with other actions")
+    # Ranges of distances; from each, one is drawn, and the actions this far below and above the taken one are tried.
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)] = Field(
         description="ranges of distances to the action taken, each tried below and above it; the logarithm drawn is"
         " uniform"
     )
+    # Actions that are tried at every such decision; each is rounded to the nearest of the ``choices`` of the network.
     fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)] = Field(
         description="actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices"
         " is"
     )
+    # Number of random options that are tried: policies of ``among``, or if it is empty actions.
     drawn: int = Field(
         ge=0,
         le=16,
         description="how many more are tried there: of the policies among, or where there are none of the choices",
     )
+    # Numbers of steps, one of which is drawn at each decision; a tried action is held for so long.
     holds: Holds = Field(description="for how many steps an action is tried, one of these")
+    # Upper limit of an action's extra cost over the best tried action, so that rare large costs do not dominate.
     largest_cost: Positive = Field(
         description="an action that costs more than this beyond the best one counts as this much more"
     )
+    # Factor, growing from 0 to this value during the training, of an additional cost: by how much more an action costs
+    # than braking fully from this decision on.
     caution: float = Field(
         0.0,
         ge=0.0,
@@ -77,6 +90,7 @@ class OptionsRecipe(TrainingRecipe):
         description="how many times the excess over full braking from there on counts besides, at the end; it grows"
         " from 0",
     )
+    # Weight, in the cost, of the line's harm under the count that the reward does not use (first impacts or all).
     tie_break: float = Field(
         0.0,
         ge=0.0,
@@ -84,13 +98,17 @@ class OptionsRecipe(TrainingRecipe):
         exclude_if=not_,
         description="weight of the whole line's harm in the other count, beside the reward",
     )
+    # Whether costs are divided by the mean cost in the same scenario of a mixture, so that all scenarios count alike.
     relative: bool = Field(
         False, exclude_if=not_, description="true: in a mixture, costs count beside the usual ones of the same scenario"
     )
+    # Share of the decisions to learn from that are drawn in proportion to how much the tried actions differ in cost.
     focus: Focus = Field(0.0, description="share of what is learned from that is drawn where a choice matters most")
+    # Weight of a convex term in the loss, which keeps gradients alive where the policy is nearly certain.
     guide: NonNegative = Field(
         description="weight of the convex part of the loss, without which learning can stand still at the beginning"
     )
+    # Number of decisions in memory, from which the network learns: the latest with a difference between the costs.
     memory: int = Field(
         ge=1,
         le=500_000,
@@ -120,14 +138,19 @@ class OptionsRecipe(TrainingRecipe):
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the spec of the actor, with the policies that it may choose."""
+        """Return the description of the network in a policy bundle, including the policies that it may choose.
+
+        ``observation_size`` is the number of features of an observation.
+        """
         several = {"observation_size": observation_size, "value_hidden": ()}
         among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies)
         return self.network.spec(observation_size, among=among)
 
     @cached_property
     def policies(self) -> tuple[Policy, ...]:
-        """Policies of ``among``, read once. A policy that itself chooses among policies is replaced by those.
+        """The policies that the key ``among`` names, loaded once.
+
+        A policy that itself chooses among policies is replaced by those.
 
         Raises ``InvalidInput`` with the name of a policy that cannot be used.
         """

@@ -20,7 +20,10 @@ WIDTH = 64  # units of the hidden layer
 
 
 class Scout(nn.Module):
-    """Small network that predicts, from an observation, the size of the measured difference."""
+    """Small network that predicts from an observation how much the choice of the action matters there.
+
+    It learns the size of the measured gradient, or cost difference. ``inputs`` is the number of features.
+    """
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -31,20 +34,26 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the logarithm of the expected size [rows] for observations [rows, F], at most 20."""
+        """Return the logarithm of the expected gradient size, [rows], for observations [rows, F]; at most 20."""
         found: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return found
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the expected size [rows], above 0."""
+        """Return the expected size [rows], above 0, for observations [rows, F]."""
         with torch.no_grad():
             found: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
         return found
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Return a loss with its minimum at the mean of the sizes [rows].
+        """Return a loss whose minimum is reached by predicting the mean size.
 
         Large sizes weigh less than in a squared error.
+
+        Args:
+            observation: [rows, F] observations.
+            size: [rows] measured sizes.
+            importance: [rows] factor of each row.
+
         """
         logarithm = self(observation)
         found: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
@@ -52,7 +61,7 @@ class Scout(nn.Module):
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:
-    """Draw ``count`` rows with replacement.
+    """Draw ``count`` of n rows with replacement, preferring rows with a large expected size.
 
     The share ``focus`` is drawn in proportion to ``expected`` [n] > 0, the rest uniformly. Returns the rows and their
     importance, 1 / (probability of the row x number of rows), which is 1 on average.
@@ -66,7 +75,20 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 def choose_rows(
     observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats] | None
 ) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of ``rows``: uniformly without replacement, or by ``draw_rows`` if ``focus`` is above 0."""
+    """Draw ``count`` of ``rows`` at which to try actions, preferring decisions that matter.
+
+    Args:
+        observed: [n, F] observations of all decisions.
+        rows: row numbers of the decisions to draw from.
+        count: number of rows to draw.
+        focus: share drawn in proportion to ``expect`` with replacement (``draw_rows``). 0: all are drawn uniformly
+            without replacement.
+        expect: function from observations to the expected size of the difference, [rows]; None: all are drawn
+            uniformly.
+
+    Returns the drawn rows and their importance (1 if drawn uniformly).
+
+    """
     if focus == 0.0 or expect is None or len(rows) == 0:
         some = rows[torch.randperm(len(rows))[:count].numpy()]
         return some, np.ones(len(some), np.float32)

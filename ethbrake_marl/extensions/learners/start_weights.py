@@ -11,9 +11,10 @@ from ethbrake_marl.training.training import Training
 
 
 def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:
-    """Return the actor's tensors of ``policy``, with weights of 0 for features that it does not observe.
+    """Return the weights of a trained policy, by name, enlarged to the features that a new training observes.
 
-    Raises ``InvalidInput`` if the training lacks a feature of the policy, or has another network.
+    The weights of features that the policy does not observe are 0. Raises ``InvalidInput`` if the training lacks a
+    feature of the policy, or has another network.
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
     found = policy.manifest.network
@@ -29,9 +30,10 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
 
 
 def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
-    """Return all tensors of ``policy`` except the critic's, with weights of 0 for features that it does not observe.
+    """Return all weights of a trained policy except the critic's, by name, enlarged to the training's features.
 
-    Raises ``InvalidInput``, naming the recipe's ``key``, if the training lacks a feature of the policy.
+    The weights of features that the policy does not observe are 0. Raises ``InvalidInput`` if the training lacks a
+    feature of the policy; ``key`` is the key of the recipe that names the policy, for the message.
     """
     names = [feature.name for feature in training.observation.features]
     known = policy.manifest.observation.features

@@ -10,21 +10,28 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class Tried(NamedTuple):
-    """Decisions that were tried in two ways, and the measured gradients."""
+    """B decisions that were tried with a higher and a lower action, and the gradients measured from the difference."""
 
     seen: Float32s  # [B, F] observations
     mean: Float32s  # [B] output of the actor, before clipping to [-1, 1]
     gradient: Float32s  # [B] gradient of the return with respect to the action
-    importance: Float32s  # [B] weight of each decision
+    importance: Float32s  # [B] weight of each decision in the loss
 
 
 def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32s, Float32s]:
-    """Return targets [B] for the actor's means, and their weights [B].
+    """Return targets [B] for the actor's outputs, and the weights [B] of their squared errors in the loss.
 
-    ``target = m + g / w`` with ``w = |g| / radius + anchor``, for mean m and gradient g. Half the weighted squared
-    distance to the target is ``-g (mu - m) + w (mu - m)^2 / 2`` up to a constant. Its slope at ``m`` is exact, and its
-    minimum is at most one radius away, however large the gradient. A mean at or beyond a bound is not moved farther
-    out, because its action would not change.
+    For an output ``m`` with the gradient ``g``: ``weight = (|g| / radius) + anchor`` and ``target = m + (g / weight)``.
+    So the target is less than ``radius`` away from ``m``, however large the gradient. At ``m``, the loss
+    ``(weight / 2) * (output - target)^2`` has the slope ``-g``, as gradient ascent on the return requires.
+
+    An output at or beyond a bound of [-1, 1] is not moved farther out, because its action would not change.
+
+    Args:
+        tried: decisions and measured gradients.
+        radius: trust radius, the largest distance of a target from the output.
+        anchor: least weight, above 0; the larger, the less a small gradient moves the target.
+
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
     gradient = tried.gradient.copy()

@@ -23,10 +23,16 @@ from ethbrake_marl.training.training import Training
 
 
 class Counterfactual(Algorithm):
-    """Vine with one actor for all learners, or with a mixture of experts for one learner."""
+    """The algorithm vine: it measures gradients of the return, and trains an actor with them.
+
+    All learners share one actor; a single learner may have a mixture of experts instead.
+    """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
-        """Return the model, with the weights of the policy to start from, or random weights."""
+        """Return a new model for a training, which learns in ``environment``.
+
+        It begins with the weights of the policy that the recipe's key ``start`` names, or with random weights.
+        """
         recipe = training.recipe
         assert isinstance(recipe, CounterfactualRecipe)
         environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
@@ -40,12 +46,15 @@ class Counterfactual(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights."""
+        """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
         found: dict[str, Float32s] = actor.tensors(network)
         return found
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimiser of the actor, or the optimisers of each expert and of the gating network."""
+        """Return the model's optimisers by name.
+
+        The only one is ``policy``, or in a mixture there are ``network_1``, ``network_2``, ..., and ``gate``.
+        """
         if not isinstance(model, ModesModel):
             return {"policy": model.policy.optimizer}
         members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}

@@ -26,7 +26,16 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class CounterfactualModel(BaseAlgorithm):
-    """Model that visits decisions with a deterministic actor, tries some of them in two ways, and learns from that."""
+    """Model that visits decisions with a deterministic actor, tries two actions at some of them, and learns from that.
+
+    One of the two actions is higher than the actor's, the other is lower. The difference of the returns measures the
+    gradient of the return with respect to the action.
+
+    Args:
+        environment: environment of the training.
+        recipe: the recipe.
+
+    """
 
     policy: AveragedActor
 
@@ -60,7 +69,7 @@ class CounterfactualModel(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train for a number of decisions of the learners."""
+        """Train until the learners have made ``total_timesteps`` decisions; arguments as in Stable-Baselines3."""
         total, told = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         told.on_training_start(locals(), globals())
         while self.num_timesteps < total:
@@ -70,7 +79,10 @@ class CounterfactualModel(BaseAlgorithm):
         return self
 
     def _update(self, told: BaseCallback, total: int) -> None:
-        """Collect and learn for one round."""
+        """Do one update of the training: collect decisions, and learn from them.
+
+        ``told`` is the training's callback, ``total`` the number of decisions in the whole training.
+        """
         actor = self.policy
         seen, moments = self._visit(told, actor.act)
         told.on_rollout_end()
@@ -78,7 +90,10 @@ class CounterfactualModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive for ``n_steps``. Return the observations [n_steps, rows, F] and the states of the worlds."""
+        """Drive all worlds for ``n_steps`` decisions with the policy ``act``, and report them to the callback ``told``.
+
+        Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
+        """
         seen, moments, numbers = [], [], []
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
@@ -97,7 +112,16 @@ class CounterfactualModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """Try some of the visited decisions with a higher and a lower action, each to the end of its episode."""
+        """Try some of the visited decisions with a higher and a lower action, each to the end of its episode.
+
+        Args:
+            seen: [steps, rows, F] observations at the visited decisions.
+            moments: states of the worlds at these decisions.
+            actor: policy that drives before and after the change of the action.
+
+        Returns the tried decisions with their measured gradients.
+
+        """
         recipe, learners = self.recipe, len(self.engine.learners)
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))
         observed = seen.reshape(-1, seen.shape[2])
@@ -129,7 +153,10 @@ class CounterfactualModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Regress the actor on better actions within the trust radius, and log the loss."""
+        """Train the actor on the decisions of ``tried`` towards better actions within the trust radius.
+
+        The loss is logged.
+        """
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

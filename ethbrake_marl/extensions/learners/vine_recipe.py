@@ -29,17 +29,18 @@ class ActorShape(Shape):
     """Hidden layers of an actor without a critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
-    activation: Activation = "relu"
+    activation: Activation = "relu"  # activation function of the hidden layers
     initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda v: v is None)] = Field(
         None, description="about what the network does at first, [-1, 1]; left out: 0, which coasts"
     )
 
 
 class CounterfactualRecipe(TrainingRecipe):
-    """Recipe that tries ``counterfactuals`` of the ``n_envs x n_steps`` decisions of a round in two ways.
+    """Recipe of vine: some decisions are tried with a higher and a lower action, each to the end of its episode.
 
-    The policy learns from the differences. ``start`` names a trained policy to continue from; without it the weights
-    are random. ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
+    A round has ``n_envs x n_steps`` decisions; ``counterfactuals`` of them are tried. The policy learns from the
+    differences of the returns. ``start`` names a trained policy to continue from; without it the weights are random.
+    ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
     """
 
     most_decisions = 2**22
@@ -55,14 +56,18 @@ class CounterfactualRecipe(TrainingRecipe):
         description="how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform"
     )
     holds: Holds = Field(description="for how many steps an action is tried, one of these")
+    # Largest size of a measured gradient (return per unit of action); larger ones, at jumps of the harm, are cut to it.
     gradient_limit: Positive | Literal["auto"] = Field(
         description="a larger gradient, at a jump, counts as this one; return per action; auto: as measured"
     )
+    # Largest distance from an action to the target that it is trained towards in one update.
     trust_radius: Rate = Field(description="farthest that one update asks an action to move")
+    # Weight that holds actions where they are; the larger, the less small gradients move them.
     anchor: Positive = Field(description="how much an action that makes no difference holds to where it is")
     n_epochs: int = Field(ge=1, le=1000, description="how often an update goes through what was collected")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     averaging: Averaging = Field(description=AVERAGING)
+    # Share of the tried decisions that are drawn in proportion to the gradient that a small network expects there.
     focus: Focus = Field(0.0, description="share of what is tried that a scout draws, where a choice matters most")
     network: ActorShape = Field(description=NETWORK)
     modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = Field(
@@ -96,13 +101,19 @@ class CounterfactualRecipe(TrainingRecipe):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the spec of the actor, or of several actors and a gate."""
+        """Return the description of the network in a policy bundle: an actor, or several actors and a gate.
+
+        ``observation_size`` is the number of features of an observation.
+        """
         modes = self.modes
         several = {} if modes is None else {"networks": modes.networks, "gate_hidden": modes.gate}
         return self.network.spec(observation_size, **several)
 
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
-        """Return the policy to start from, for instance ``ppo@shipped/ppo``; None: random weights."""
+        """Return the spec of the policy whose weights a training on ``scenario`` begins with.
+
+        For instance ``ppo@shipped/ppo``; None: random weights.
+        """
         kind, _, path = (self.start or "").partition("@")
         if path != SHIPPED:
             return self.start
@@ -111,7 +122,10 @@ class CounterfactualRecipe(TrainingRecipe):
         return None
 
     def begins(self, scenario: Scenario) -> str:
-        """Return a phrase on the initial weights: the policy to start from, or random weights and the reason."""
+        """Return a phrase about the initial weights, for messages.
+
+        It is the spec of a policy, such as ``ppo@shipped/ppo``, or ``random weights`` with the reason.
+        """
         why = "" if self.start is None else f", as {self.start} has none for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 

@@ -36,10 +36,18 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 
 @compiled
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
-    """Return the part of the gap that full braking from now does not need to stay behind the braking leader. [m]
+    """Return the part of the gap that full braking from now does not need to stay behind the braking front vehicle, m.
 
     A negative value means that the two meet. If the follower stops last, the stopping distances decide, else the moment
     of equal speeds.
+
+    Args:
+        gap: gap between the two vehicles, m.
+        v_l: speed of the front vehicle (leader), m/s.
+        a_l: its braking capacity, m/s2.
+        v_f: speed of the follower, m/s.
+        a_f: its braking capacity, m/s2.
+
     """
     if v_f * a_l >= v_l * a_f:
         return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
@@ -52,11 +60,21 @@ def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> flo
 def drive_before_braking(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float
 ) -> tuple[float, float, bool]:
-    """Return the longest drive with constant ``u >= 0`` after which full braking still stays behind the braking leader.
+    """Return how long a vehicle may drive with constant ``u >= 0`` so that full braking still keeps it behind the
+    leader.
 
-    Returns its duration, the time at which the gap becomes 0, and whether both vehicles move at that time (then
-    ``a_f > a_l`` and the speeds are equal; else the follower stops at the standing leader). Infinite if the follower
-    never moves. Assumes ``spare_gap >= 0``.
+    Returns the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles move at
+    that time (then ``a_f > a_l`` and the speeds are equal; else the follower stops at the standing leader). Both times
+    are infinite if the follower never moves. Assumes ``spare_gap >= 0``.
+
+    Args:
+        gap: gap to the leader (the vehicle in front, which brakes from now on), m.
+        v_l: speed of the leader, m/s.
+        a_l: braking capacity of the leader, m/s2.
+        v_f: speed of the following vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        u: its driving acceleration, m/s2.
+
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
     if relief > 0.0 and v_l > 0.0:
@@ -82,7 +100,22 @@ def drive_before_braking(
 def largest_behind(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
 ) -> tuple[float, float, bool]:
-    """Return the values of ``drive_before_braking`` for a vehicle that stops driving at its speed limit."""
+    """Return how long a vehicle may drive, at most up to its speed limit, so that full braking still keeps it behind
+    the leader.
+
+    The leader is the front vehicle, which brakes from now on. Also returns the time at which the gap becomes 0 (s), and
+    whether both vehicles move then.
+
+    Args:
+        gap: gap to the leader, m.
+        v_l: speed of the leader, m/s.
+        a_l: braking capacity of the leader, m/s2.
+        v_f: speed of the following vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        u: its driving acceleration, m/s2.
+        limit: its speed limit, m/s.
+
+    """
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         found = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -97,9 +130,18 @@ def largest_behind(
 
 @compiled
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
-    """Return the smallest gap behind a vehicle that coasts until ``until``. [m]
+    """Return the smallest gap between a vehicle that coasts until ``until`` and the vehicle behind it, m.
 
     The gap is convex, so its minimum is at equal speeds or at an end.
+
+    Args:
+        gap: gap now, m.
+        v_f: speed of the coasting vehicle, m/s.
+        v_r: speed of the vehicle behind, m/s.
+        a_r: its braking capacity, m/s2.
+        onset_r: time from which on it brakes, s.
+        until: end of the coasting, s.
+
     """
     w = v_r - v_f
     if w <= 0.0:
@@ -111,7 +153,7 @@ def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_
 
 @compiled
 def met(gap: float, closing: float) -> bool:
-    """Return whether a pair with this gap and closing speed has had an impact, or has one at this moment."""
+    """Return whether a pair with this gap (m) and closing speed (m/s) has had an impact, or has one at this moment."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > BOUND.TOUCH_SPEED_MPS)
 
 
@@ -119,9 +161,18 @@ def met(gap: float, closing: float) -> bool:
 def leader_at_onset(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
 ) -> tuple[float, float]:
-    """Return the gap to the leader and its speed at ``start``, when the coasting follower may act.
+    """Return gap to the leader (m) and speed of the leader (m/s) at ``start``, if the follower coasts until then.
 
     The leader brakes by then. The gap is concave until then: if it is not negative at the end, it never was.
+
+    Args:
+        gap: gap now, m.
+        v_l: speed of the leader (front vehicle), m/s.
+        a_l: its braking capacity, m/s2.
+        onset_l: time from which on it brakes, s.
+        v_f: speed of the follower, m/s.
+        start: time at which the follower may act, s.
+
     """
     after, way, _ = solo_motion(v_l, -a_l, onset_l, math.inf, start)
     return gap + (way - v_f * start), after
@@ -129,9 +180,17 @@ def leader_at_onset(
 
 @compiled
 def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Decide the front pair of vehicle ``i`` without a drive. Return False if the pair certainly meets.
+    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking; return False if it certainly does
+    not.
 
-    REASON, MARGIN and SPARE go to ``out``.
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may brake, s.
+        braking: [N] braking capacities, m/s2.
+        i: index of the controlled vehicle, at least 1.
+        out: [RESULT_WIDTH] receives columns REASON (a code), MARGIN and SPARE (both m) of the verdict.
+
     """
     a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
     ahead, v_l = leader_at_onset(gap[i - 1], speed[i - 1], a_l, onset[i - 1], v_f, onset[i])
@@ -151,9 +210,23 @@ def plan_behind(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
     plan: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the largest trajectory that stays ``keep`` metres behind the leader, if any, to ``plan`` and ``out``.
+    """Write to ``plan`` the most forward trajectory of vehicle i among those that stay ``keep`` metres behind i - 1.
 
-    It is the trajectory that is farthest ahead at all times.
+    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle ahead at that distance.
+
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        driving: [N] driving capacities, m/s2.
+        limit: [N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        keep: distance to keep to the vehicle ahead, m.
+        plan: [2, PIECES] receives the trajectory: ends (s) and accelerations (m/s2) of its pieces.
+        out: [RESULT_WIDTH] receives columns DRIVE (s; end of the drive), TOUCH (s; end of the full braking after it)
+            and FOLLOW (m/s2; the command after that).
+
     """
     a_f, u = braking[i], driving[i]
     if i > 0:
@@ -168,9 +241,16 @@ def plan_behind(
 
 @compiled
 def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Return whether the rear pair of vehicle ``i`` meets before the vehicle may act.
+    """Return whether the vehicle behind vehicle ``i`` meets it before vehicle ``i`` may act.
 
-    The reason then goes to ``out``.
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        i: index of the controlled vehicle.
+        out: [RESULT_WIDTH] receives columns REASON and MARGIN if they meet.
+
     """
     v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
     lowest = lowest_while_coasting(gap[i], v_f, v_r, a_r, onset[i + 1], start)
@@ -186,9 +266,24 @@ def decide_world(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, plan: Floats,
     rear: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the verdict on one world to ``out`` [RESULT_WIDTH].
+    """Decide whether vehicle ``i`` can avoid contact in one world, and write the verdict to ``out``.
 
-    ``plan`` and ``rear`` are working memory. Times count from the onset of vehicle ``i``.
+    Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m) as in ``Avoidability``, SPARE (m; part
+    of the gap that full braking does not need), DRIVE and TOUCH (s after vehicle ``i`` may act; end of the drive, and
+    of the full braking after it), FOLLOW (m/s2; the command after that).
+
+    Args:
+        gap: [P] gaps, m.
+        speed: [N] speeds, m/s.
+        onset: [N] times from which on the vehicles may act, s.
+        braking: [N] braking capacities, m/s2.
+        driving: [N] driving capacities, m/s2.
+        limit: [N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        plan: [2, PIECES] working memory.
+        rear: [2, PIECES] working memory.
+        out: [RESULT_WIDTH] receives the verdict.
+
     """
     out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
     out[DRIVE], out[TOUCH], out[FOLLOW] = math.inf, math.inf, -braking[i]
@@ -220,7 +315,19 @@ def decide_world(
 def decide_worlds(
     gaps: Floats, speeds: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, out: Floats
 ) -> None:
-    """Write the verdict on every world to ``out`` [n, RESULT_WIDTH]."""
+    """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact; write the verdicts to ``out``.
+
+    Args:
+        gaps: [n, P] gaps, m.
+        speeds: [n, N] speeds, m/s.
+        onset: [n, N] times from which on the vehicles may act, s.
+        braking: [n, N] braking capacities, m/s2.
+        driving: [n, N] driving capacities, m/s2.
+        limit: [n, N] speed limits, m/s.
+        i: index of the controlled vehicle.
+        out: [n, RESULT_WIDTH] receives the verdicts, columns REASON to FOLLOW as in ``decide_world``.
+
+    """
     plan, rear = empty_plan(), empty_plan()
     for k in range(gaps.shape[0]):
         decide_world(gaps[k], speeds[k], onset[k], braking[k], driving[k], limit[k], i, plan, rear, out[k])
@@ -231,46 +338,52 @@ REASONS = ("", "early", "front", "rear")  # name of each reason code; "" if cont
 
 @dataclass(frozen=True, slots=True)
 class Avoidability:
-    """Verdict on each world, [n].
+    """Verdict on each of ``n`` worlds: can the controlled vehicle avoid all contact?
 
-    ``reason``: 0 avoidable; 1 early: a pair meets before the controlled vehicle may act; 2 front: even full braking
-    meets the front vehicle; 3 rear: the rear vehicle meets the largest trajectory that avoids the front vehicle.
+    The *largest trajectory* is the one that is farthest ahead at all times without contact with the front vehicle.
+    ``margin_m`` is the smallest gap between it and the rear vehicle (for two vehicles with the rear one controlled: the
+    part of the gap that full braking does not need). If contact is unavoidable it is negative: for *front* the missing
+    gap, for *early* the overlap before the vehicle may act.
 
-    ``margin_m``: smallest gap between that trajectory and the rear vehicle (for two vehicles with the rear one
-    controlled: the part of the gap that full braking does not need). If contact is unavoidable it is negative: for
-    *front* the missing gap, for *early* the overlap before the vehicle may act.
-
-    ``switch_s``, ``command_mps2``: the witness, a command profile of the controlled vehicle that has no impact in the
-    physics. Each command applies from its absolute time to the next (infinite: never). NaN if contact is unavoidable.
+    ``switch_s`` and ``command_mps2`` are a witness: a command profile without an impact in the physics. Each command
+    applies from its absolute time to the next (infinite: never). They are NaN if contact is unavoidable.
     """
 
+    # [n] 0: avoidable. 1, early: a pair meets before the controlled vehicle may act. 2, front: even full braking meets
+    # the front vehicle. 3, rear: the rear vehicle meets the largest trajectory
     reason: Ints
-    margin_m: Floats
-    switch_s: Floats  # [n, 3]
-    command_mps2: Floats  # [n, 3]
+    margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
+    switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s
+    command_mps2: Floats  # [n, 3] commands of the witness, m/s2
 
     @property
     def avoidable(self) -> Bools:
-        """Whether some profile avoids all contact, and so every impact, [n]."""
+        """True for worlds in which some command profile avoids all contact, and so every impact, [n]."""
         return np.asarray(self.reason == 0, np.bool_)
 
     @property
     def reason_name(self) -> NDArray[np.str_]:
-        """Name of the reason, [n]: one of ``REASONS``."""
+        """Name of the reason in each world, [n]: "" if contact is avoidable, else "early", "front" or "rear"."""
         return np.array(REASONS)[self.reason]
 
 
 def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str] | None = None) -> Avoidability:
-    """Decide in every world whether ``vehicle`` (index from 0) can avoid all contact from now on.
+    """Decide in every world whether one vehicle can avoid all contact from now on.
 
-    Where it cannot, every profile leads to contact, but not always to an impact: see ``LowerBound.impact_proven``.
-    Covers three vehicles with the middle one controlled, or two with either. The others brake with their whole capacity
-    from their latencies on; ``scripts`` (index -> name, as in ``Scenario.roles``) is only checked to say the same. An
-    overlap of the deciding trajectories of up to 1e-12 m counts as gap 0, so as avoided.
+    Where it cannot, every command profile leads to contact, but not always to an impact: see
+    ``LowerBound.impact_proven``. Covers three vehicles with the middle one controlled, or two with either. The others
+    brake with their whole capacity from their latencies on. An overlap of the deciding trajectories of up to 1e-12 m
+    counts as gap 0, so as avoided.
+
+    Args:
+        worlds: the worlds now, [n].
+        vehicle: index of the controlled vehicle, from 0.
+        scripts: name of each other vehicle's script by index, as in ``Scenario.roles``; only checked to be full_brake.
 
     Raises ``InvalidInput`` for another line, a script other than full_brake, a front vehicle that may brake only after
     the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
     reach before any contact.
+
     """
     worlds.refuse_build_up("avoidability")
     check_covered(worlds, vehicle, scripts)
@@ -292,7 +405,14 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
 
 def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
-    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked."""
+    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked.
+
+    Args:
+        worlds: the worlds, [n].
+        vehicle: index of the controlled vehicle.
+        scripts: name of each other vehicle's script by index; None: all brake fully.
+
+    """
     # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring the vehicle
     # there, and a push is an impact already.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)

@@ -31,10 +31,18 @@ _TRIED = 8  # number of meetings evaluated before the search, for a first best v
 
 @compiled(apart=True)
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Return the least closing speed of first contacts between two times.
+    """Return the least closing speed of first contacts between the times ``early`` and ``late``, m/s.
 
-    It falls with time, except if the leader brakes harder than the controlled vehicle: it may then rise by the
-    difference.
+    It falls with time, except if the leader (front vehicle) brakes harder than the controlled vehicle: it may then rise
+    by the difference.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+
     """
     if kind >= RAMPED_FRONT:
         return gentlest_ramped_between(kind, at, early, late)
@@ -46,9 +54,10 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
 
 @compiled
 def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
-    """Return start and end of the decision step that holds both times.
+    """Return start and end (s) of the decision step that holds both ``early`` and ``late``.
 
-    Returns ``late`` twice if there are no decision steps, or if the times lie in more than one step.
+    Returns ``late`` twice if there are no decision steps, or if the times lie in more than one step. ``at`` is one
+    world, an array with the columns of ``line.LINE``.
     """
     step = at[LINE.TIME_STEP]
     if step <= 0.0:
@@ -61,11 +70,22 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
-    """Return how far the command in force at the first contacts of a cell is from the best command after them.
+    """Return a lower bound (m/s2) on how far the command during a first contact is from the best command after it.
 
-    The result is a lower bound. Before a gentle contact the vehicle brakes (drives); to soften what follows it drives
-    (brakes) after it. The command is the same in the whole decision step, so it cannot do both. Covers contacts with
-    closing speeds from ``softest`` to ``hard``.
+    If the front vehicle is met first, the vehicle brakes before a gentle contact, and drives after it to soften the
+    impact from behind. If the rear vehicle is met first, it drives before and brakes after. The command is the same in
+    the whole decision step, so it cannot do both.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        softest: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        begin: start of the decision step, s.
+
     """
     whole = at[LINE.U_F] + at[LINE.A_F]
     turn = gentlest(kind, at, early)[1]
@@ -89,7 +109,21 @@ def harm_of(
     kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound on the harm of the first contacts of a cell (a range of times and closing speeds)."""
+    """Return a lower bound on the harm of the first contacts in a range of times and closing speeds, m2/s2.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     begin, end = decision_around(at, early, late)
     lack = 0.0
     if end > late:
@@ -103,9 +137,15 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Make room on the heap for a cell (a range of times and closing speeds) with this bound; return its index.
+    """Make room on the heap for an entry with bound ``harm``; return its index. The caller fills in the other columns.
 
-    Index 0 holds the cell with the least bound.
+    Index 0 holds the entry with the least bound.
+
+    Args:
+        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
+        count: number of entries so far.
+        harm: bound of the new entry, m2/s2.
+
     """
     at = count
     while at > 0 and heap[(at - 1) // 2, HARM] > harm:
@@ -118,7 +158,18 @@ def room_for(heap: Floats, count: int, harm: float) -> int:
 
 @compiled(apart=True)
 def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
-    """Add a cell (a range of times and closing speeds) to the heap; return the new number of cells."""
+    """Add a range of times and closing speeds to the heap; return the new number of entries.
+
+    Args:
+        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
+        count: number of entries so far.
+        harm: lower bound on the harm of first contacts in the range, m2/s2.
+        early: earliest time, s.
+        late: latest time, s.
+        soft: least closing speed, m/s.
+        hard: largest closing speed, m/s.
+
+    """
     at = room_for(heap, count, harm)
     heap[at, EARLY], heap[at, LATE], heap[at, SOFT], heap[at, HARD] = early, late, soft, hard
     return count + 1
@@ -126,7 +177,10 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
 @compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
-    """Remove the first cell from the heap, which has the least bound; return the new number of cells."""
+    """Remove the entry with the least bound, index 0, from the heap; return the new number of entries.
+
+    ``count`` is the number of entries on the heap before.
+    """
     count -= 1
     at, below = 0, 1
     while below < count:
@@ -146,9 +200,20 @@ def drop_first(heap: Floats, count: int) -> int:
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
-    """Replace the first cell of the heap, a range of times and closing speeds, by its halves.
+    """Replace the first entry of the heap, a range of times and closing speeds of first contacts, by its halves.
 
-    Returns the new number of cells, and the harm of a first contact inside.
+    Returns the new number of entries, and a harm (m2/s2) that some contact in the range does not exceed.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        count: number of entries on the heap.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
     """
     harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
     count = drop_first(heap, count)
@@ -178,9 +243,22 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound on the harm of all first contacts between two times, or ``best`` if no meeting does less.
+    """Return a lower bound on the harm of all first contacts between two times (m2/s2), or ``best`` if none does less.
 
-    Harm of ``enough`` is proven without it: as soon as some meeting does no more than that, 0 is returned.
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest time of the contact, s after the controlled vehicle may act.
+        last: latest time of the contact, s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: result if no contact does less harm, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because a bound of ``enough`` is
+            proven elsewhere.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
     """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)
@@ -208,7 +286,11 @@ def least_harm(
 
 @compiled
 def next_split(kind: int, at: Floats, time: float, last: float) -> float:
-    """Return the next time at which a decision is due or the leader comes to rest, at most ``last``."""
+    """Return the next time (s) at which a decision is due or the front vehicle comes to rest, at most ``last``.
+
+    With brake build-up it is at most ``_PART_S`` later than ``time``. ``kind`` is the kind of contact (``FRONT_FIRST``,
+    ...), ``at`` one world, an array with the columns of ``line.LINE``.
+    """
     until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
     if at[LINE.TIME_STEP] > 0.0:
         until = min(until, (math.floor(time / at[LINE.TIME_STEP] + 1e-6) + 1.0) * at[LINE.TIME_STEP])

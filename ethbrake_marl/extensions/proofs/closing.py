@@ -23,7 +23,7 @@ FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)
 
 @compiled(apart=True)
 def least_on_piece(constant: float, pressing: float, since: float, until: float) -> float:
-    """Return the least value of ``constant / t + pressing t / 2`` for ``t`` from ``since`` to ``until``."""
+    """Return the least value of ``(constant / t) + (pressing * t / 2)`` for ``t`` from ``since`` to ``until``."""
     least = constant / until + 0.5 * pressing * until
     if since > 0.0:
         least = min(least, constant / since + 0.5 * pressing * since)
@@ -38,10 +38,16 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 
 @compiled(apart=True)
 def least_before(at: Floats, met: float, squared: float) -> float:
-    """Return the least closing speed of a pair's first contact until ``met``, for a scripted leader.
+    """Return the least closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a script.
 
-    ``met`` is the time at which the extreme motions meet. At time t the closing speed is at least ``c(t) + g(t) / t``:
-    the closing speed of the extreme motions, and what must be added to it to use up their gap by then.
+    At time t the closing speed is at least ``c(t) + (g(t) / t)``. Here c and g are closing speed and gap of the extreme
+    motions, and ``g(t) / t`` is the speed that must be added to close the gap by then.
+
+    Args:
+        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        met: time at which the extreme motions of the pair meet, s.
+        squared: their squared closing speed at that time, m2/s2.
+
     """
     if met <= 0.0:
         return math.sqrt(squared)
@@ -68,9 +74,16 @@ def least_before(at: Floats, met: float, squared: float) -> float:
 
 @compiled(apart=True)
 def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the least closing speed at a pair's first contact, and the latest time of that contact.
+    """Return the least closing speed (m/s) at a pair's first contact, and the latest time of that contact (s).
 
     Returns 0 and infinity if no contact is forced by ``until``.
+
+    Args:
+        at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        until: horizon, s.
+        plan: working memory for one plan (``empty_plan``).
+        other: further working memory of the same kind.
+
     """
     onset = at[LEADER_ONSET]
     if at[LEADER_FREE] > 0.0:
@@ -87,7 +100,14 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
 
 @compiled
 def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
-    """Write the bounds of pairs ``pairs`` [n, PAIR_WIDTH] to ``out`` [n]; a contact without impact counts as 0."""
+    """Compute the least harm of each of ``n`` pairs, whatever its vehicles and their neighbours do.
+
+    Args:
+        pairs: [n, PAIR_WIDTH] columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        until: [n] horizon of each pair, s.
+        out: [n] receives the bounds, m2/s2; a contact without impact counts as 0.
+
+    """
     plan, other = empty_plan(), empty_plan()
     for k in range(pairs.shape[0]):
         closing = least_closing_of_pair(pairs[k], until[k], plan, other)[0]

@@ -14,11 +14,20 @@ from ethbrake_marl.physics.jit import compiled
 
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
-    """Return the speed lead that a flight of this length gives the controlled vehicle, less its cost. [m/s]
+    """Return the speed (m/s) that a flight gains for the controlled vehicle over the common speed of both, less its
+    cost.
 
-    A flight is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
+    A *flight* is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
     speed is ``share (press L - o) - G``. G is the least loss of command, at most ``reach`` per second, that keeps the
-    two apart for L: ``G L - G^2 / 2 reach >= press L^2 / 2 - o L``. Returns -inf if nothing keeps them apart.
+    two apart for L: ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. Returns -inf if nothing keeps them apart.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        opening: speed with which the two separate, m/s.
+        flight: length of the flight, s.
+
     """
     relative = share * (press * flight - opening)
     if press * flight <= 2.0 * opening:
@@ -33,7 +42,18 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
 
 @compiled
 def best_flight(share: float, press: float, reach: float, opening: float) -> float:
-    """Return the length of the flight with the largest ``flight_lead``; infinite if the lead keeps rising."""
+    """Return the length (s) of the flight with the largest ``flight_lead``; infinite if the lead keeps rising with the
+    length.
+
+    A *flight* is a time in which the two vehicles are apart.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        opening: speed with which the two separate, m/s.
+
+    """
     if press <= 0.0:
         return math.inf
     if share <= 0.5:
@@ -52,9 +72,20 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
-    """Return the largest ``flight_lead`` of lengths from ``shortest`` to ``longest``, if ``lost`` is lost in any case.
+    """Return the largest ``flight_lead`` (m/s) of flights from ``shortest`` to ``longest`` (s).
 
-    The maximum is over all openings up to ``opening``: a smaller one may lead further if flights are cut short.
+    A *flight* is a time in which the two vehicles are apart. The maximum is over all opening speeds up to ``opening``:
+    a smaller one may lead further if flights are cut short.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        opening: speed with which the two separate, m/s.
+        shortest: least length of the flight, s.
+        longest: largest length of the flight, s.
+        lost: speed that is lost in any case, m/s.
+
     """
     if press > 0.0:
         opening = min(opening, 0.5 * press * longest)
@@ -71,9 +102,16 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Return whether a loss of command to make a later bounce larger never pays.
+    """Return whether it never pays to give up some acceleration in order to make a later bounce larger.
 
-    If so, ``reach`` bounds the gain of flights.
+    If so, ``reach`` bounds the speed that the vehicle gains while the two are apart.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        bounce: coefficient of restitution.
+
     """
     if share <= 0.5:
         return True
@@ -89,10 +127,27 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """Return the largest lead over the common speed (without loss) between ``since`` and ``until``. [m/s]
+    """Return an upper bound (m/s) on how much faster the controlled vehicle is than the speed of both vehicles' centre
+    of mass.
 
-    ``lost`` is lost in the window from ``late`` to ``end``. The last flight before the meeting with the rear vehicle
-    began with the first impact, within the window, or after it. ``reach`` is infinite if ``press`` is not constant.
+    Both vehicles have met already. The centre of mass is the one that the best command alone would lead to. In the
+    *window* an earlier command still acts instead, which costs the speed ``lost``.
+
+    The bound covers three cases: the last time apart before the meeting with the other neighbour began with the first
+    impact, within the window, or after it.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        press: acceleration with which the two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        bounce: coefficient of restitution.
+        opening: speed with which the two separate, m/s.
+        lost: speed that is lost in the window, m/s.
+        late: start of the window, s.
+        end: end of the window, s.
+        since: earliest time of the meeting with the other neighbour, s.
+        until: latest time of that meeting, s.
+
     """
     if since < end:
         lost, end = 0.0, late
@@ -116,11 +171,20 @@ def largest_lead(
 def widest_flight(
     share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
 ) -> float:
-    """Return the largest ``sqrt(p^2 + 2 press s)`` in any flight from a partner that brakes harder by ``slack``. [m/s]
+    """Return the largest ``sqrt(p^2 + 2 press s)`` (m/s) while a vehicle and a partner that brakes harder are apart.
 
-    p is the speed with which the two separate, s their gap. The first impact had closing speed ``closing`` and left the
-    vehicle with speed ``-back``. Covers flights within ``time``; ``drive`` is the largest acceleration by a command.
-    Returns infinity if no bound is known.
+    p is the speed with which the two separate, s their gap. Returns infinity if no bound is known.
+
+    Args:
+        share: partner's share of both masses, 0 to 1.
+        slack: by how much the partner brakes harder, m/s2.
+        press: acceleration with which the two close under the best command, m/s2.
+        drive: largest acceleration by a command, m/s2.
+        bounce: coefficient of restitution.
+        closing: closing speed of the first impact, m/s.
+        back: backward speed of the vehicle after that impact, m/s.
+        time: time that is covered, s.
+
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:
         return math.inf

@@ -31,7 +31,7 @@ def least_of_line(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
     until: float,
 ) -> float:  # fmt: skip
-    """Return the least value of a piecewise linear function from ``since`` to ``until``.
+    """Return the least value of a piecewise linear function of time from ``since`` to ``until``.
 
     The function is ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+``, where ()+ is the positive
     part.
@@ -48,9 +48,31 @@ def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
 ) -> float:  # fmt: skip
-    """Return the least closing speed of a second meeting until ``until``: that of the common speed, less the lead.
+    """Return the least closing speed (m/s) at which the controlled vehicle meets its second neighbour, after it met the
+    first.
 
-    The time is divided at one of a few moments, because a loss in the window counts only after it.
+    The *common speed* is the speed of the centre of mass of the two vehicles that met first. The result is the closing
+    speed that the second neighbour has to this centre, less the largest lead of the controlled vehicle over it
+    (``largest_lead``). The *window* is the time in which an earlier command still acts, which costs the speed ``lost``.
+    Times count from the first contact, in s.
+
+    Args:
+        start: closing speed of the second neighbour to the centre of mass, at the first contact, m/s.
+        slope: its rate of change, m/s2.
+        turn: first time at which the rate changes, s.
+        bend: change of the rate at ``turn``, m/s2.
+        other_turn: second time at which the rate changes, s.
+        other_bend: change of the rate at ``other_turn``, m/s2.
+        share: share of the partner of the first contact in both masses, 0 to 1.
+        press: acceleration with which these two close under the best command, m/s2.
+        reach: part of ``press`` that a command can hold back, m/s2.
+        bounce: coefficient of restitution.
+        opening: speed with which the two separate after the first contact, m/s.
+        lost: speed that is lost in the window, m/s.
+        late: start of the window, s.
+        end: end of the window, s.
+        until: latest time of the second meeting, s.
+
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
     best -= largest_lead(share, press, reach, bounce, opening, lost, late, end, 0.0, until)
@@ -70,10 +92,21 @@ def least_closing(
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least closing speed at the rear pair, from the centre of mass of leader and controlled vehicle.
+    """Return the least closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
-    Returns 0 if nothing is proven. A standing leader stays in place, so a later first contact with it differs only in
-    time; the window with the loss is then not used.
+    The bound follows from the centre of mass of leader and controlled vehicle. Returns 0 if nothing is proven. If the
+    leader stands, a later first contact differs only in its time, so ``late``, ``end`` and ``lack`` are not used.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
     v_l, way_l = leader(at, early)
@@ -106,9 +139,18 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Return the least closing speed at the rear pair behind a leader that brakes harder.
+    """Return the least closing speed (m/s) at the rear pair after a first contact with a leader that brakes harder.
 
-    The controlled vehicle then stays near the leader. Returns 0 if nothing is proven.
+    The controlled vehicle then stays near the leader (front vehicle). Returns 0 if nothing is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
     v_l, way_l = leader(at, early)
@@ -148,10 +190,21 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared closing speed at the rear pair after a first contact with the leader.
+    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    The contact closes with at most ``closing``. The arguments from the centre of mass do not hold if an obstacle may
-    throw both vehicles back; they are then left out.
+    It is the largest of several bounds. Those that rest on the centre of mass of both vehicles do not hold if an
+    obstacle may throw them back, and are then left out.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
     v_l, way_l = leader(at, early)
@@ -176,10 +229,16 @@ def after_front(
 
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
-    """Return the least squared speed at which the leader, met by ``late``, hits the obstacle.
+    """Return the least squared speed (m2/s2) at which the front vehicle hits the obstacle after the controlled vehicle
+    pushed it.
 
-    Only the leader's own brakes slow it. Returns 0 if it already stands at the obstacle, because all three are then one
-    cluster.
+    Only its own brakes slow it. Returns 0 if it already stands at the obstacle, because all three are then one cluster.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        late: latest time of the first contact, s.
+        closing: least closing speed of the push, m/s.
+
     """
     if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
         return 0.0
@@ -196,10 +255,21 @@ def obstacle_harm(at: Floats, late: float, closing: float) -> float:
 def braking_after(
     gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared closing speed with the leader of a vehicle that brakes with at most ``a_f``.
+    """Return the least squared closing speed (m2/s2) with which a vehicle meets the front vehicle if it brakes with at
+    most ``a_f``.
 
-    Returns 0 if none is certain. The gap is at most ``gap``, and at least ``least_gap``, which matters behind a leader
-    that brakes harder.
+    Returns 0 if no contact is certain.
+
+    Args:
+        gap: largest possible gap, m.
+        least_gap: least possible gap, m; it matters if the front vehicle brakes harder.
+        v_l: speed of the front vehicle, m/s.
+        a_l: its braking capacity, m/s2.
+        v_f: speed of the braking vehicle, m/s.
+        a_f: its braking capacity, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     fill_braking(plan, 0.0, a_l)
     fill_braking(other, 0.0, a_f)
@@ -215,9 +285,22 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least closing speed at the front pair after the controlled vehicle met the rear one.
+    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
 
-    The bound follows from the centre of mass of these two vehicles. Needs ``a_f >= a_r``.
+    The bound follows from the centre of mass of these two vehicles. The controlled vehicle must have brakes at least as
+    strong as the rear one.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        gap: gap to the front vehicle at ``early``, m.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l = leader(at, early)[0]
@@ -241,9 +324,19 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Return the least closing speed at the front pair after the controlled vehicle met the rear one.
+    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
 
-    The controlled vehicle stays ahead of the rear one. Needs ``a_f >= a_r``. Returns 0 if the closing speed may rise.
+    The bound follows because the controlled vehicle stays ahead of the rear one. The controlled vehicle must have
+    brakes at least as strong as the rear one. Returns 0 if the closing speed may rise.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        closing: largest closing speed of the contact, m/s.
+        gap: gap to the front vehicle at ``early``, m.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]
     pooled = (1.0 - share) * at[LINE.A_F] + share * at[LINE.A_R]

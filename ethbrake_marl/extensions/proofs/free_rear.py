@@ -40,10 +40,14 @@ _SHORT_S = 1e-3  # least time to divide by
 
 @compiled
 def gained(near: float, time: float, since: float, power: float) -> float:
-    """Return by how much, at least, the rear vehicle is faster than by full braking, if it is ``near`` further.
+    """Return by how much, at least, the rear vehicle is faster at ``time`` than by its own full braking, m/s.
 
-    ``time`` is the time of the comparison. The rear vehicle holds back its brakes from ``since`` on, by at most
-    ``power`` (m/s2; infinite if others push it).
+    Args:
+        near: by how much it has come further than by full braking, m.
+        time: time of the comparison, s.
+        since: time from which on it may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2; infinite if other vehicles push it.
+
     """
     if near <= 0.0 or time <= since:
         return 0.0
@@ -55,9 +59,10 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
-    """Return the least gap to the rear vehicle under full braking.
+    """Return the least gap (m) to the rear vehicle if the controlled vehicle brakes until ``early``, the rear one until
+    ``late``.
 
-    The controlled vehicle brakes until ``early``, the rear vehicle until ``late``.
+    ``at`` is one world, an array with the columns of ``line.LINE``; the times are in s.
     """
     return float(
         at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
@@ -66,9 +71,18 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
-    """Return the least closing speed of the first contacts with the rear vehicle in a cell.
+    """Return the least closing speed (m/s) of the first contacts with the rear vehicle in a range of times and
+    distances (``near`` to ``far``).
 
-    A cell is a range of times and of distances by which the rear vehicle has come further than by full braking.
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        since: time from which on the rear vehicle may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2.
+
     """
     faster = gained(near, late, since, power)
     # the fastest way of the controlled vehicle to that place is to brake, then to drive
@@ -82,12 +96,23 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed at the front pair after the rear vehicle was met first.
+    """Return the least squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The first contacts are those of a cell: at times from ``early`` to ``late``, with the rear vehicle ``near`` to
-    ``far`` further, and faster by ``faster``, than by full braking, and with closing speeds of at most ``hard``. The
-    bound starts from a state at ``early`` that is at every later time no further and no faster than after any of these
-    contacts.
+    The bound starts from a state at ``early`` that is at every later time no further and no faster than after any of
+    these contacts.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        hard: largest closing speed of the contact, m/s.
+        faster: least speed by which the rear vehicle is faster than by full braking, m/s.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     further = near - faster * (late - early)
     v_l, way_l = leader(at, early)
@@ -116,9 +141,26 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Add a cell of first contacts with the rear vehicle to the heap if it may beat the best.
+    """Add a range of first contacts with the rear vehicle to the heap if it may do less harm than the best one known.
 
-    Returns the number of cells.
+    Returns the new number of entries on the heap.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        near: least distance by which the rear vehicle has come further than by full braking, m.
+        far: largest such distance, m.
+        soft: least closing speed, m/s.
+        hard: largest closing speed, m/s.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2).
+        count: number of entries on the heap.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+
     """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
     room = at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, late)[1] - follower(at, early)[1]
@@ -142,9 +184,20 @@ def put_behind(
 def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
-    """Lower the best to the harm of the gentlest first contact with the rear vehicle at ``time``.
+    """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if that is
+    less.
 
-    The rear vehicle is then about ``near`` further than by full braking.
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s.
+        near: distance by which the rear vehicle has come further than by full braking, m; raised if too small.
+        far: largest such distance, m.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     near = max(near, behind_full_braking(at, time, time))
     if near > far or near > at[LINE.GAP_L] + at[LINE.GAP_R] + leader(at, time)[1] - follower(at, time)[1]:
@@ -159,9 +212,20 @@ def try_behind(
 def divide_behind(
     at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> int:
-    """Replace the first cell of the heap by its halves; return the new number of cells.
+    """Replace the first entry of the heap by its halves; return the new number of entries.
 
-    A cell is a range of times, distances and closing speeds of first contacts with the rear vehicle.
+    An entry is a range of times, distances and closing speeds of first contacts with the rear vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        count: number of entries on the heap.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+
     """
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
     soft, hard = heap[0, SOFT], min(heap[0, HARD], math.sqrt(search[BEST]))
@@ -190,9 +254,20 @@ def divide_behind(
 def meetings_behind(
     at: Floats, last: float, search: Floats, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound on the harm of all first contacts with the rear vehicle until ``last``.
+    """Return a lower bound on the harm of all first contacts with the rear vehicle until ``last`` (s), m2/s2.
 
-    The result is at most the least harm found before (``search[BEST]``).
+    The result is at most ``search[BEST]``, the least harm that is known before.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        last: latest time of the contact, s after the controlled vehicle may act.
+        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
+            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [SEARCHED + 4, HEAP_WIDTH].
+
     """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0
     if since > 0.0:

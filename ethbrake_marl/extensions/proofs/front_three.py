@@ -35,9 +35,19 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Floats, other: Floats) -> float:
-    """Return the least harm if leader and rear vehicle meet with the controlled one between them; else infinity.
+    """Return the least harm (m2/s2) of a contact of all three vehicles at the same time; infinity if there can be none.
 
-    The closing speed of the front pair is at least the least of its first contacts; the rear pair has the rest.
+    Front and rear vehicle then close with at least some speed W, which the two pairs share. The front pair's part of W
+    is at least its least closing speed of any first contact.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest first contact with the front vehicle, s.
+        last: latest first contact with the front vehicle, s.
+        pair: working memory for a pair, [PAIR_WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
     pair[LEADER_V], pair[LEADER_A] = at[LINE.V_L], at[LINE.A_L]
@@ -54,10 +64,19 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Return whether the first contact with the rear vehicle may come after it would stand by full braking.
+    """Return a code: may the rear vehicle first touch the controlled one after the time at which it would stand by
+    braking?
 
-    0: it cannot. 1: it may, and the harm is then no less than if the leader is met first. 2: it may, and nothing is
-    proven.
+    0: it cannot. 1: it may, and the harm is then no less than if the front vehicle is met first. 2: it may, and nothing
+    is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest first contact with the front vehicle, s; infinite: none.
+        stand: time at which the rear vehicle stands by full braking, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return 0
@@ -78,10 +97,25 @@ def combined_bound_of_team(
     at: Floats, until: float, front: float, rear: float, since: float, power: float, pair: Floats, moved: Floats,
     plan: Floats, other: Floats, heap: Floats, heap_behind: Floats,
 ) -> float:  # fmt: skip
-    """Return the least harm of the first three vehicles in a world with unavoidable contact, whoever is met first.
+    """Return the least harm (m2/s2) of the first three vehicles in a world with unavoidable contact, whoever is met
+    first.
 
-    Returns 0 if the harm may come after ``until``. ``front`` and ``rear`` are the bounds of the two pairs alone. The
-    rear vehicle may hold back its brakes from ``since`` on, by at most ``power`` (m/s2).
+    Returns 0 if the harm may come after ``until``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        until: horizon, s; harm after it does not count.
+        front: bound on the harm of the front pair alone, m2/s2.
+        rear: bound on the harm of the rear pair alone, m2/s2.
+        since: time from which on the rear vehicle may hold back its brakes, s.
+        power: largest acceleration by which it holds them back, m/s2.
+        pair: working memory for a pair, [PAIR_WIDTH].
+        moved: working memory for a second world, [LINE.WIDTH].
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory for contacts with the front vehicle, [CELLS, NEAR].
+        heap_behind: working memory for contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
+
     """
     rest, stand = last_rest(at)
     if not rest < until:
@@ -112,9 +146,16 @@ def combined_bound_of_team(
 
 @compiled
 def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
-    """Write the combined bounds of the first three vehicles of worlds ``states`` [n, WIDTH] to ``out`` [n].
+    """Compute the combined bound of the first three vehicles for each of ``n`` worlds with unavoidable contact.
 
-    Contact is unavoidable in these worlds. ``pairs`` [n, 2] are the bounds of their two pairs.
+    Args:
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        until: [n] horizon, s.
+        pairs: [n, 2] bounds of the two pairs alone, m2/s2.
+        since: [n] time from which on the rear vehicle may hold back its brakes, s.
+        power: [n] largest acceleration by which it holds them back, m/s2.
+        out: [n] receives the bounds, m2/s2.
+
     """
     plan, other, pair, moved = empty_plan(), empty_plan(), np.empty(PAIR_WIDTH), np.empty(LINE.WIDTH)
     heap, heap_behind = np.empty((CELLS, NEAR)), np.empty((SEARCHED + 4, HEAP_WIDTH))

@@ -11,40 +11,40 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Line(NamedTuple):
-    """Columns of one world at the moment when the controlled vehicle (follower, F) may act.
+    """Index of each column of a world array, at the moment when the controlled vehicle (follower, F) may act.
 
-    L is the front vehicle (leader), R the rear vehicle. V are speeds, A braking and U driving capacities.
+    L is the front vehicle (leader), R the rear vehicle. V are speeds (m/s), A braking and U driving capacities (m/s2).
     """
 
-    GAP_L: int = 0
-    V_L: int = 1
-    A_L: int = 2
-    V_F: int = 3
-    A_F: int = 4
-    U_F: int = 5
-    LIMIT_F: int = 6
-    GAP_R: int = 7
-    V_R: int = 8
-    A_R: int = 9
-    ONSET_R: int = 10
-    FRONT_SHARE: int = 11  # m_l / (m_l + m_f)
-    REAR_SHARE: int = 12  # m_r / (m_f + m_r)
-    RESTITUTION: int = 13
+    GAP_L: int = 0  # gap to the front vehicle, m
+    V_L: int = 1  # speed of the front vehicle, m/s
+    A_L: int = 2  # braking capacity of the front vehicle, m/s2
+    V_F: int = 3  # speed of the controlled vehicle, m/s
+    A_F: int = 4  # braking capacity of the controlled vehicle, m/s2
+    U_F: int = 5  # driving capacity of the controlled vehicle, m/s2
+    LIMIT_F: int = 6  # speed limit of the controlled vehicle, m/s
+    GAP_R: int = 7  # gap to the rear vehicle, m
+    V_R: int = 8  # speed of the rear vehicle, m/s
+    A_R: int = 9  # braking capacity of the rear vehicle, m/s2
+    ONSET_R: int = 10  # time from which on the rear vehicle brakes, s
+    FRONT_SHARE: int = 11  # m_l / (m_l + m_f), with the masses m
+    REAR_SHARE: int = 12  # m_r / (m_f + m_r), with the masses m
+    RESTITUTION: int = 13  # coefficient of restitution
     TIME_STEP: int = 14  # time between decisions (s), the first one now; 0 if commands may change at any time
     OBSTACLE: int = (
         15  # gap from the leader to an obstacle ahead (m), which it does not reach by itself; infinite without
     )
-    # only with brake build-up: accelerations in force (m/s2); rates at which they fall and rise (m/s3)
+    # acceleration of the front vehicle in force, m/s2 (this and the next six only with brake build-up)
     FORCE_L: int = 16
-    FALL_L: int = 17
-    FORCE_F: int = 18
-    FALL_F: int = 19
-    RISE_F: int = 20
-    FORCE_R: int = 21
-    FALL_R: int = 22
+    FALL_L: int = 17  # rate at which the acceleration of the front vehicle falls, m/s3
+    FORCE_F: int = 18  # acceleration of the controlled vehicle in force, m/s2
+    FALL_F: int = 19  # rate at which it falls, m/s3
+    RISE_F: int = 20  # rate at which it rises, m/s3
+    FORCE_R: int = 21  # acceleration of the rear vehicle in force, m/s2
+    FALL_R: int = 22  # rate at which the acceleration of the rear vehicle falls, m/s3
     UNTIL: int = 23  # horizon (s); 0 if unknown
     WALL: int = 24  # OBSTACLE if an impact with it counts and the rear vehicle brakes fully; else 0
-    WIDTH: int = 25
+    WIDTH: int = 25  # number of columns
 
 
 LINE = _Line()
@@ -60,14 +60,20 @@ AHEAD_M = 1e-9  # tolerance: a smaller overlap is no meeting with the other vehi
 
 @compiled
 def leader(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed and distance of the front vehicle at ``time`` if nobody touches it."""
+    """Return speed (m/s) and distance (m) of the front vehicle at ``time`` (s) if nobody touches it.
+
+    ``at`` is one world, an array with the columns of ``LINE``.
+    """
     speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
     return speed, way
 
 
 @compiled
 def follower(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed and distance of the rear vehicle at ``time`` if nobody touches it."""
+    """Return speed (m/s) and distance (m) of the rear vehicle at ``time`` (s) if nobody touches it.
+
+    ``at`` is one world, an array with the columns of ``LINE``.
+    """
     speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
     return speed, way
 

@@ -61,9 +61,15 @@ _PARTS = 8  # number of parts into which the times of soft meetings are divided
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the least squared closing speed at the rear pair's first contact, and its latest time.
+    """Return the least squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
 
-    Both belong to full drive of the controlled vehicle.
+    The controlled vehicle reaches both by full drive.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -75,7 +81,17 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the other neighbour has not arrived before the gentlest first contact at ``time``."""
+    """Return whether the other neighbour has not arrived before the gentlest first contact at ``time`` (s).
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     if kind == FRONT_FIRST:
         return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
     return stays_behind(at, braking_to_rear(at, time, 0.0), time, plan, other)
@@ -83,10 +99,22 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time, at most ``last``, of a first contact with one neighbour before the other one has arrived.
+    """Return the latest time (s) of a first contact with one neighbour at which the other neighbour has not arrived
+    yet.
 
-    At ``first`` there is room. The later the meeting, the shorter the drive (the braking) before it, and the less room
-    behind (ahead).
+    It is found by halving the time, because a later contact leaves less room. A later contact with the front vehicle
+    needs a shorter drive before it, so the rear vehicle comes nearer. A later contact with the rear vehicle needs
+    shorter braking, so the front vehicle comes nearer.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: time of a first contact at which there is room, s.
+        last: latest time of a first contact with this neighbour, s; the result is at most this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     if is_first(kind, at, last, plan, other):
         return last
@@ -101,9 +129,17 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest first contact with the leader, and the latest one at which the leader is met first.
+    """Return the latest contact (s) with the front vehicle, and the latest one (s) that comes before the rear vehicle
+    arrives.
 
-    Also returns whether the leader may be met first arbitrarily late and softly. ``first`` is the earliest meeting.
+    The third result says whether the front vehicle may be met first arbitrarily late and softly.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        first: earliest contact with the front vehicle, s.
+        plan: working memory, from ``empty_plan``.
+        other: further working memory of the same kind.
+
     """
     touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
     last = meet_front(at, 0.0, plan, other)
@@ -119,10 +155,20 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least harm, if below ``best``, where the leader is met first or all three meet at once.
+    """Return the least harm (m2/s2), if below ``best``, where the front vehicle is met first or all three meet at once.
 
-    If all three meet at once, leader and rear vehicle close with W; the front pair's part of W is at least the least
-    closing speed at that time. This case counts only if the leader can be met that late.
+    If all three meet at once, front and rear vehicle close with W; the front pair's part of W is at least the least
+    closing speed at that time. This case counts only if the front vehicle can be met that late.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: least harm of a first contact that is known so far, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
     """
     first = meet_front(at, math.inf, plan, other)
     if (
@@ -156,7 +202,21 @@ def front_first(
 def soft_harm(
     kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm, if below ``best``, of first contacts from ``early`` to ``late`` with any closing speed."""
+    """Return the least harm (m2/s2), if below ``best``, of first contacts from ``early`` to ``late`` with any closing
+    speed.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: least harm of a first contact that is known so far, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     soft = 0.0
     while soft * soft < best:
         hard = soft + 0.02 * (1.0 + soft)
@@ -172,7 +232,18 @@ def soft_harm(
 def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least harm, if below ``best``, where the rear vehicle is met first."""
+    """Return the least harm (m2/s2), if below ``best``, where the rear vehicle is met first.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        floor: known lower bound on the harm at the other pair, m2/s2.
+        best: least harm of a first contact that is known so far, m2/s2.
+        enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
+    """
     high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
     first = meet_rear(at, high, plan, other)
     if first == math.inf or not stays_behind(at, first, first, plan, other):
@@ -202,10 +273,17 @@ def rear_first(
 
 @compiled(apart=True)
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
-    """Return a time after which no first contact with the rear vehicle is possible; everything stands at ``rest``.
+    """Return a time (s) after which no first contact with the rear vehicle is possible.
 
-    By then the rear vehicle has passed neither the leader nor the controlled vehicle. If it brakes harder than the
-    controlled vehicle by b, it was faster by ``b t`` at time t before the meeting, from its onset on.
+    By then the rear vehicle has passed neither the front vehicle nor the controlled one. If it brakes harder than the
+    controlled vehicle by b, it was faster by ``b t`` at time t before the contact, from its onset on.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        rest: time at which the controlled and the rear vehicle stand by full braking, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     fill_braking(plan, 0.0, at[LINE.A_L])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -223,7 +301,11 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return when everything that follows from braking is over, and when the rear vehicle stands by full braking."""
+    """Return the time (s) by which all harm has happened if all vehicles brake, and the time (s) at which the rear
+    vehicle stands.
+
+    ``at`` is one world, an array with the columns of ``line.LINE``.
+    """
     stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
     way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
     room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
@@ -235,9 +317,19 @@ def last_rest(at: Floats) -> tuple[float, float]:
 def combined_bound(
     at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least harm of a world with unavoidable contact, whoever is met first.
+    """Return the least harm (m2/s2) of a world with unavoidable contact, whoever is met first.
 
-    Returns 0 if the harm may come after ``until``. ``front`` and ``rear`` are the bounds of the two pairs alone.
+    Returns 0 if the harm may come after ``until``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        until: horizon, s; harm after it does not count.
+        front: bound on the harm of the front pair alone, m2/s2.
+        rear: bound on the harm of the rear pair alone, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
     """
     if not last_rest(at)[0] < until:
         return 0.0
@@ -256,9 +348,16 @@ def combined_bound(
 def bound_worlds(
     states: Floats, until: Floats, has_front: Bools, has_rear: Bools, unavoidable: Bools, out: Floats
 ) -> None:
-    """Write the bounds of worlds ``states`` [n, WIDTH] to ``out`` [n, BOUNDS].
+    """Compute lower bounds on the harm of ``n`` worlds: of each pair alone, and of both together.
 
-    These are the bound of each pair that exists, and the combined bound where contact is unavoidable.
+    Args:
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        until: [n] horizon, s.
+        has_front: [n] True if the front pair exists and its next impact counts.
+        has_rear: [n] True if the rear pair exists and its next impact counts.
+        unavoidable: [n] True if contact is unavoidable; only there the combined bound is computed.
+        out: [n, BOUNDS] receives columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+
     """
     plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
     for k in range(states.shape[0]):
@@ -293,20 +392,28 @@ def lower_bound(
     scripts: Mapping[int, str] | None = None,
     time_step_s: float | None = None,
 ) -> LowerBound:
-    """Return a proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicle``.
+    """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
 
-    ``harm = early + max(front_pair + rear_pair, combined)``, each part rounded outward (``rounding``). The combined
-    bound is 0 where contact can be avoided. Harm that may come only after the horizon counts as 0. With ``harm_count``
-    "first", the next impact of a pair that was hit before counts as 0 too.
-
-    With ``time_step_s`` the bound is proven only for commands that change at decisions: the first one when the vehicle
-    may act, then one every ``time_step_s``, as for every agent. That is sharper, and takes ten times as long.
+    ``harm = early + max((front_pair + rear_pair), combined)``, each part lowered by the largest possible rounding error
+    (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come only after the horizon
+    counts as 0.
 
     With brake build-up the bound holds for any command at any time and is looser. It has no verdict on contact:
     ``contact`` is None if brakes build up in any of the worlds.
 
+    Args:
+        worlds: the worlds now, [n].
+        vehicle: index of the controlled vehicle, from 0.
+        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
+        horizon_s: time until which harm counts, s (absolute).
+        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
+        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
+            the first one when the vehicle may act, then one every ``time_step_s``, as for every agent. That is sharper,
+            and takes ten times as long. None: commands may change at any time.
+
     Covers the same lines as ``avoidability``. Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
+
     """
     check_asked("lower_bound", harm_count, horizon_s, time_step_s)
     slow = worlds.vehicles.build_up

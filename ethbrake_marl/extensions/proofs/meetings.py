@@ -26,9 +26,11 @@ _GUARD = 2.0**-46  # relative allowance for rounding of positions, so that no me
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed of a first contact with the leader at ``time``, and how long to drive first.
+    """Return the least closing speed (m/s) of a contact with the front vehicle at ``time``, and how long to drive first
+    (s).
 
-    The slowest way to be there at that time is to drive, then to brake.
+    The slowest way to be there at that time is to drive, then to brake. ``at`` is one world, an array with the columns
+    of ``line.LINE``.
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
@@ -49,9 +51,10 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
-    """Return distance and speed at ``time`` of the controlled vehicle if it brakes for ``brake``, then drives.
+    """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes for ``brake`` s, then
+    drives.
 
-    It brakes at most to rest.
+    It brakes at most to rest. ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
     braking = min(brake, v / a)
@@ -66,9 +69,14 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
 
 @compiled(apart=True)
 def braking_to_rear(at: Floats, time: float, further: float) -> float:
-    """Return how long the controlled vehicle must brake, then drive, so that the rear vehicle meets it at ``time``.
+    """Return for how long (s) the controlled vehicle must brake, then drive, so that the rear vehicle meets it at
+    ``time``.
 
-    ``further`` is how much further the rear vehicle has come than by full braking (m).
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        further: by how much the rear vehicle has come further than by full braking, m.
+
     """
     place = follower(at, time)[1] - at[LINE.GAP_R] + further
     low, high = 0.0, time
@@ -83,10 +91,11 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed of a first contact with the rear vehicle at ``time``, and how long to brake first.
+    """Return the least closing speed (m/s) of a contact with the rear vehicle at ``time``, and how long to brake first
+    (s).
 
     The fastest way to be there at that time is to brake, then to drive. The braking is infinite if the vehicle is then
-    at its speed limit.
+    at its speed limit. ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     brake = braking_to_rear(at, time, 0.0)
     speed = braked_then_driven(at, brake, time)[1]
@@ -95,7 +104,17 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
-    """Call ``gentlest_front``, ``gentlest_rear`` or ``gentlest_ramped``, by ``kind``."""
+    """Return the least closing speed (m/s) of a first contact at ``time``, and how long to drive or brake first (s).
+
+    With brake build-up the second result is 0.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+
+    """
     if kind >= RAMPED_FRONT:
         return gentlest_ramped(kind, at, time), 0.0
     return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
@@ -103,7 +122,18 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
-    """Return when the controlled vehicle meets the leader if it drives for ``drive``, then brakes."""
+    """Return the time (s) at which the controlled vehicle, which drives for ``drive`` s and then brakes, meets the
+    front one.
+
+    Infinite if they never meet.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        drive: duration of the drive, s; infinite: drive all the time.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
     fill_braking(other, 0.0, at[LINE.A_L])
     return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, math.inf)[1]
@@ -111,7 +141,18 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
-    """Return when the rear vehicle meets the controlled vehicle if that brakes for ``brake``, then drives."""
+    """Return the time (s) at which the rear vehicle meets the controlled one, which brakes for ``brake`` s, then
+    drives.
+
+    Infinite if they never meet.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        brake: duration of the braking, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
     return walk(
@@ -121,9 +162,16 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the controlled vehicle avoids the rear vehicle until ``until`` if it drives, then brakes.
+    """Return whether the controlled vehicle avoids the rear vehicle until ``until`` if it drives for ``drive`` s, then
+    brakes.
 
-    It drives for ``drive``.
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        drive: duration of the drive, s.
+        until: end of the comparison, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
     fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
@@ -132,9 +180,16 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the controlled vehicle avoids the leader until ``until`` if it brakes, then drives.
+    """Return whether the controlled vehicle avoids the front vehicle until ``until`` if it brakes for ``brake`` s, then
+    drives.
 
-    It brakes for ``brake``.
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        brake: duration of the braking, s.
+        until: end of the comparison, s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
     fill_braking(other, 0.0, at[LINE.A_L])

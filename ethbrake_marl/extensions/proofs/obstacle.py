@@ -37,9 +37,11 @@ _SHORTEST_S = 1e-3  # shortest time or last drive to divide by
 
 @compiled
 def all_three(at: Floats) -> tuple[float, float, float, float]:
-    """Return the masses of leader and rear vehicle, and how fast the centre of mass of all three slows at most.
+    """Return the masses of front and rear vehicle, and the largest deceleration of the centre of mass of all three
+    (m/s2).
 
-    The last value is the part of that deceleration which comes from the rear vehicle.
+    Masses are in units of the controlled vehicle's mass. The fourth result is the part of that deceleration that comes
+    from the rear vehicle (m/s2). ``at`` is one world, an array with the columns of ``line.LINE``.
     """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
     whole = front + 1.0 + rear
@@ -48,7 +50,17 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Return the speed of a leader that, pushed at ``early``, hits the obstacle with ``sqrt(beyond)``, and when."""
+    """Return the speed (m/s) to which a push at ``early`` must bring the front vehicle, and the time (s) of its impact
+    with the obstacle.
+
+    It then hits the obstacle with the speed ``sqrt(beyond)``.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: time of the push, s.
+        beyond: squared speed at the obstacle, m2/s2.
+
+    """
     v = math.sqrt(max(beyond + 2.0 * at[LINE.A_L] * (at[LINE.WALL] - leader(at, early)[1]), 0.0))
     return v, early + (v - math.sqrt(beyond)) / at[LINE.A_L]
 
@@ -57,10 +69,21 @@ def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float
 def least_beyond(
     at: Floats, early: float, late: float, place: float, speed: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared speed with which the leader, pushed at ``early``, hits the obstacle; at least ``least``.
+    """Return the least squared speed (m2/s2) with which the front vehicle, pushed at ``early``, hits the obstacle.
 
-    It follows from the centre of mass of all three vehicles, which must not reach the obstacle before the leader. At
-    ``late`` that centre is at least at ``place``, with ``speed``.
+    It follows from the centre of mass of all three vehicles, which must not reach the obstacle before the front
+    vehicle.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: time of the push, s.
+        late: time for which ``place`` and ``speed`` hold, s.
+        place: least position of the centre of mass of all three at ``late``, m.
+        speed: speed of that centre of mass at ``late``, m/s.
+        least: bound that is known before, m2/s2; the result is at least this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     if not speed > 0.0:
         return least
@@ -78,10 +101,17 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Return the least position and speed at ``late`` of a braking vehicle after its first contact, and its brakes.
+    """Return the least position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
 
-    It left the contact ``faster`` than the leader. The brakes are the hardest of all three vehicles, so that no vehicle
-    falls further behind.
+    The third result is its deceleration (m/s2): the hardest of all three vehicles, so that no vehicle falls further
+    behind.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        faster: speed by which it left the contact faster than the front vehicle, m/s.
+
     """
     v_l, way = leader(at, late)
     brakes = max(at[LINE.A_F], at[LINE.A_L], at[LINE.A_R])
@@ -92,9 +122,18 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
 
 @compiled
 def last_drive(room: float, speed: float, brakes: float, drive: float, time: float) -> float:
-    """Return how long a vehicle must drive at the end to be ``room`` further after ``time``, if it brakes before.
+    """Return for how long (s) a vehicle must drive at the end of ``time``, after braking, to have travelled ``room`` m
+    by then.
 
     Infinite if it cannot.
+
+    Args:
+        room: distance to travel, m.
+        speed: speed now, m/s.
+        brakes: deceleration while braking, m/s2.
+        drive: acceleration while driving, m/s2.
+        time: total time, s.
+
     """
     stand = speed / brakes
     if time > stand:
@@ -109,9 +148,24 @@ def stopped_there(
     at: Floats, early: float, late: float, hard: float, beyond: float, struck: float, until: float, place: float,
     speed: float, brakes: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return the largest distance from the obstacle, backward speed and time of a vehicle stopped there by the leader.
+    """Return three limits for a vehicle that the front vehicle stops at the obstacle: distance, backward speed and
+    time.
 
-    The distance is infinite if it is not known.
+    These are its largest distance from the obstacle (m; infinite if it is not known), its largest backward speed (m/s)
+    and the largest time it spends there (s).
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        hard: largest closing speed of the contact, m/s.
+        beyond: squared speed with which the front vehicle hits the obstacle, m2/s2.
+        struck: time of that impact, s.
+        until: time by which the rear vehicle arrives, s.
+        place: least position of the vehicle at ``late``, m.
+        speed: its least speed at ``late``, m/s.
+        brakes: its deceleration, m/s2.
+
     """
     bounce, drive, wall = at[LINE.RESTITUTION], at[LINE.U_F], at[LINE.GAP_L] + at[LINE.WALL]
     v_l, way = leader(at, early)
@@ -140,10 +194,23 @@ def behind_leader(
     at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed at the rear pair after a first contact with the leader.
+    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    Nobody passes the leader, which hits the obstacle with at most ``sqrt(beyond)``. The centre of mass of all three is
-    at ``late`` at least at ``place``, with ``speed``. Returns LARGE if such a course is impossible.
+    It assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle passes
+    it. Returns LARGE (a huge number) if that is impossible.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        beyond: largest squared speed with which the front vehicle hits the obstacle, m2/s2.
+        place: least position of the centre of mass of all three at ``late``, m.
+        speed: speed of that centre of mass at ``late``, m/s.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
     kept = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
@@ -212,9 +279,18 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm at rear pair and obstacle after a first contact with the leader.
+    """Return the least harm (m2/s2) at rear pair and obstacle together after a first contact with the front vehicle.
 
-    The harm at the rear pair is at least ``follows``.
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        soft: least closing speed of the contact, m/s.
+        hard: largest closing speed of the contact, m/s.
+        follows: known lower bound on the harm at the rear pair, m2/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share = at[LINE.FRONT_SHARE]
     least = obstacle_harm(at, late, soft)
@@ -245,9 +321,17 @@ def after_at_obstacle(
 def beyond_rear(
     at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least ``beyond`` (see ``least_beyond``) after a first contact with the rear vehicle.
+    """Return the least squared speed (m2/s2) of the front vehicle at the obstacle after the rear vehicle was met first.
 
-    The contact closes with at most ``closing``.
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        least: bound that is known before, m2/s2; the result is at least this.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     v_l, way_l = leader(at, late)
     v_r, way_r = follower(at, late)
@@ -263,9 +347,18 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm at front pair and obstacle after a first contact with the rear vehicle.
+    """Return the least harm (m2/s2) at front pair and obstacle after a first contact with the rear vehicle.
 
-    The contact closes with at most ``closing``.
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
     v_l, way_l = leader(at, early)
@@ -295,7 +388,21 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Call ``after_front``, ``after_rear`` or ``after_ramped``, by ``kind``."""
+    """Return the least harm (m2/s2) at the other pair (and the obstacle) after a first contact with one neighbour.
+
+    Args:
+        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
+            brake build-up).
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        closing: largest closing speed of the contact, m/s.
+        end: time until which the command of the earlier decision stays in force, s.
+        lack: least amount by which that command falls short of the best one, m/s2.
+        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: further working memory of the same kind.
+
+    """
     if kind >= RAMPED_FRONT:
         return after_ramped(kind, at, early, late, closing, plan, other)
     if kind == FRONT_FIRST:

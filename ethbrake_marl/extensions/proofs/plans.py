@@ -22,7 +22,9 @@ PIECES = 4
 
 @compiled
 def empty_plan() -> Floats:
-    """Return uninitialised memory for a plan."""
+    """Return an uninitialised plan [2, PIECES] to fill in: row 0 the ends of its pieces (s), row 1 their accelerations
+    (m/s2).
+    """
     return np.empty((2, PIECES))
 
 
@@ -30,7 +32,11 @@ def empty_plan() -> Floats:
 def fill_plan(
     plan: Floats, end_0: float, u_0: float, end_1: float, u_1: float, end_2: float, u_2: float, u_3: float
 ) -> None:
-    """Set a plan: ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, then ``u_3``."""
+    """Write a plan: acceleration ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, then
+    ``u_3``.
+
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    """
     plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
     plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
     plan[ACCELERATIONS, 2], plan[ACCELERATIONS, 3] = u_2, u_3
@@ -38,13 +44,19 @@ def fill_plan(
 
 @compiled
 def fill_braking(plan: Floats, onset: float, braking: float) -> None:
-    """Set a plan: coast until ``onset``, then brake to rest."""
+    """Write a plan: coast until ``onset`` (s), then brake to rest with ``braking`` (m/s2, positive).
+
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    """
     fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
 
 
 @compiled
 def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
-    """Set a plan: ``u``, plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to ``end``."""
+    """Write a plan: acceleration ``u``, plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to ``end``.
+
+    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    """
     first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
     u_1 = u + step if turn < late else u + change
     u_2 = u + step + change if turn < end else u
@@ -53,27 +65,55 @@ def fill_window(plan: Floats, u: float, late: float, end: float, change: float, 
 
 @compiled
 def time_to_limit(v: float, u: float, limit: float) -> float:
-    """Return how long ``u`` accelerates from ``v`` to the speed limit; 0 at the limit or without drive. [s]"""
+    """Return for how long (s) the acceleration ``u`` (m/s2) acts until the speed rises from ``v`` to ``limit`` (m/s).
+
+    0 at or above the limit, and if ``u <= 0``.
+    """
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 
 @compiled
 def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
-    """Set a plan: drive for ``drive`` (at most to the speed limit), then brake to rest."""
+    """Write a plan: drive for ``drive`` s (at most to the speed limit), then brake to rest.
+
+    Args:
+        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+        v: speed now, m/s.
+        u: driving acceleration, m/s2.
+        limit: speed limit, m/s.
+        drive: duration of the drive, s.
+        braking: deceleration, m/s2, positive.
+
+    """
     cap = min(time_to_limit(v, u, limit), drive)
     fill_plan(plan, cap, u, drive, 0.0, drive, 0.0, -braking)
 
 
 @compiled
 def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake: float, braking: float) -> None:
-    """Set a plan: brake for ``brake`` (at most to rest), then drive to the speed limit and stay there."""
+    """Write a plan: brake for ``brake`` s (at most to rest), then drive to the speed limit and stay there.
+
+    Args:
+        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+        v: speed now, m/s.
+        u: driving acceleration, m/s2.
+        limit: speed limit, m/s.
+        brake: duration of the braking, s.
+        braking: deceleration, m/s2, positive.
+
+    """
     cap = brake + time_to_limit(max(v - braking * brake, 0.0), u, limit)
     fill_plan(plan, brake, -braking, cap, u, cap, 0.0, 0.0)
 
 
 @compiled
 def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
-    """Return the acceleration in force at ``now`` for speed ``v``, until when it lasts, and whether it ends at rest."""
+    """Return the acceleration in force at ``now`` (m/s2), the time at which it ends (s), and whether the vehicle then
+    stops.
+
+    ``plan`` [2, PIECES] holds the ends (s) and accelerations (m/s2) of the pieces of its motion, ``v`` its speed at
+    ``now`` (m/s).
+    """
     k = 0
     while now >= plan[ENDS, k]:
         k += 1
@@ -91,11 +131,21 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
 def walk(
     gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
 ) -> tuple[float, float, float]:
-    """Follow a pair to ``until``. Return its smallest gap, and time and squared closing speed of its first meeting.
+    """Follow two vehicles until ``until``. Return their smallest gap, and time and squared closing speed of their
+    contact.
 
-    Units are m and s. Time is infinite and speed 0 if they do not meet. The two pass through each other, so a negative
-    smallest gap is the depth of the overlap. If the gap reaches 0 and opens again, that is no meeting; if it would
-    become an overlap, it is a meeting with closing speed 0. Needs speeds >= 0.
+    Units are m, s and m2/s2. The time is infinite and the speed 0 if they do not meet. The two pass through each other,
+    so a negative smallest gap is the depth of the overlap. If the gap reaches 0 and opens again, that is no contact; if
+    it would become an overlap, it is a contact with closing speed 0. Needs speeds >= 0.
+
+    Args:
+        gap: gap now, m.
+        v_front: speed of the front vehicle, m/s.
+        front: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of its motion.
+        v_rear: speed of the rear vehicle, m/s.
+        rear: [2, PIECES] the same for the rear vehicle.
+        until: end of the motion, s.
+
     """
     lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
     while now < until:

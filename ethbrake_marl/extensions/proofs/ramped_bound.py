@@ -36,10 +36,20 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 def combined_ramped(
     at: Floats, until: float, front: float, rear: float, contact_s: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least combined harm, whoever is met first, with brake build-up.
+    """Return the least harm of both pairs together (m2/s2), whoever is met first, with brake build-up.
 
-    Contact is certain by ``contact_s``, or by the time at which the outer two vehicles would meet. Returns 0 if nothing
-    is proven.
+    Returns 0 if nothing is proven.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        until: horizon, s; harm after it does not count.
+        front: bound on the harm of the front pair alone, m2/s2.
+        rear: bound on the harm of the rear pair alone, m2/s2.
+        contact_s: time by which some contact is certain, s; infinite: unknown.
+        plan: working memory, from ``empty_legs``.
+        other: further working memory of the same kind.
+        heap: working memory of the search, [CELLS, NEAR].
+
     """
     if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= TOUCHING_M:
         return 0.0
@@ -72,9 +82,15 @@ def combined_ramped(
 
 @compiled
 def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools, out: Floats) -> None:
-    """Write the bounds as ``bound_worlds`` does, for brakes that build up.
+    """Compute lower bounds on the harm of ``n`` worlds with brake build-up: of each pair alone, and of both together.
 
-    ``both`` [n] selects the worlds for the combined bound.
+    Args:
+        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        has_front: [n] True if the front pair exists and its next impact counts.
+        has_rear: [n] True if the rear pair exists and its next impact counts.
+        both: [n] True for worlds in which the combined bound is computed.
+        out: [n, BOUNDS] receives columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+
     """
     plan, other, heap = empty_legs(), empty_legs(), np.empty((CELLS, NEAR))
     for k in range(states.shape[0]):
@@ -94,9 +110,15 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
 
 
 def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
-    """Return ``onset_states`` of worlds with brake build-up. The bounds cover only harm within ``until`` [n] s.
+    """Return worlds with brake build-up in the columns of ``line.LINE``, [n, WIDTH].
 
     A controlled vehicle that already brakes or drives is treated as if its rates were infinite.
+
+    Args:
+        worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
+        i: index of the controlled vehicle.
+        until: [n] horizon, s from then; the bounds cover only harm within it.
+
     """
     v, at = worlds.vehicles, onset_states(worlds, i, None)
     moved = worlds.command_mps2[:, i] != 0.0

@@ -33,19 +33,33 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 @compiled
 def fill_leader(at: Floats, plan: Floats) -> None:
-    """Set the plan of the front vehicle if nobody touches it."""
+    """Write the plan of the front vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
+    ``line.LINE``.
+    """
     fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
 
 
 @compiled
 def fill_follower(at: Floats, plan: Floats) -> None:
-    """Set the plan of the rear vehicle if nobody touches it."""
+    """Write the plan of the rear vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+
+    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
+    ``line.LINE``.
+    """
     fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
 
 
 @compiled
 def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
-    """Return the largest force and its rate, and the size of the least force and its rate, all times ``sign``."""
+    """Return the range of ``sign`` times the controlled vehicle's force: largest force, rate up, size of the least
+    force, rate down.
+
+    A *force* is an acceleration in m/s2; the least one is returned with its sign dropped. Rates are in m/s3. With
+    ``sign`` 1 the largest force is full drive, with -1 it is full braking. ``at`` is one world, an array with the
+    columns of ``line.LINE``.
+    """
     if sign > 0.0:
         return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
     return at[LINE.A_F], at[LINE.FALL_F], at[LINE.U_F], at[LINE.RISE_F]
@@ -53,7 +67,20 @@ def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: float, plan: Floats) -> None:
-    """Apply ``fill_switch`` to the controlled vehicle."""
+    """Write a plan of the controlled vehicle: its force (times ``sign``) rises fully until ``switch``, then falls
+    fully.
+
+    A *force* is an acceleration in m/s2.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        sign: 1 if the front vehicle is met, -1 for the rear vehicle.
+        switch: time at which the force begins to fall, s.
+        time: time of the contact, s.
+        final: force times ``sign`` at ``time``; -inf: no such condition.
+        plan: [3, LEGS] receives the plan.
+
+    """
     high, rise, low, fall = range_of(sign, at)
     fill_switch(plan, sign, sign * at[LINE.FORCE_F], high, rise, low, fall, switch, time, final)
 
@@ -62,9 +89,20 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
 def switch_for(
     at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
 ) -> tuple[float, float, float]:
-    """Return the switches just before and just after the one that leads to ``place`` at ``time``, and the speed there.
+    """Return two times (s) just before and after the switch that leads the controlled vehicle to ``place`` at ``time``.
 
-    The speed belongs to the earlier switch. ``final`` limits the force (times ``sign``) at ``time``; -inf: no limit.
+    The *switch* is the time at which its force (acceleration times ``sign``) turns from rising to falling. The third
+    result is the speed (m/s) at ``time`` after the earlier switch.
+
+    Args:
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        sign: 1 if the front vehicle is met, -1 for the rear vehicle.
+        time: time of the contact, s after the controlled vehicle may act.
+        place: position times ``sign`` at ``time``, m.
+        final: largest force at ``time``, m/s2; -inf: no limit.
+        halvings: number of halvings of the interval.
+        plan: [3, LEGS] working memory.
+
     """
     low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
     for _ in range(halvings):
@@ -80,7 +118,17 @@ def switch_for(
 
 @compiled
 def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
-    """Return sign, speed and place of the neighbour that is met, if nobody touches it until ``time``."""
+    """Return sign, speed (m/s) and place (m) at ``time`` of the neighbour that is met, if nobody touches it before.
+
+    The *sign* is 1 for the front vehicle and -1 for the rear one; the *place* is the position times the sign.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        plan: [3, LEGS] working memory.
+
+    """
     if kind == RAMPED_FRONT:
         fill_leader(at, plan)
         v, way = travel(plan, at[LINE.V_L], math.inf, time)
@@ -92,7 +140,14 @@ def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, flo
 
 @compiled(apart=True)
 def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
-    """Return the least closing speed of a first contact at ``time``."""
+    """Return the least closing speed (m/s) of a first contact at ``time``, with brake build-up.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+
+    """
     plan = empty_legs()
     sign, v, place = met_at(kind, at, time, plan)
     return max(sign * (switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[2] - v), 0.0)
@@ -102,9 +157,20 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return how far from its place, and by which speed, the controlled vehicle may be at ``early`` at most.
+    """Return the largest distance (m) to the neighbour at ``early``, and by how much (m/s) the closing speed may then
+    exceed ``hard``.
 
-    It meets its neighbour between ``early`` and ``late`` with a closing speed of at most ``hard``.
+    The controlled vehicle meets the neighbour between ``early`` and ``late``.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        v: speed of the neighbour at ``early``, m/s.
+        hard: largest closing speed of the contact, m/s.
+        plan: [3, LEGS] working memory.
+
     """
     span = late - early
     if kind == RAMPED_FRONT:
@@ -115,7 +181,15 @@ def slack_of(
 
 @compiled(apart=True)
 def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Return the least closing speed of the first contacts between two times."""
+    """Return the least closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+
+    """
     plan = empty_legs()
     hard = gentlest_ramped(kind, at, early)
     sign, v, place = met_at(kind, at, early, plan)
@@ -130,9 +204,19 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
 
 @compiled(apart=True)
 def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
-    """Return the largest force, times the sign, with which a first contact can be as soft as ``hard``.
+    """Return the largest acceleration (m/s2) of the controlled vehicle with which it can meet a neighbour at no more
+    than ``hard``.
 
-    The contact lies between ``early`` and ``late``.
+    For a contact with the rear vehicle, accelerations count with the opposite sign, so the largest one is the hardest
+    braking.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        hard: largest closing speed of the contact, m/s.
+
     """
     plan = empty_legs()
     sign, v, place = met_at(kind, at, early, plan)
@@ -155,10 +239,19 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
 def after_ramped(
     kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed at the other neighbour after a first contact.
+    """Return the least squared closing speed (m2/s2) at the other neighbour after a first contact, with brake build-up.
 
-    The contact lies between ``early`` and ``late`` and closes with at most ``hard``. The bound uses the motion of the
-    controlled vehicle alone.
+    The bound uses the motion of the controlled vehicle alone.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        early: earliest time of the first contact, s after the controlled vehicle may act.
+        late: latest time of the first contact, s.
+        hard: largest closing speed of the contact, m/s.
+        plan: [3, LEGS] working memory.
+        other: [3, LEGS] working memory.
+
     """
     sign = 1.0 if kind == RAMPED_FRONT else -1.0
     share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
@@ -200,7 +293,16 @@ def after_ramped(
 
 @compiled(apart=True)
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the other neighbour never arrives before a first contact at ``time`` or later."""
+    """Return whether the other neighbour never arrives before a first contact at ``time`` or later.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        time: time of the contact, s after the controlled vehicle may act.
+        plan: [3, LEGS] working memory.
+        other: [3, LEGS] working memory.
+
+    """
     sign, _, place = met_at(kind, at, time, plan)
     switch = switch_for(at, sign, time, place, -math.inf, HALVINGS, plan)[1]
     fill_controlled(at, sign, switch, time, -math.inf, plan)
@@ -219,7 +321,20 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
-    """Return ``meeting`` with a neighbour if the controlled vehicle drives (``sign`` 1) or brakes (-1) fully."""
+    """Return time and closing speed of the contact with a neighbour under full drive or full braking, with brake
+    build-up.
+
+    The time (s) is infinite and the speed (m/s) 0 if they never meet. The third result is the least closing speed (m/s)
+    of any motion of the pair that is at no time farther apart than these two.
+
+    Args:
+        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
+        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        sign: 1: the controlled vehicle drives fully; -1: it brakes fully.
+        plan: [3, LEGS] working memory.
+        other: [3, LEGS] working memory.
+
+    """
     fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
     if kind == RAMPED_FRONT:
         fill_leader(at, other)
@@ -245,19 +360,19 @@ LEAST_PART = 100  # least number of worlds per thread; fewer are not worth a thr
 
 @dataclass(frozen=True, slots=True)
 class LowerBound:
-    """Proven bounds on each world, [n] m2/s2."""
+    """Proven bounds on the harm of each world, [n] m2/s2 each."""
 
-    harm: Floats  # bound on the total: no profile does less harm than this
+    harm: Floats  # lower bound on the total harm: no command profile does less
     early: Floats  # harm before the controlled vehicle may act
-    front_pair: Floats  # bound of the front pair alone, from then on
-    rear_pair: Floats  # bound of the rear pair alone, from then on
+    front_pair: Floats  # bound of the front pair alone, from that moment on
+    rear_pair: Floats  # bound of the rear pair alone, from that moment on
     combined: Floats  # bound of both pairs together; 0 if nothing is proven
     # verdict on contact, on which the combined bound rests; None if brakes build up in any world
     contact: Avoidability | None
 
     @property
     def impact_proven(self) -> Bools:
-        """Whether every profile certainly has an impact, [n].
+        """True for worlds in which every command profile certainly has an impact, [n].
 
         False means that none is proven, not that an impact can be avoided.
         """
@@ -267,9 +382,19 @@ class LowerBound:
 def at_onset_of(
     where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
 ) -> tuple[Worlds, Floats, Floats, Bools]:
-    """Return the worlds at the moment when the first of these vehicles may act, that time (s), and the harm until then.
+    """Simulate worlds until the first of ``vehicles`` may act. Return these worlds, that time, the harm so far, and a
+    mask of pairs.
 
-    Also returns the pairs, [n, P], whose next impact counts and whose vehicles move forward.
+    The time is [n] s, the harm [n] m2/s2. The mask [n, P] is True for pairs whose next impact counts and whose vehicles
+    move forward.
+
+    Args:
+        where: name of the caller, for error messages.
+        worlds: the worlds now, [n].
+        vehicles: indices of the controlled vehicles.
+        harm_count: ``first`` or ``total`` impacts.
+        horizon_s: horizon, s; ``InvalidInput`` if it is not finite or lies before that moment.
+
     """
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
@@ -282,7 +407,15 @@ def at_onset_of(
 
 
 def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: object) -> None:
-    """Raise ``InvalidInput`` for an unknown count, a horizon that is not a number, or an invalid time step."""
+    """Raise ``InvalidInput`` for an unknown harm count, a horizon that is not a number, or an invalid time step.
+
+    Args:
+        where: name of the caller, which begins the error message.
+        harm_count: must be ``first`` or ``total``.
+        horizon_s: must be a number.
+        time_step_s: must be None or a number of at least ``LEAST_TIME_STEP_S``.
+
+    """
     check_harm_count(harm_count)
     if not _is_number(horizon_s):
         raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be a number of seconds")
@@ -297,17 +430,23 @@ def _is_number(value: object) -> bool:
 
 
 def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -> Floats:
-    """Return how far floating-point arithmetic can move a bound and the simulated harm apart, at most; [n] m2/s2.
+    """Return how far apart floating-point arithmetic can bring a bound and the simulated harm, at most; [n] m2/s2.
 
     A squared closing speed is ``D = w^2 + 2 b g``. Let ``V`` be the largest speed in the line, ``G`` the sum of its
     gaps (plus ``way_m`` [n]), ``A`` the largest closing acceleration and ``a`` the weakest brakes. Then ``w^2`` is at
     most ``V^2``, and no gap grows beyond ``G + V^2 / 2a`` (plus ``V a / r`` if brakes build up at rate r), so all terms
-    of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
-    A segment of motion rounds each speed twice and each gap five times; a round of impacts rounds each speed by up to
-    8 eps of the largest speed. Either changes D by at most 8 eps S. These errors add up and do not multiply, because
-    the proofs compare a motion with itself. ``BOUND_EPS`` covers 500 of them: an episode of 8 s has 80 steps, and the
-    bound's own arithmetic is a few hundred roundings. For several vehicles (a team) the largest speed is a speed limit
-    if any of them may drive, and the largest closing acceleration uses the strongest drive.
+    of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each speed twice and each gap five
+    times; a round of impacts rounds each speed by up to 8 eps of the largest speed. Either changes D by at most 8 eps
+    S. These errors add up and do not multiply, because the proofs compare a motion with itself. ``BOUND_EPS`` covers
+    500 of them: an episode of 8 s has 80 steps, and the bound's own arithmetic is a few hundred roundings. For several
+    vehicles (a team) the largest speed is a speed limit if any of them may drive, and the largest closing acceleration
+    uses the strongest drive.
+
+    Args:
+        worlds: the worlds, [n].
+        vehicle: index of the controlled vehicle, or several indices.
+        way_m: further distance to add to the gaps, a number or [n], m.
+
     """
     v, chosen = worlds.vehicles, np.atleast_1d(vehicle)
     driving = v.driving_capacity_mps2[:, chosen]
@@ -321,9 +460,16 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 
 
 def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
-    """Return the worlds in the columns of ``line.LINE``, [n, WIDTH], at the moment when vehicle ``i`` may act.
+    """Return the worlds in the columns of ``line.LINE``, [n, WIDTH].
 
-    Columns of a missing neighbour stay 0, and so does the time step if there is none.
+    Columns of a missing neighbour stay 0.
+
+    Args:
+        worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
+        i: index of the controlled vehicle.
+        time_step_s: time between two decisions, a number or [n], s; None: commands may change at any time; the column
+            is then 0.
+
     """
     v = worlds.vehicles
     at = np.zeros((worlds.n, LINE.WIDTH))

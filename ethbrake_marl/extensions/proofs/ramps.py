@@ -26,19 +26,28 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return uninitialised memory for a plan."""
+    """Return an uninitialised plan [3, LEGS] to fill in: the end (s), initial acceleration (m/s2) and jerk (m/s3) of
+    each leg.
+    """
     return np.empty((3, LEGS))
 
 
 @compiled
 def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None:
-    """Set leg ``k`` of a plan: its end, its initial force and its jerk."""
+    """Write leg ``k`` of a plan [3, LEGS], in place: its end (s), its initial force (m/s2) and its jerk (m/s3).
+
+    A *leg* is a time interval of constant jerk; a *force* is an acceleration.
+    """
     plan[ENDS, k], plan[FORCES, k], plan[JERKS, k] = end, force, jerk
 
 
 @compiled
 def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
-    """Set a plan: ``force`` until ``since``, then towards ``wanted`` at this rate, which may be infinite."""
+    """Write a plan [3, LEGS]: ``force`` until ``since`` (s), then towards ``wanted`` at ``rate`` (m/s3, may be
+    infinite).
+
+    Forces are accelerations in m/s2.
+    """
     rise = abs(wanted - force) / rate
     put_leg(plan, 0, since, force, 0.0)
     put_leg(plan, 1, since + rise, force, (wanted - force) / rise if rise > 0.0 else 0.0)
@@ -50,11 +59,23 @@ def fill_switch(
     plan: Floats, sign: float, force: float, high: float, rise: float, low: float, fall: float, switch: float,
     time: float, final: float,
 ) -> None:  # fmt: skip
-    """Set a plan: from ``force`` up to ``high`` until ``switch``, then down to ``-low``.
+    """Write a plan: the force rises from ``force`` to at most ``high`` until ``switch``, then falls to ``-low``.
 
-    Before ``time`` the force turns up again, so that it is ``final`` at ``time`` (-inf: no such condition). The rates
-    are ``rise`` and ``fall``. Forces in the arguments are times ``sign``. A ``switch`` from -1 to 0, for an infinite
-    ``rise``, means to start at once from a part of the way up.
+    Before ``time`` the force turns up again, so that it is ``final`` at ``time``.
+
+    Args:
+        plan: [3, LEGS] receives the plan.
+        sign: 1 or -1; all forces below are times ``sign``. A force is an acceleration in m/s2.
+        force: force now.
+        high: largest force.
+        rise: rate at which the force rises, m/s3; may be infinite.
+        low: size of the least force.
+        fall: rate at which the force falls, m/s3.
+        switch: time at which it begins to fall, s. A value from -1 to 0, for an infinite ``rise``, means to start at
+            once from a part of the way up.
+        time: time at which ``final`` holds, s.
+        final: force at ``time``; -inf: no such condition.
+
     """
     full = (high - force) / rise
     top = high if switch >= full else force + rise * switch
@@ -76,9 +97,17 @@ def fill_switch(
 
 @compiled
 def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
-    """Return acceleration and jerk at ``now`` for speed ``v``, when they end, and the speed reached then.
+    """Return acceleration (m/s2) and jerk (m/s3) in force at ``now``, when they end (s), and the speed reached then
+    (m/s).
 
-    That speed is NaN if the leg ends otherwise than at rest or at the speed limit.
+    That speed is NaN if the interval ends otherwise than at rest or at the speed limit.
+
+    Args:
+        plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg of the motion.
+        now: present time, s.
+        v: present speed, m/s.
+        limit: speed limit, m/s.
+
     """
     k = 0
     while now >= plan[ENDS, k]:
@@ -107,13 +136,22 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
 
 @compiled
 def speed_after(v: float, u: float, jerk: float, step: float, reached: float) -> float:
-    """Return the speed at the end of a leg, or of its first ``step`` seconds (``reached`` is then NaN)."""
+    """Return the speed (m/s) after ``step`` seconds with initial acceleration ``u`` (m/s2) and constant ``jerk``
+    (m/s3).
+
+    ``v`` is the speed at the start. ``reached`` is the known speed at the end, or NaN if it is not known.
+    """
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
 
 @compiled(apart=True)
 def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
-    """Return speed and distance at ``until`` of a vehicle that starts with speed ``v``."""
+    """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that starts with speed ``v`` and follows
+    ``plan``.
+
+    ``plan`` [3, LEGS] holds end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg; ``limit`` is the speed
+    limit, m/s.
+    """
     now, way = 0.0, 0.0
     while now < until:
         u, jerk, end, reached = leg_at(plan, now, v, limit)
@@ -127,15 +165,17 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Return the force of a plan at ``now``, also if the vehicle is at rest."""
+    """Return the force (acceleration, m/s2) that a plan [3, LEGS] commands at ``now`` (s), even for a vehicle at
+    rest.
+    """
     return leg_at(plan, now, 1.0, math.inf)[0]
 
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Return the least ``constant / t + pressing t / 2 + jerk t^2 / 3`` for t from ``since`` to ``until``.
+    """Return the least ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
 
-    -inf if the function falls without bound towards t = 0.
+    The result is -inf if the function falls without bound towards t = 0.
     """
     if since <= 0.0 and constant <= 0.0:
         return -math.inf
@@ -162,11 +202,24 @@ def meeting(
     gap: float, slack: float, v_front: float, front: Floats, front_limit: float, v_rear: float, rear: Floats,
     rear_limit: float, since: float, until: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return when two vehicles first meet after ``since``, their closing speed w, and the least forced closing speed.
+    """Return the time at which two vehicles first meet, their closing speed w then, and the least forced closing speed.
 
     Returns inf, 0, 0 if they never meet. The last value is the least of ``w + (gap - slack) / t`` until then, t counted
     from ``since``. It bounds every motion of the pair that is never behind these two, is ``slack`` nearer at ``since``,
     and is faster by a growing amount.
+
+    Args:
+        gap: gap at ``since``, m.
+        slack: distance by which the pair may be nearer, m.
+        v_front: speed of the front vehicle at ``since``, m/s.
+        front: [3, LEGS] its plan.
+        front_limit: its speed limit, m/s.
+        v_rear: speed of the rear vehicle at ``since``, m/s.
+        rear: [3, LEGS] its plan.
+        rear_limit: its speed limit, m/s.
+        since: start, s.
+        until: end, s.
+
     """
     now, least = since, math.inf
     while now < until:

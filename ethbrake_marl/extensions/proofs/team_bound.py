@@ -43,9 +43,17 @@ def _combined_bound_of_line(
 ) -> Floats:
     """Return the combined bound of the first two pairs, [n] m2/s2, or 0 if nothing is proven.
 
-    It covers ``until`` [n] s from now. ``onset`` [n, N] counts from now. ``counts`` [n, P] marks pairs whose next
-    impact counts and whose vehicles move forward. The first vehicle must brake by now. The second one, one of
-    ``chosen``, is treated as if it may act from now on. ``pairs`` [n, 2] are the bounds of both pairs alone.
+    The first vehicle must brake by now. The second one is treated as if it may act from now on.
+
+    Args:
+        now: the worlds now, [n].
+        onset: [n, N] time from now at which each vehicle may act, s.
+        counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
+        chosen: indices of the controlled vehicles; the second vehicle is one of them.
+        until: [n] horizon, s from now.
+        pairs: [n, 2] bounds of both pairs alone, m2/s2.
+        time_step_s: time between two decisions, s; None: commands may change at any time.
+
     """
     v = now.vehicles
     stops = (
@@ -93,17 +101,19 @@ def _combined_bound_of_line(
 
 @dataclass(frozen=True, slots=True)
 class TeamBound:
-    """Proven bounds on each world, [n] m2/s2."""
+    """Proven bounds on the harm of each world, [n] m2/s2 each."""
 
-    harm: Floats  # bound on the total: no joint command does less harm than this
+    harm: Floats  # lower bound on the total harm, whatever the controlled vehicles do
     early: Floats  # harm before any controlled vehicle may act
-    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead
-    pairs: Floats  # [n, P] bound of each pair alone, from then on
+    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
+    pairs: Floats  # [n, P] bound of each pair alone, from that moment on
     combined: Floats  # bound of the first two pairs together (see ``team_bound``); 0 if nothing is proven
 
     @property
     def impact_proven(self) -> Bools:
-        """Whether every joint command certainly has an impact, [n]. False means that none is proven."""
+        """True for worlds in which an impact is certain whatever the controlled vehicles do, [n]. False means that none
+        is proven.
+        """
         return np.asarray(self.harm > 0.0, np.bool_)
 
 
@@ -116,21 +126,29 @@ def team_bound(
     scripts: Mapping[int, str] | None = None,
     time_step_s: float | None = None,
 ) -> TeamBound:
-    """Return a proven lower bound on the harm from now to ``horizon_s`` (absolute), over all commands of ``vehicles``.
+    """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
 
-    ``harm = early + obstacle + max(pairs[:, 0] + pairs[:, 1], combined) + pairs[:, 2:]``, each part rounded outward. If
-    Vehicle 1 is controlled, ``combined`` covers the obstacle and Vehicles 1 and 2: ``early + max(obstacle + pairs[:,
-    0], combined) + pairs[:, 1:]``.
-    All other vehicles brake with their whole capacity from their latencies on; ``scripts`` (index -> name) is only
-    checked to say the same. Harm that may come only after the horizon counts as 0. With ``harm_count`` "first", the
-    next impact of a pair that was hit before counts as 0 too. A single controlled vehicle is allowed; ``lower_bound``
-    is sharper where it covers the line.
+    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``, each part
+    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle and
+    Vehicles 1 and 2: ``early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm that may come
+    only after the horizon counts as 0.
 
-    With ``time_step_s`` the bound is proven only for commands that change at decisions: the first one when the first of
-    the vehicles may act, then one every ``time_step_s``. That is sharper if Vehicle 2 is the first one.
+    All other vehicles brake with their whole capacity from their latencies on. A single controlled vehicle is allowed;
+    ``lower_bound`` is sharper where it covers the line.
+
+    Args:
+        worlds: the worlds now, [n].
+        vehicles: indices of the controlled vehicles, from 0.
+        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
+        horizon_s: time until which harm counts, s (absolute).
+        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
+        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
+            the first one when the first of the vehicles may act, then one every ``time_step_s``. That is sharper if
+            Vehicle 2 is the first one. None: commands may change at any time.
 
     Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown count, a time
     step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
+
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
     # sort the controlled vehicles, and refuse what the bound does not cover
@@ -201,9 +219,13 @@ def team_bound(
 
 
 def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
-    """Return the bound of one pair alone, [n]; 0 where its next impact does not count.
+    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 where its next impact does not count.
 
-    ``columns`` holds the nonzero columns of the pair.
+    Args:
+        columns: maps a column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``) to its values; missing columns are 0.
+        until: [n] horizon, s.
+        counts: [n] True for worlds in which the next impact of the pair counts.
+
     """
     at, found, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
     for column, values in columns.items():

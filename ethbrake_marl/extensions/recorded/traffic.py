@@ -53,18 +53,21 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 
 
 class _Format(NamedTuple):
-    """One of the data sets: its files, columns, units and licence."""
+    """One of the formats of recorded traffic: its files, columns, units and licence."""
 
-    title: str
-    files: str
-    columns: tuple[str, ...]  # columns for the first fields of ``_State``; a name ending in 1 is followed by 2, 3, ...
-    units: str
-    licence: str
-    metres: float = 1.0  # metres in a unit of length
-    ticks: float = 1.0  # ticks in a unit of the first column
-    hertz: float = 10.0  # ticks in a second
-    impossible: float = 0.0  # largest share of vehicles with a fault (overlap, missing leader); they are left out
-    elsewhere: tuple[str, ...] = ()  # places whose lines are left out: streets with crossings
+    title: str  # name of the data set, for users
+    files: str  # pattern of the names of its files
+    # Names of the columns to read, in the order of the fields of ``_State``. A name ending in 1 stands for one column
+    # per vehicle: ``Speed1``, ``Speed2``, ...
+    columns: tuple[str, ...]
+    units: str  # units of lengths and speeds, for messages
+    licence: str  # sentence about its licence, for the scenario's ``source``
+    metres: float = 1.0  # number of metres in a unit of length of the files
+    ticks: float = 1.0  # number of ticks (intervals between recorded moments) per unit of time of the files
+    hertz: float = 10.0  # number of ticks in a second
+    # Largest accepted share of vehicles with a fault (overlap, missing leader). Faulty vehicles are left out.
+    impossible: float = 0.0
+    elsewhere: tuple[str, ...] = ()  # lines of a file that contain one of these texts (names of streets) are left out
     blanks: bool = False  # True if empty cells mean that nothing was measured
 
 
@@ -108,15 +111,24 @@ def scenario_from_data(
     draw: DataDraw = "rows",
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> tuple[str, str, list[str]]:
-    """Make a scenario from a folder of recordings. Return its YAML, the CSV of its rows, and notes on what was read.
+    """Make a scenario from a folder of recordings. Return its YAML text, the CSV text of its rows, and notes.
 
-    Every ``every_s`` seconds, queues are cut from the front into chains of as many vehicles as ``based_on`` has; a
-    vehicle belongs to at most one chain. Each chain is a row. ``draw`` selects how the scenario draws worlds: whole
-    rows, or each quantity from a fit to the rows. Everything that is not recorded comes from ``based_on``. If there are
-    more rows than a table may hold, every k-th row is kept.
+    At regular times, queues of vehicles are cut from the front into chains of as many vehicles as ``based_on`` has; a
+    vehicle belongs to at most one chain. Each chain is a row of speeds and gaps. If there are more rows than a table
+    may hold, every k-th row is kept.
+
+    Args:
+        name: name of the scenario.
+        folder: folder with the files.
+        format: format of the files.
+        based_on: scenario for everything that is not recorded, and for the number of vehicles.
+        every_s: time between two moments that become rows (s).
+        draw: how the scenario draws worlds: whole ``rows``, or each quantity from a fit to the rows.
+        progress: called with the name of a file, the KiB read of it, and its size in KiB.
 
     Raises ``InvalidInput`` with file, line and column for a missing column, a cell that is not a number, or an
     impossible value.
+
     """
     entry, base = FORMATS[format], load_scenario(based_on)
     check_file_name("scenario", name)
@@ -174,7 +186,10 @@ def scenario_from_data(
 
 
 def _fits(rows: Floats, draw: DataDraw) -> dict[str, Any]:
-    """Return independent fits to the time gaps, to the mean speed of a row, and to deviations from that mean."""
+    """Return keys of a scenario with independent fits to time gaps, mean speed of a row, and deviations from it.
+
+    ``rows`` [k, 2 N - 1] holds the gaps (m) and speeds (m/s) of each chain; ``draw`` is the kind of fit.
+    """
     gaps, speeds = np.split(rows, [rows.shape[1] // 2], axis=1)
     times = gaps / np.maximum(speeds[:, 1:], SLOWEST_MPS)
     used = (speeds >= SLOWEST_MPS).all(axis=1) & ((times > 0.0) & (times <= LONGEST_S)).all(axis=1)
@@ -193,7 +208,10 @@ def _fits(rows: Floats, draw: DataDraw) -> dict[str, Any]:
 
 
 def _fit(values: Floats, draw: DataDraw) -> Any:
-    """Return a number or a distribution as in a scenario file, within the range of the values."""
+    """Return a distribution for a scenario file, fitted to ``values`` [k] and limited to their range.
+
+    ``draw`` is its kind: ``normal``, ``lognormal`` or ``quantiles``.
+    """
     low, high = float(values.min()), float(values.max())
     if draw == "quantiles" or low == high:
         return {"choice": np.quantile(values, (np.arange(QUANTILES) + 0.5) / QUANTILES).tolist()}
@@ -207,7 +225,10 @@ def _fit(values: Floats, draw: DataDraw) -> Any:
 def _keep_states(
     store: sqlite3.Connection, file: Path, format: DataFormat, stride: int, progress: Callable[[int, int], None]
 ) -> None:
-    """Store the vehicles of a file at every ``stride``-th tick."""
+    """Write the vehicles of a file at every ``stride``-th tick (recorded moment) into the table ``state`` of ``store``.
+
+    ``progress`` is called with the KiB read and the size of the file in KiB.
+    """
     entry, turned, first, cars, states = FORMATS[format], np.empty((0, 2)), None, 0, 0
     if format == "highd":
         meta = _numbers(Path(f"{str(file)[:-4]}Meta.csv"), entry, ("id", "drivingDirection"), lambda *_: None)
@@ -233,7 +254,18 @@ def _keep_states(
 
 
 def _states(values: Floats, lines: Floats, file: Path, format: DataFormat, turned: Floats) -> Floats:
-    """Return the fields of ``_State`` for each vehicle and moment, [rows, 8]."""
+    """Return the fields of ``_State`` for each vehicle and moment, [rows, 8], in m and m/s.
+
+    Args:
+        values: [rows, columns] numbers of the file, in the order of the format's columns.
+        lines: [rows] line number of each row in the file.
+        file: the file, for messages.
+        format: its format.
+        turned: [vehicles, 2] id and driving direction of each vehicle, sorted by id; only used for highD.
+
+    Raises ``InvalidInput`` with file, line and column for an impossible value.
+
+    """
     entry = FORMATS[format]
     states, fastest = np.column_stack([values, lines]), entry.columns[-1]
     if format == "openacc":
@@ -270,7 +302,19 @@ def _states(values: Floats, lines: Floats, file: Path, format: DataFormat, turne
 def _cut_chains(
     store: sqlite3.Connection, file: Path, entry: _Format, stride: int, vehicles: int, left_out: Counter[str]
 ) -> None:
-    """Link the vehicles of each moment to those ahead, cut queues into rows, and check gaps against speeds."""
+    """Cut the queues of vehicles of one file into rows, and write them into the table ``chain`` of ``store``.
+
+    Vehicles are linked to those ahead at each moment. Gaps are checked against speeds.
+
+    Args:
+        store: database whose table ``state`` holds the vehicles of the file.
+        file: the file, for messages.
+        entry: its format.
+        stride: ticks between two moments.
+        vehicles: number of vehicles in a row.
+        left_out: counts what was left out, by description; it is updated.
+
+    """
     first_fault, faults, states, last = "", 0, 0, math.nan
     before: dict[float, tuple[float, float, Any]] = {}
     sums = np.zeros(3)  # sums of squares and product of the change of gaps and of the change by the speeds
@@ -327,9 +371,10 @@ def _cut_chains(
 def _numbers(
     file: Path, entry: _Format, columns: Sequence[str], progress: Callable[[int, int], None]
 ) -> Iterator[tuple[Floats, Floats]]:
-    """Yield the selected columns of a file piece by piece, [rows, columns], with the line number of each row.
+    """Yield the numbers of a CSV file piece by piece: selected columns [rows, columns], line numbers [rows].
 
-    All values are finite numbers. In formats with blanks an empty cell is NaN.
+    All values are finite numbers. In formats with blanks an empty cell is NaN. ``progress`` is called with the KiB read
+    and the size of the file in KiB.
     """
     with open_plain(file, LARGEST_BYTES) as stream:
         text = io.TextIOWrapper(stream, "utf-8-sig")
@@ -370,7 +415,10 @@ def _numbers(
 def _header(
     file: Path, entry: _Format, columns: Sequence[str], source: Iterator[tuple[int, str]]
 ) -> tuple[list[str], list[int]]:
-    """Return the names of all columns, and the indices of the wanted ones. Lines above the header are skipped."""
+    """Find the header among the first lines, and return the names of all columns and the indices of ``columns``.
+
+    ``source`` yields (line number, line); lines up to the header are consumed.
+    """
     least, have = list(columns), set[str]()
     for number, line in islice(source, HEAD):
         names = [cell.strip() for cell in line.split(",")]
@@ -392,7 +440,10 @@ def _header(
 
 
 def _refuse(bad: Bools, file: Path, lines: Floats, column: str, values: Floats, right: str) -> None:
-    """Raise ``InvalidInput`` for the first bad row."""
+    """Raise ``InvalidInput`` with file, line and column for the first row in which ``bad`` [rows] is true.
+
+    ``lines`` and ``values`` [rows] are the rows' line numbers and values; ``right`` says what would be right.
+    """
     if bad.any():
         line, value = lines[bad][0], values[bad][0]
         raise InvalidInput(f"{file}, line {line:.0f}, column {column}: {value:.12g} {right}")

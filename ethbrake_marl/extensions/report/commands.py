@@ -29,9 +29,9 @@ def watch_command(
     settings: SettingsOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Film agents in one world, in real time.
+    """Write a film of agents in one world, in real time.
 
-    It shows the road to scale, commands, impacts and harm.
+    The film shows the road to scale, commands, impacts and harm.
     """
     # imported here, because matplotlib takes a second to load and most commands do not draw
     from ethbrake_marl.extensions.report.film import check_film, film

@@ -32,37 +32,45 @@ _LONG_S = 1e4  # long enough for every meeting to have happened
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Constant deceleration that E-V2X-BM chooses in the world, and its minimal harm there (m2/s2)."""
+    """Constant deceleration that a method chooses in one world, and its minimal harm there."""
 
-    deceleration_mps2: float
-    harm: float
+    deceleration_mps2: float  # chosen deceleration, m/s2
+    harm: float  # harm at that deceleration, m2/s2, predicted or simulated
 
 
 @dataclass(frozen=True, slots=True)
 class DecelerationCurve:
-    """Harm (m2/s2) in one world at K constant decelerations of one vehicle, in rising order."""
+    """Harm in one world at K constant decelerations of one vehicle, in rising order."""
 
     task: Task  # scenario, and the one vehicle that has the deceleration
     world: Worlds  # the world, n = 1, at the alert
     deceleration_mps2: Floats  # [K] from 0 to the braking capacity
-    predicted: Floats  # [K] harm predicted by the pairwise closed form
-    first_impact_harm: Floats  # [K] simulated harm
-    total_harm: Floats  # [K] simulated harm
-    regimes: dict[str, NDArray[np.str_]]  # by pair ("front pair", "rear pair"): [K] how it first meets
-    closed_form: Choice  # choice of the closed form, with its predicted harm
-    coupled: Mapping[HarmCount, Choice]  # choice with the least simulated harm of each count
+    predicted: Floats  # [K] harm predicted by the pairwise closed form, m2/s2
+    first_impact_harm: Floats  # [K] simulated first-impact harm, m2/s2
+    total_harm: Floats  # [K] simulated total harm, m2/s2
+    # by pair ("front pair", "rear pair"): [K] how the pair first meets, a value of ``regimes_of``
+    regimes: dict[str, NDArray[np.str_]]
+    closed_form: Choice  # deceleration that the pairwise closed form chooses, with its predicted harm
+    coupled: Mapping[HarmCount, Choice]  # by harm count: deceleration with the least simulated harm
     limits: Limits | Unproven  # best known harm and proven bound over all time-varying commands
 
     def harm(self, harm_count: HarmCount) -> Floats:
-        """Return the simulated harm of a count, [K] m2/s2."""
+        """Return the simulated harm, [K] m2/s2, under ``harm_count``: ``first`` or ``total``."""
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
 
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
-    """Compute the three harms of one world at evenly spaced decelerations and at the breakpoints of the closed form.
+    """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The prediction assumes that all others brake fully; in the simulation they follow the scenario's scripts. Raises
-    ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
+    The decelerations are ``points`` evenly spaced ones and the breakpoints of the pairwise closed form. The prediction
+    assumes that all others brake fully; in the simulation they follow the scenario's scripts. Raises ``InvalidInput``
+    unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
+
+    Args:
+        world: the world at the alert, n = 1.
+        task: the scenario, and the one vehicle that has the deceleration.
+        points: number of evenly spaced decelerations from 0 to the braking capacity.
+
     """
     if world.n != 1:
         raise InvalidInput(f"deceleration curve: {world.n} worlds given; exactly one is drawn")
@@ -96,10 +104,17 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
 
 
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
-    """Return how one pair, alone, first meets under constant decelerations [n, N] from now (t = 0) on, [n].
+    """Return how one pair, alone, first meets in each world, [n], if both vehicles brake constantly from t = 0 on.
 
-    Values: ``A``, ``A'``, ``B`` or ``C`` as in docs/proofs/constant-deceleration.md; ``early``: before the front
-    vehicle of the pair brakes; ``none``.
+    Values: ``early`` (before the front vehicle of the pair brakes), ``A`` (the rear vehicle still coasts), ``A'`` (it
+    coasts and the front one stands), ``B`` (both brake), ``C`` (the rear one brakes and the front one stands), ``none``
+    (they never meet). docs/proofs/constant-deceleration.md has the formulas.
+
+    Args:
+        worlds: the worlds, [n].
+        pair: index of the pair: vehicles ``pair`` and ``pair + 1``.
+        deceleration_mps2: [n, N] constant deceleration of each vehicle, m/s2.
+
     """
     own = slice(pair, pair + 2)
     v = worlds.vehicles
@@ -139,8 +154,9 @@ _REGIMES = {  # colour and meaning of each regime
 def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
-    Top: the three curves, the decelerations that E-V2X-BM chooses (closed form, and coupled for both counts), and level
-    lines at the best known harm of any profile, if known. Bottom: how each pair alone first meets.
+    Top: the three curves, the decelerations that E-V2X-BM chooses (by the closed form, and by simulation for both
+    counts), and level lines at the best known harm of any profile, if known. Bottom: how each pair alone first meets.
+    ``curve`` is the result of ``deceleration_curve``; ``title`` is written above, if empty the name of the scenario.
     """
     scenario, vehicle = curve.task.scenario, curve.task.vehicle
     figure = new_figure(8.0, 5.4)

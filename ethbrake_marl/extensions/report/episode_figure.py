@@ -21,8 +21,13 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
     """Draw positions with impacts, gaps, and the command of the controlled vehicle over time.
 
-    There is one column per record (by its title) on common scales, to compare agents in the same world. Without a
-    ``caption`` the conditions of the first record are the caption. Raises ``InvalidInput`` without records.
+    There is one column for each record on common scales, to compare agents in the same world. Raises ``InvalidInput``
+    without records.
+
+    Args:
+        records: recorded episodes, by the title of their column.
+        caption: text below the figure; if empty, the conditions of the first record.
+
     """
     if not records:
         raise InvalidInput("trajectories: no records given")

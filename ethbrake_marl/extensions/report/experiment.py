@@ -40,12 +40,18 @@ MOST_WORLDS = 2_000  # largest number of worlds of each of the other two tests
 
 
 def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
-    """Evaluate the policy on the other two tests, draw the figures, and write ``report.html``."""
+    """Evaluate the policy on the other two tests, draw the figures, and write ``report.html``; return what to print.
+
+    Args:
+        experiment: the finished run: its folder, policy and evaluation.
+        tell: called with a ``Progress`` object at each stage.
+
+    """
     evaluation, folder = experiment.evaluation, experiment.run.path
     others, done = other_tests(evaluation.scenario), count()
 
     def begin(stage: str) -> None:
-        """Report the progress: a stage begins, or (empty) all stages have ended."""
+        """Report the progress: ``stage`` begins, or all stages have ended if it is empty."""
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
     is_papers = is_papers_test(evaluation.task, evaluation.seed)
@@ -79,7 +85,9 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
 
 
 def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
-    """Evaluate the trained policy and its shield on another test."""
+    """Evaluate the trained policy, the policy behind its shield, and the baselines on another test; return the
+    table.
+    """
     evaluation = experiment.evaluation
     worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
     agents = compared_agents(experiment.trained.policy, test, experiment.harm_count, BESIDE)
@@ -98,7 +106,19 @@ def write_figures(
     agents: Mapping[str, Agent],
     harm_count: HarmCount = "first",
 ) -> list[Part]:
-    """Draw the three figures, write them as PNG files, and return them as parts of the report."""
+    """Draw the three figures, write them as PNG files into ``folder``, and return them as parts (pieces of HTML) of the
+    report.
+
+    Args:
+        folder: folder of the run.
+        evaluation: evaluation of the trained policy and the baselines.
+        rows: summary of that evaluation, one ``SummaryRow`` for each agent; baselines are drawn as level lines.
+        course: evaluations during the training; each has ``steps``, both harms and ``collision_rate``.
+        course_caption: caption of the learning curve.
+        agents: the evaluated agents, by name.
+        harm_count: harm that the policy minimises.
+
+    """
     references = [row for row in rows if row.agent in BESIDE]
     shown = telling_world(evaluation, harm_count)
     world, row = int(evaluation.index[shown]), evaluation.worlds.take([shown])
@@ -130,9 +150,12 @@ def write_figures(
 
 
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> int:
-    """Return the row of the world to draw: the median saving of the policy among worlds where full braking does harm.
+    """Return the index of a typical world to draw: the one with the median reduction of harm by the policy.
 
-    Returns 0 if full braking does no harm in any world.
+    The reduction is the harm of full braking minus the policy's harm. Only worlds in which full braking does harm
+    count.
+
+    Returns 0 if there are none. ``harm_count`` is ``first`` or ``total``.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)

@@ -60,19 +60,34 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 
 
 def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
-    """Return ``film_bytes`` of several agents, by title, in one world. Raises before any work if it is impossible."""
+    """Let several agents control the same world, and return a film of their episodes as the bytes of a file.
+
+    Args:
+        world: the world at the alert, n = 1.
+        agents: the agents, by the title above their film.
+        ending: ``.gif``, ``.mp4`` or ``.svg``. Other endings raise ``InvalidInput`` before any work.
+        scenario: scenario of the world.
+
+    """
     check_film(ending, len(agents))
     films = {title: film_scenes(world, agent, scenario=scenario) for title, agent in agents.items()}
     return film_bytes(films, ending)
 
 
 def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
-    """Return films of one world, with titles and one below the other, in real time: an endless GIF or SVG, or an MP4.
+    """Return films of one world, one below the other, in real time, as the bytes of a GIF, SVG (both endless) or MP4
+    file.
 
     A film that ends before the others keeps showing its end. Raises ``InvalidInput`` without films, for more than
     ``MOST_FILMS`` films or ``MOST_PICTURES`` pictures, for an ``ending`` other than ``.gif``, ``.mp4`` and ``.svg``,
     and for an ``fps`` that does not divide 100 (a GIF counts hundredths of a second). Raises ``MissingExtra`` for an
     MP4 without the library that writes it.
+
+    Args:
+        films: scenes of each film, by its title.
+        ending: ``.gif``, ``.mp4`` or ``.svg``.
+        fps: scenes per second.
+
     """
     check_film(ending, len(films))
     if not films or not all(films.values()):
@@ -89,7 +104,10 @@ def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
 
 
 def check_film(ending: str, films: int = 1) -> None:
-    """Raise before any work if ``film_bytes`` cannot write this ending, or this number of films."""
+    """Raise ``InvalidInput`` if ``film_bytes`` cannot write a file with this ``ending``, or this number of ``films``.
+
+    Raises ``MissingExtra`` for an MP4 without the library that writes it.
+    """
     if ending not in _WRITERS:
         raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
     if ending == ".mp4":
@@ -99,7 +117,7 @@ def check_film(ending: str, films: int = 1) -> None:
 
 
 def _stacked(films: Films) -> Iterator[Frame]:
-    """Yield the frames of all films, one below the other."""
+    """Yield the pictures of the film file: each shows the present frame of all films, one below the other."""
     for k in range(max(map(len, films.values()))):
         each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
         yield np.concatenate([scene.frame() for scene in each])

@@ -32,10 +32,16 @@ def harm_by_agent(
     harm_count: HarmCount = "first",
     elsewhere: Mapping[str, Sequence[SummaryRow]] | None = None,
 ) -> Figure:
-    """Draw the mean harm of each agent with its 95 % interval, a line at the best known, and marks for other tests.
+    """Draw the mean harm of each agent with its 95 % interval, a line at the best known harm, and marks for other
+    tests.
 
-    The figure is as narrow as a phone. ``elsewhere`` holds the rows of other tests, by title. Raises ``InvalidInput``
-    without rows.
+    The figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` without rows.
+
+    Args:
+        rows: summary of each agent, one ``SummaryRow`` each.
+        harm_count: harm to draw, ``first`` or ``total``.
+        elsewhere: summaries of the agents on other tests, by the title of the test; None: no marks.
+
     """
     if not rows:
         raise InvalidInput("harm_by_agent: no rows; evaluate at least one agent")
@@ -63,7 +69,7 @@ def harm_by_agent(
 
 
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
-    """Label one row per agent, the first on top. Names are cut to ``most`` characters."""
+    """Label one row of a figure for each agent, the first on top. Names are cut to ``most`` characters."""
     axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()
 
@@ -71,7 +77,7 @@ def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
 def regret_distribution(evaluation: Evaluation) -> Figure:
     """Draw the share of worlds in which an agent's regret (harm minus best known harm) exceeds x, under both counts.
 
-    Without a best known harm, the harm itself is drawn.
+    There is one curve per agent. Without a best known harm, the harm itself is drawn.
     """
     regrets = regrets_of(evaluation)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
@@ -97,9 +103,10 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Draw each agent's mean harm as the best known harm plus its regret where contact is unavoidable and avoidable.
+    """Draw each agent's mean harm in three parts: best known harm, regret in worlds with unavoidable contact, and
+    regret in worlds with avoidable contact.
 
-    Raises ``InvalidInput`` if nothing is proven about the worlds.
+    *Regret* is harm minus best known harm. Raises ``InvalidInput`` if nothing is proven about the worlds.
     """
     regrets = regrets_of(evaluation)
     if regrets is None:

@@ -37,7 +37,7 @@ text { font-family: system-ui, sans-serif; font-size: 14px; fill: var(--ink); }
 
 
 def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
-    """Return an SVG with films of one world, with titles and one below the other, in real time, on one scale.
+    """Return the text of an SVG that shows films of one world, one below the other, in real time and on one scale.
 
     Args:
         films: the scenes of each film by its title; none is empty.
@@ -65,7 +65,10 @@ def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
 
 
 class _Strip:
-    """One agent's film, drawn on its own road."""
+    """Drawing of one agent's film on its own road, as a strip of the SVG picture.
+
+    ``left_m`` and ``right_m`` are the positions at the edges of the picture, ``fps`` the scenes per second.
+    """
 
     def __init__(self, film: Sequence[Scene], title: str, left_m: float, right_m: float, fps: int) -> None:
         self.title = title
@@ -106,7 +109,9 @@ class _Strip:
             )
 
     def _vehicle(self, i: int) -> Iterator[str]:
-        """Yield the moving body, with its number and the lights of its command."""
+        """Yield the SVG elements of vehicle ``i``: a moving body with its number, the lights of its command, and its
+        impacts.
+        """
         places = [self._x(scene.front_m[i]) for scene in self._film]
         length, top = BODY_M * self._scale, _FILM_LANE - _HALF_BODY
         yield f'<g transform="translate({places[0]:.1f} 0)">'
@@ -142,7 +147,7 @@ class _Strip:
     def _events(self) -> list[tuple[int, int, Struck]]:
         """Return the impacts to show: first scene, scene after the last, and the impact.
 
-        A lighter impact is left out while a harder one is shown.
+        One impact is shown at a time, for a short while; a weaker one is left out while a harder one is shown.
         """
         known: set[tuple[int, float]] = set()
         found: list[tuple[int, int, Struck]] = []
@@ -158,7 +163,7 @@ class _Strip:
         return found
 
     def _switched(self, lit: Sequence[bool]) -> str:
-        """Return an animation with opacity 1 in the scenes that are lit, and 0 in the others."""
+        """Return an SVG animation with opacity 1 in the scenes in which ``lit`` is True, and 0 in the others."""
         values, times, k = [], [], 0
         for on, run in groupby(lit):
             values.append("1" if on else "0")
@@ -174,7 +179,15 @@ class _Strip:
 
 
 def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
-    """Yield the elements of the clock: the seconds since the alert, and a line that fills."""
+    """Yield the SVG elements of the clock: the seconds since the alert, and a line that fills.
+
+    Args:
+        y: height of the line in the picture.
+        last: number of the last scene of the longest film.
+        frames: number of scenes until the animation begins again.
+        fps: scenes per second.
+
+    """
     left, width = 170, _FILM_WIDTH - 200
     yield f'<text class="quiet" x="12" y="{y + 4}">seconds since the alert</text>'
     yield f'<path d="M{left} {y}h{width}" stroke="var(--road)" stroke-width="4"/>'

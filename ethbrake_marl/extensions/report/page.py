@@ -34,50 +34,53 @@ _STAY = "\u00a0"  # no-break space
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of a page, with the names of the style sheets and scripts of this folder that it needs."""
+    """A piece of a page: its HTML, and the style sheets and scripts that it needs.
 
-    html: Markup
-    styles: tuple[str, ...] = ()
-    scripts: tuple[str, ...] = ()
+    Class methods make the usual parts, for instance ``Part.paragraph("Text")``.
+    """
+
+    html: Markup  # markup of the piece
+    styles: tuple[str, ...] = ()  # names of style sheets in this folder
+    scripts: tuple[str, ...] = ()  # names of scripts in this folder
 
     @classmethod
     def paragraph(cls, text: str, kind: str = "") -> Part:
-        """Return text as a paragraph.
+        """Return a part with ``text`` as a paragraph.
 
-        ``kind``: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
+        ``kind`` is its style: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
         """
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
     @classmethod
     def heading(cls, text: str) -> Part:
-        """Return a heading inside a section."""
+        """Return a part with ``text`` as a heading inside a section."""
         return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
 
     @classmethod
     def facts(cls, found: Mapping[str, object]) -> Part:
-        """Return names and values, one below the other."""
+        """Return a part that lists names with their values, one below the other; ``found`` maps names to values."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
     def remarks(cls, texts: Sequence[str]) -> Part:
-        """Return a list of important remarks, one line each; nothing if there are none."""
+        """Return a part with ``texts`` as a list of important remarks, one line each; an empty part if none."""
         lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
         return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
 
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
-        """Return words and their meanings, in a box."""
+        """Return a part that explains words in a box; ``meanings`` maps each word to its meaning."""
         return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
-        """Return parts of equal width side by side; on a narrow screen, one below the other."""
+        """Return one part that shows ``parts`` side by side in equal widths; below each other on a narrow screen."""
         return cls._around('<div class="beside">{}</div>\n', parts)
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Return parts that are hidden until the reader clicks on their title."""
+        """Return one part with ``parts`` under a title; they are hidden until the reader clicks on the title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -88,7 +91,17 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Return plain data for a script of the page, as JSON that cannot end its element or begin another."""
+        """Return a part that holds ``content`` as JSON inside a script element, for a script of the page to read.
+
+        The text can neither end its element nor begin another one.
+
+        Args:
+            name: id of the element.
+            content: plain data: mappings, lists, texts and numbers.
+            styles: style sheets that the reading script needs.
+            scripts: names of the scripts that read it.
+
+        """
         text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
         for sign in "<>&":
             text = text.replace(sign, f"\\u{ord(sign):04x}")
@@ -97,12 +110,19 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """Return a template of this folder filled with these values. Values are text, unless they are Markup."""
+        """Return a part: the template ``file`` of this folder, filled with ``values``. Text is escaped, ``Markup`` is
+        not.
+
+        ``styles`` and ``scripts`` are names of files in this folder that it needs.
+        """
         return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """Return a table that scrolls if it is wider than the page. A cell may be a ``Shown`` of Markup."""
+        """Return a part that shows ``sheet`` as a table, which scrolls if it is wider than the page.
+
+        A cell may be a ``Shown`` whose value is ``Markup``, for instance a button; other texts are escaped.
+        """
         return cls(Markup(sheet.html() + "\n"))
 
     @classmethod
@@ -116,7 +136,7 @@ class Part:
         known: str = "",
         where: object = "",
     ) -> Part:
-        """Return a figure, or the SVG of one of our figures, with a title and a description.
+        """Return a part that shows a figure, or the SVG of a figure of this package, with a title and a description.
 
         The caption is removed from the SVG and becomes text of the page below it, which a phone can show.
 
@@ -125,7 +145,7 @@ class Part:
             title: title above it.
             description: what it shows, in words.
             alone: keep the colours, as a map needs them, on a white background.
-            known: text of the caption that the page has already; it is left out.
+            known: part of the caption that stands elsewhere on the page; it is left out here.
             where: file that the SVG was read from, for the error message about a foreign SVG.
 
         """
@@ -155,14 +175,15 @@ class Part:
         shown_first: Sequence[int] = (),
         folded: bool = False,
     ) -> Part:
-        """Return the episode player of these worlds, in which all agents drove.
+        """Return a part with the player of episodes, in which a reader watches the same worlds under different agents.
 
         Args:
-            worlds: at least one world.
+            worlds: at least one world, with its episode under each agent.
             driven: indices (0 = front) of the controlled vehicles; a mapping by agent if agents control different
                 vehicles.
-            focus: the agent that is shown at first, between the first and the last.
-            shown_first: numbers of the agents that are shown at first, if others.
+            focus: name of an agent that is shown at first, besides the first and the last ones.
+            shown_first: positions (from 0) of the agents that are shown at first instead; empty: the first, the focus
+                and the last.
             folded: hide the traces until their title is clicked.
 
         """
@@ -206,14 +227,14 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Section of a page: strings, which become paragraphs, and parts."""
+    """Section of a page."""
 
-    title: str
-    body: Sequence[str | Part]
+    title: str  # heading, and entry in the table of contents
+    body: Sequence[str | Part]  # strings, which become paragraphs, and parts
 
     @property
     def parts(self) -> list[Part]:
-        """The body with every string as a paragraph."""
+        """The body of the section as parts; every string becomes a paragraph."""
         return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
 
 
@@ -234,10 +255,10 @@ class Page:
 
     """
 
-    title: str
-    sections: Sequence[Section]
-    lead: str = ""
-    opening: Sequence[Part] = ()
+    title: str  # title of the page
+    sections: Sequence[Section]  # sections in order
+    lead: str = ""  # text below the title
+    opening: Sequence[Part] = ()  # parts between the lead and the table of contents
 
     @cached_property
     def _parts(self) -> list[Part]:
@@ -245,7 +266,7 @@ class Page:
 
     @cached_property
     def _code(self) -> tuple[str, str]:
-        """Styles and scripts of the page; each file is included once."""
+        """Text of all style sheets and of all scripts of the page; each file is included once."""
         styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
         scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
         return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
@@ -264,7 +285,7 @@ class Page:
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
-        """Return a unique link name for each title, of letters, digits and hyphens."""
+        """Return a unique link name for each title, of letters, digits and hyphens, for instance "worst-ten-worlds"."""
         found: list[str] = []
         for k, title in enumerate(titles):
             name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
@@ -273,7 +294,7 @@ class Page:
 
     @cached_property
     def html(self) -> str:
-        """The page as text."""
+        """The whole page as HTML text."""
         styles, script = self._code
         names = self.anchors([section.title for section in self.sections])
         whole = Part.template(
@@ -290,13 +311,13 @@ class Page:
 
 
 def shown(value: object) -> str:
-    """Return a value as text for a page, with control and direction characters escaped."""
+    """Return ``value`` as text for a page, with control and direction characters escaped."""
     return plain_text(str(value), keep=_STAY)
 
 
 @cache
 def read_file(name: str) -> str:
-    """Return the text of a file of this folder."""
+    """Return the text of the file ``name`` in this folder."""
     return files(__package__).joinpath(name).read_text("utf-8")
 
 

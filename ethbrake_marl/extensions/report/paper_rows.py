@@ -7,7 +7,7 @@ from typing import Literal
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measures import BASELINE
+from ethbrake_marl.evaluation.measure_sets import BASELINE
 from ethbrake_marl.evaluation.notes import Note
 from ethbrake_marl.evaluation.summary import RowsBeside, SummaryTable, summarise
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
@@ -18,13 +18,14 @@ from ethbrake_marl.scenario.task import Task
 class PaperRow:
     """One row of a table of the paper, as printed. The paper reports a single harm and no intervals."""
 
-    table: Literal["random test", "hybrid test"]
-    agent: str  # the paper's name
-    episodes: int
-    collisions: int
-    collision_rate: float
-    average_harm: float  # m2/s2
-    harm_decrease: float | None  # share of Non-E's harm that is saved, as printed
+    table: Literal["random test", "hybrid test"]  # title of the table
+    agent: str  # name of the strategy in the paper
+    episodes: int  # number of worlds
+    collisions: int  # number of worlds with a collision
+    collision_rate: float  # share of worlds with a collision
+    average_harm: float  # mean harm, m2/s2
+    # decrease of harm against the strategy Non-E, as a share, as printed; None: not printed
+    harm_decrease: float | None
 
 
 PAPER_ROWS = (
@@ -63,13 +64,20 @@ _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the varian
 
 
 def is_papers_test(task: Task, seed: int | None) -> bool:
-    """Return whether the paper's rows apply: Vehicle 2 in a list of the paper's random test, as shipped."""
+    """Return whether the paper's rows apply: Vehicle 2 is controlled in a list of the paper's random test, as shipped.
+
+    ``task`` is the evaluated task, ``seed`` the seed of the list of worlds; None: unknown.
+    """
     scenario = task.scenario
     return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
 
 
 def check_papers_test(task: Task, seed: int | None) -> None:
-    """Raise ``InvalidInput`` unless the paper's rows apply."""
+    """Raise ``InvalidInput`` unless the paper's rows apply: ``task`` controls Vehicle 2 in a list of the paper's random
+    test.
+
+    ``seed`` is the seed of the list; None: unknown, which raises.
+    """
     if not is_papers_test(task, seed):
         raise InvalidInput(
             f"paper: the paper's rows are about Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, and these"
@@ -79,13 +87,17 @@ def check_papers_test(task: Task, seed: int | None) -> None:
 
 
 def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """Return ``summarise`` with the rows of the paper's tables below; ``InvalidInput`` if they do not apply."""
+    """Return the summary of an evaluation, with the rows of the paper's tables below it.
+
+    Raises ``InvalidInput`` if the paper's rows are about other worlds. ``baseline`` is the agent with which others are
+    compared.
+    """
     check_papers_test(evaluation.task, evaluation.seed)
     return with_paper_rows(summarise(evaluation, baseline=baseline))
 
 
 def with_paper_rows(table: SummaryTable) -> SummaryTable:
-    """Return the table with the rows of the paper's tables below it."""
+    """Return ``table`` with the rows of the paper's tables below it."""
     return SummaryTable(table, _beside())
 
 

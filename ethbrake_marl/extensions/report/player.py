@@ -23,17 +23,18 @@ _BIN_S = 1e-3  # of several impacts of a pair within this time only the last is 
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """One world, driven by every agent."""
+    """One world of the episode player, with the motion of the vehicles under every agent."""
 
     number: int  # number of the world in its list
-    kind: str  # reason of the choice, as a heading
+    kind: str  # reason why the world is shown, as a heading
     why: str  # special property of the world, in a few words
-    motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # motion of the vehicles, by agent
+    motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # motion of the vehicles, by name of the agent
     title: str = ""  # name of the world; empty: "World" and its number
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent drive the worlds of ``played``, and store each motion there under the agent's name.
+        """Let one agent control the worlds of ``played``, and store the motion in the ``motions`` of each entry, under
+        the agent's name.
 
         Args:
             played: one entry for each world.
@@ -48,7 +49,13 @@ class Played:
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
-        """Return the player's data of one episode, in which an agent controlled these vehicles."""
+        """Return the data of one episode for the player's script, as a mapping.
+
+        Args:
+            motion: motion of the vehicles.
+            driven: indices of the controlled vehicles.
+
+        """
         obstacle = float(motion.world.obstacle_gap_m[0])
         without = 1 + 3 * motion.world.N
         jerks = bool(motion.pieces[:, without:].any())
@@ -66,7 +73,14 @@ class Played:
 
 
 def _impacts(motion: EpisodeMotion) -> list[list[float]]:
-    """Return each impact with the harm counted so far. At the last impact this equals the ledger exactly."""
+    """Return the impacts of an episode as lists, in order of time.
+
+    Entries of a list: time (s), index of the pair, closing speed (m/s), 1 for the first impact of the pair (else 0),
+    number of the impact in the episode from 1, first-impact harm so far, total harm so far (m2/s2).
+
+    Of several impacts of a pair within ``_BIN_S`` only the last is kept. The harm after the last impact is exactly the
+    recorded harm of the episode.
+    """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")
     harm = rows.closing_speed_mps[order] ** 2

@@ -37,9 +37,9 @@ SHIELD_WORLDS = 200  # number of worlds in which a shield's replacements are sim
 
 
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
-    """Return the section on the ten worlds in which an agent did worst.
+    """Return the section on the ten worlds in which the agent ``focus`` did worst.
 
-    ``watched`` worlds get a button that starts the player.
+    ``watched`` are the numbers of worlds that the page's player shows; they get a button that starts it.
     """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -66,7 +66,9 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
-    """Return the section that splits collisions, harm and regret into avoidable and unavoidable contact."""
+    """Return the section that shows collisions, harm and regret separately for avoidable and for unavoidable
+    contact.
+    """
     regrets, limits = regrets_of(evaluation), limits_of(evaluation)
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -111,7 +113,11 @@ _SPLIT: tuple[Column | str, ...] = (
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
-    """Return the section that compares the shield's modes and rates each intervention of step mode."""
+    """Return the section that compares the shield's modes, and counts how many interventions of step mode were needed,
+    harmless or costly.
+
+    ``rows`` are the results by agent and mode, ``conditions`` a line on the worlds. The section is empty without rows.
+    """
     if not rows:
         return Section("Shield", ())
     told = (
@@ -134,26 +140,32 @@ _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Content of the HTML report. ``settings`` and ``versions`` are printed unchanged, name and value."""
+    """Content of the HTML report of an evaluation.
 
-    title: str
-    rows: Sequence[SummaryRow]
+    ``html`` is the page, ``write`` writes it to a file, and ``driven`` adds episodes to watch.
+    """
+
+    title: str  # title of the page
+    rows: Sequence[SummaryRow]  # summary of each agent
     evaluation: Evaluation  # evaluation that the rows summarise
     played: Sequence[Played] = ()  # episodes to watch
-    shield: Section | None = None  # section on the shield
-    focus: str = ""  # agent whose worst worlds are shown
-    figures: Sequence[Part] = ()
-    tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()  # other tests: title, difference, rows of the agents
+    shield: Section | None = None  # section on the shield; None: no shield was measured
+    focus: str = ""  # agent whose worst worlds are shown; empty: no such section
+    figures: Sequence[Part] = ()  # figures to show, as parts of a page
+    # other tests: title, how the test differs, summary of each agent
+    tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()
     harm_count: HarmCount = "first"  # harm count that the agents minimised
     remarks: Sequence[str] = ()  # important remarks, below the first sentence
     summary: str = ""  # one or two sentences on what was compared
-    settings: Mapping[str, object] = field(default_factory=dict)  # command, seeds, training set-up
-    versions: Mapping[str, str] = field(default_factory=dict)
+    # name -> value of command, seeds and training set-up, printed unchanged
+    settings: Mapping[str, object] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)  # name -> version of software, printed unchanged
 
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
-        """Return the report with episodes, which every agent drives once more, and with the section on shields.
+        """Return the report with episodes to watch and with the section on shields.
 
-        Shields are measured in the first worlds, in every mode and without a shield.
+        For the episodes every agent drives once more. Shields are measured in the first ``SHIELD_WORLDS`` worlds, in
+        every mode and without a shield.
 
         Args:
             agents: the evaluated agents by name; they are not changed.
@@ -179,16 +191,16 @@ class Report:
 
     @property
     def about(self) -> str:
-        """The agent that the page is about.
+        """Name of the agent that the page is about.
 
-        It is the focus, else the last agent with a trained policy, else the last agent.
+        It is ``focus``, else the last agent with a trained policy, else the last agent.
         """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
 
     @property
     def html(self) -> str:
-        """The page as text. It loads nothing."""
+        """The whole page as HTML text. It loads no other file."""
         sections: list[Section | None] = [self._results(), self._episodes()]
         if self.focus:
             sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
@@ -219,15 +231,19 @@ class Report:
         return Page(self.title, shown, self.first_sentence, opening=self._opening(all_rows)).html
 
     def write(self, path: str | Path, *, force: bool = False) -> None:
-        """Write the page. Raises ``AlreadyExists`` unless ``force``, ``InvalidInput`` if the folder does not exist."""
+        """Write the page to the file ``path``.
+
+        Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` if the folder does not exist.
+        """
         write_output(path, self.html.encode("utf-8"), force=force)
 
     @property
     def first_sentence(self) -> str:
-        """A sentence that compares the agent's harm with full braking and the best known, and names its failures.
+        """Sentence at the top of the page: the agent's harm against full braking and the best known harm, and where it
+        fails.
 
-        It fails in another test where it does no less harm than full braking; if it fails in none, single worlds are
-        named.
+        It fails in another test where it does no less harm than full braking. If it fails in none, the share of worlds
+        in which it does more harm is named.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -248,7 +264,10 @@ class Report:
         return f"{name} does {told} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
 
     def _fails(self, harm: str) -> str:
-        """Say where the agent does no less harm than full braking; empty if nowhere."""
+        """Return a clause on where the agent does no less harm than full braking; empty if nowhere.
+
+        ``harm`` is the measure to compare, for instance ``total_harm``.
+        """
         found = []
         for title, _, others in self.tests:
             rows = {row.agent: row for row in others}
@@ -264,7 +283,7 @@ class Report:
         return f"more in {100.0 * share:.1f} % of these worlds, by {most:.2f} at most" if share else ""
 
     def _opening(self, rows: SummaryTable) -> list[Part]:
-        """Return the important remarks, one figure and one table."""
+        """Return the parts at the top of the page: important remarks, one figure and one table."""
         if not rows:
             return []
         which = "First-impact" if self.harm_count == "first" else "Total"
@@ -282,7 +301,9 @@ class Report:
         return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
 
     def _episodes(self) -> Section:
-        """Return the section with episodes to watch, with notes on agents that drove differently the second time."""
+        """Return the section with episodes to watch. Notes name agents whose second drive differs from the
+        evaluation.
+        """
         evaluation, played = self.evaluation, self.played
         if not played:
             return Section("Episodes", ())
@@ -313,36 +334,40 @@ class Report:
 
 
 def _words(estimate: Estimate | None) -> str:
-    """Return a mean without its interval, as text."""
+    """Return a mean as text, without its interval; a dash if there is no estimate."""
     return Column("").show(estimate).value
 
 
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Compare the harm with full braking in the same worlds; "as much" if the interval of the difference contains 0."""
+    """Compare an agent's harm with full braking in the same worlds: "less", "more" or "as much".
+
+    It is "as much" if the interval of the difference contains 0. ``harm`` is the measure, for instance ``total_harm``.
+    """
     difference = row[f"{harm}_difference"]
     low, high = (0.0, 0.0) if difference is None else difference.ends
     return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
 
 
 def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
-    """Return the rows as a table; a table stays as it is, with rows of other sources beside it."""
+    """Return ``rows`` as a summary table. A table is returned unchanged, with its rows of other sources."""
     return rows if isinstance(rows, SummaryTable) else SummaryTable(rows)
 
 
 def _short_table(rows: SummaryTable) -> Part:
-    """Return a table of each agent's collision rate and both harms."""
+    """Return a table of each agent's collision rate, first-impact harm and total harm."""
     return _table(SummaryTable(rows).sheet(), _CAPTION, _SHORT)
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
-    """Return the important remarks about these rows."""
+    """Return the texts of the important remarks about these rows."""
     return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """Return the conditions of these rows and, folded, all measures with the paper's rows.
+    """Return parts with the conditions of these rows and, hidden until clicked, a table of all measures with the
+    paper's rows.
 
-    ``because`` is the reason for empty columns.
+    ``because`` is a sentence with the reason for empty columns.
     """
     ours = SummaryTable(rows)
     whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
@@ -362,14 +387,18 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
 
 
 def _empty(rows: SummaryTable) -> list[str]:
-    """Return the columns in which no row has a value."""
+    """Return the headings of the columns of a summary in which no row has a value."""
     sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table of the agent's column and the named columns; empty columns are left out."""
+    """Return a table of some columns of ``sheet``: its first column (the agent) and the columns in ``names`` that have
+    a value.
+
+    ``caption`` is the title of the table.
+    """
     filled = set(sheet.filled())
     some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or (name in names and k in filled))
     rows = [
@@ -388,10 +417,19 @@ def write_evaluation(
     force: bool = False,
     tell: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write the page of ``ethbrake evaluate --report``, with episodes that ``agents`` drive again.
+    """Write the page of ``ethbrake evaluate --report`` to the file ``path``.
 
-    ``tell`` is called with the number of agents that are done and their total. Raises the exceptions of
-    ``Report.write``.
+    Raises the exceptions of ``Report.write``.
+
+    Args:
+        path: the HTML file.
+        evaluation: the evaluation of the agents.
+        rows: its summary.
+        agents: the evaluated agents by name, which drive some worlds again to be watched.
+        harm_count: harm that the agents minimise.
+        force: replace an existing file.
+        tell: called with the number of agents that are done and their total.
+
     """
     done: list[str] = []
 

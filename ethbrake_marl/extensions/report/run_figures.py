@@ -29,10 +29,15 @@ _POLICY = COLOURS[_POLICY_NUMBER]
 def learning_curve(
     points: Sequence[Mapping[str, float]], *, references: Sequence[SummaryRow] = (), caption: str = ""
 ) -> Figure:
-    """Draw both harms and the collision rate of the policy on its fixed list while it learns.
+    """Draw both harms and the collision rate of a policy on a fixed list of worlds while it learns.
 
-    Each point has ``steps``, ``first_impact_harm``, ``total_harm`` and ``collision_rate``; ``references`` are drawn as
-    level lines. Raises ``InvalidInput`` without points.
+    Raises ``InvalidInput`` without points.
+
+    Args:
+        points: evaluations in order; each has ``steps``, ``first_impact_harm``, ``total_harm`` and ``collision_rate``.
+        references: summaries of other agents, drawn as level lines.
+        caption: text below the figure.
+
     """
     if not points:
         raise InvalidInput("learning_curve: no points; evaluate the policy at least once during training")
@@ -56,8 +61,13 @@ def learning_curve(
 def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
     """Draw the mean of both harms against the sum of the gaps at the alert, one line per agent, with 95 % bands.
 
-    Worlds are grouped into ``bins`` equal parts of the range. Raises ``InvalidInput`` for an unknown agent or
-    ``bins < 1``.
+    Raises ``InvalidInput`` for an unknown agent or ``bins < 1``.
+
+    Args:
+        evaluation: worlds, and the outcome of each agent in them.
+        agents: names of the agents to draw; None: all.
+        bins: number of groups of worlds, of equal width in the sum of gaps.
+
     """
     if not bins >= 1:
         raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")

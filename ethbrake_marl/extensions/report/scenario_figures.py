@@ -44,15 +44,25 @@ _SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by r
 
 
 def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, force: bool = False) -> None:
-    """Write the picture of ``ethbrake scenario sample``. Raises the exceptions of ``write_picture``."""
+    """Write the picture of ``ethbrake scenario sample`` to the file ``path``. Raises the exceptions of
+    ``write_picture``.
+
+    ``seed`` is the seed of the list from which ``sample`` comes; ``force`` replaces an existing file.
+    """
     write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
 
 
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
     """Draw the distribution of each quantity that varies, the most important ones in pairs, and three worlds to scale.
 
-    Pairs show quantities of the first learner, and of the pair ahead of it, before those of others. Colours separate
-    the scenarios of a mixture, or the types of that vehicle.
+    Pairs show quantities of the first learner, and of the pair ahead of it, before quantities of other vehicles.
+    Colours separate the scenarios of a mixture, or the types of the first learner.
+
+    Args:
+        scenario: the scenario of the worlds.
+        sample: the worlds.
+        seed: seed of their list, for the caption.
+
     """
     worlds, panels = sample.worlds, drawn_alike(sample.worlds, scenario)
     focus = scenario.learners[0] if scenario.learners else 0
@@ -78,9 +88,10 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return label -> values [n] of the quantities to draw in pairs.
+    """Return the quantities of ``worlds`` to draw in pairs: label -> values [n].
 
-    One entry of each quantity that varies comes first, then further entries.
+    Only quantities that vary between the worlds are drawn. Of each, the value of the vehicle (or pair) nearest to
+    vehicle ``focus`` is chosen first, then values of others while there is room.
     """
     found: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
@@ -97,7 +108,11 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
-    """Draw the distribution of each quantity, with one outline for all vehicles that are drawn alike."""
+    """Draw the distribution of each quantity, with one outline for all vehicles that are drawn alike.
+
+    ``panels`` maps each quantity to the values [n, ...] of each group of vehicles; ``part`` is a sub-figure of
+    matplotlib.
+    """
     columns = min(len(panels), _ABREAST)
     every = part.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
     for axes in every[len(panels) :]:
@@ -121,7 +136,11 @@ def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> Non
 
 
 def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
-    """Draw each pair of quantities as points, below the diagonal, with a colour for each kind of world."""
+    """Draw each pair of quantities as points, below the diagonal, with a colour for each kind of world.
+
+    ``paired`` maps labels to values [n], ``kinds`` [n] names the kind of each world, ``part`` is a sub-figure of
+    matplotlib.
+    """
     labels, values, names = list(paired), list(paired.values()), np.unique(kinds)
     grid = part.subplots(len(paired) - 1, len(paired) - 1, squeeze=False, sharex="col", sharey="row")
     for axes in grid[np.triu_indices(len(grid), 1)]:
@@ -143,7 +162,10 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
 
 
 def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
-    """Draw some of the worlds at the alert, to scale."""
+    """Draw some worlds at the alert, to scale.
+
+    ``shown`` maps rows of the sample to descriptions; ``part`` is a sub-figure of matplotlib.
+    """
     worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):
         style_axes(axes, 7)

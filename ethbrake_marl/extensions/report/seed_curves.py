@@ -17,16 +17,16 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class SeedCurve:
-    """One quantity of several trainings of one recipe, at common steps."""
+    """One quantity during several trainings of one recipe that differ in their seeds, at common steps."""
 
-    steps: Floats  # [k]
-    values: Floats  # [seeds, k]
+    steps: Floats  # [k] training steps (or another quantity of the x axis)
+    values: Floats  # [seeds, k] value of the quantity
 
     @classmethod
     def of(cls, trainings: Sequence[Mapping[int, float]]) -> Self:
-        """Return the curve of several trainings (step -> value), at the steps that all of them have.
+        """Return the curve of several trainings, at the steps that all of them have.
 
-        Raises ``InvalidInput`` if there is no common step.
+        Each training maps steps to values. Raises ``InvalidInput`` if there is no common step.
         """
         common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
         if not common:
@@ -43,11 +43,18 @@ def seed_curves(
     x_label: str = "Training steps",
     known: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Draw one panel per label and one line per recipe: the mean over seeds, with a band of one standard deviation.
+    """Draw one panel per quantity and one line per recipe: the mean over seeds, with a band of one standard deviation.
 
-    Panels in ``logarithmic`` have a logarithmic axis if all values are positive, because harm falls to a tenth and the
-    last tenth matters most. A dashed line marks the best ``known`` value. Raises ``InvalidInput`` without panels or
-    lines.
+    Raises ``InvalidInput`` without panels or lines.
+
+    Args:
+        panels: label of a quantity -> name of a recipe -> its curve.
+        logarithmic: labels of panels with a logarithmic axis, on which small harm late in the training is still
+            visible. The axis stays linear if a value is not positive.
+        caption: text below the figure.
+        x_label: label of the x axis.
+        known: best known value by label, marked by a dashed line; None: no line.
+
     """
     if not panels or not all(panels.values()):
         raise InvalidInput("seed_curves: nothing to draw; at least one training with one evaluation is needed")

@@ -34,9 +34,12 @@ WORDS = {
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Choose up to ``most`` worlds to show, by row.
+    """Choose up to ``most`` worlds to show. Return a mapping: index of the world in the evaluation -> its entry for the
+    episode player.
 
-    They are worlds where ``focus`` did worst, best against full braking, and typically, and worlds at random.
+    The worlds come in this order: those in which the agent ``focus`` did worst, had an avoidable collision, saved most
+    harm against full braking, or did more harm than full braking; then worlds with typical harm, and worlds drawn at
+    random. The entries hold no motion yet.
     """
     outcome = evaluation.outcome(focus)
     found: dict[int, Played] = {}
@@ -64,7 +67,11 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
 
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
-    """Return the ten worlds with the largest regret in total harm, or the largest total harm if no best is known."""
+    """Return the indices of at most ten worlds in which the agent ``focus`` did worst, the worst first.
+
+    These have the largest regret in total harm, or the largest total harm if no best harm is known. Worlds in which
+    that value is 0 are left out.
+    """
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
     return _largest(value, value > 0.0)[:WORST]

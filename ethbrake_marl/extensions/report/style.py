@@ -46,10 +46,13 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to leave out, because they
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook displays, with or without pyplot."""
+    """A figure that a notebook displays by itself, with or without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
-        """Draw the figure. Saving draws twice; the first time only lays out, because its drawing is thrown away."""
+        """Draw the figure with matplotlib's ``renderer``.
+
+        Saving a file draws twice; the first pass only computes the layout, because its picture is not used.
+        """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
             engine.execute(self)
@@ -61,13 +64,16 @@ class ShownFigure(Figure):
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Return colour, marker and dashes of the series with this number (from 0). They repeat after seven."""
+    """Return colour, marker, dashes and sizes of line number ``number`` (from 0), as keywords of matplotlib's ``plot``.
+
+    Styles repeat after seven lines.
+    """
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """Return text that is safe in a figure: no formula, no character that the font lacks, and not too long."""
+    """Return text that is safe in a figure: no formula, only characters that the font has, at most ``most`` of them."""
     signs = font_signs()
     told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
     return (told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}").replace("$", r"\$")
@@ -75,17 +81,20 @@ def label_text(text: str, most: int = 40) -> str:
 
 @cache
 def font_signs() -> frozenset[int]:
-    """Return the code points that the font of figures has."""
+    """Return the code points of all characters that the font of figures has."""
     return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure with automatic layout that belongs to no window."""
+    """Return an empty figure with automatic layout that belongs to no window; sizes are in inches."""
     return ShownFigure(figsize=(width_in, height_in), layout="constrained")
 
 
 def style_axes(axes: Axes, labelsize: float = 9) -> None:
-    """Set a thin grid behind the data, and remove the top and right frame lines."""
+    """Set a thin grid behind the data, and remove the top and right frame lines.
+
+    ``labelsize`` is the font size of the numbers at the ticks.
+    """
     axes.grid(visible=True, color="#dddddd", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -93,7 +102,10 @@ def style_axes(axes: Axes, labelsize: float = 9) -> None:
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """Return a styled figure and its axes, row by row; ``how`` are arguments of matplotlib's ``subplots``."""
+    """Return a styled figure with ``rows`` times ``columns`` panels, and its axes, row by row.
+
+    ``size_in`` is width and height in inches; ``how`` are further arguments of matplotlib's ``subplots``.
+    """
     figure = new_figure(*size_in)
     panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
     for axes in panels:
@@ -102,7 +114,7 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
-    """Set the title of a panel and the labels of its axes."""
+    """Set the title of a panel and the labels ``x`` and ``y`` of its axes; empty texts are left out."""
     in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
     for text, write, size in in_style:
         if text:
@@ -118,7 +130,17 @@ def finish(
     fontsize: float = 9,
     loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
 ) -> Figure:
-    """Add the caption, and one legend for all panels above them, taken from the axes ``legend``. Return the figure."""
+    """Add the caption and a legend to a figure. Return the figure.
+
+    Args:
+        figure: the figure, which is changed.
+        caption: text below it.
+        legend: axes whose lines the legend names, for all panels; None: no legend.
+        columns: number of columns of the legend.
+        fontsize: font size of the legend.
+        loc: place of the legend.
+
+    """
     if legend is not None:
         named = legend.get_legend_handles_labels()
         figure.legend(*named, loc=loc, ncols=columns, frameon=False, fontsize=fontsize)
@@ -127,19 +149,21 @@ def finish(
 
 
 def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Mapping[str, Any]) -> None:
-    """Draw the band of a line's intervals in the line's colour."""
+    """Fill the band between ``low`` and ``high`` at the places ``x``, in the colour of ``style`` (from
+    ``series_style``).
+    """
     axes.fill_between(x, low, high, color=str(style["color"]), alpha=0.18, linewidth=0.0)
 
 
 def add_caption(figure: Figure, text: str) -> None:
-    """Add the conditions of a figure below it, in small type."""
+    """Write ``text`` (the conditions of a figure) below the figure, in small type."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
     label = figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
     label.set_gid(CAPTION)
 
 
 def picture_ending(path: str | Path) -> str:
-    """Return the ending of a picture's file name. Raises ``InvalidInput`` for any except .png, .svg and .pdf."""
+    """Return the ending of a picture's file name: .png, .svg or .pdf. Raises ``InvalidInput`` for any other."""
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
         raise InvalidInput(f"{path}: pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf")
@@ -147,9 +171,9 @@ def picture_ending(path: str | Path) -> str:
 
 
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
-    """Return the figure as PNG, SVG or PDF, by the ending of ``path``. The same figure always gives the same bytes.
+    """Return the figure as the bytes of a PNG, SVG or PDF file, by the ending of ``path``. Nothing is written.
 
-    Raises ``InvalidInput`` for another ending.
+    The same figure always gives the same bytes. Raises ``InvalidInput`` for another ending.
     """
     ending = picture_ending(path)
     buffer = io.BytesIO()
@@ -162,7 +186,7 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 
 
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
-    """Write a figure as PNG, SVG or PDF, by the ending of ``path``. The file is written whole or not at all.
+    """Write ``figure`` to a PNG, SVG or PDF file, by the ending of ``path``. The file is written whole or not at all.
 
     Raises ``InvalidInput`` for another ending or a file that cannot be written, and ``AlreadyExists`` unless ``force``.
     """
@@ -173,5 +197,8 @@ TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)
 
 
 def plain(value: float, _: int) -> str:
-    """Format a tick without powers of ten."""
+    """Format the number at a tick of an axis without powers of ten.
+
+    The second argument, the index of the tick, is not used.
+    """
     return f"{value:g}"

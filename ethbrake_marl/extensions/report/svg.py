@@ -58,11 +58,17 @@ SLIM_IN = 3.8  # a figure of this width can be read on a phone without scrolling
 
 
 def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> tuple[str, str]:
-    """Return a figure as an SVG element without ``style`` (the page's policy allows none), and its caption.
+    """Return a figure as an SVG element without ``style`` (the page's policy allows none), and its caption as text.
 
     The caption is removed from the SVG. All ids get a prefix, so that they are unique in a page. Raises
     ``InvalidInput`` for the bytes of an SVG with anything that our figures do not contain, because somebody may have
     changed the file.
+
+    Args:
+        figure: the figure, or the bytes of its SVG.
+        label: description for readers who do not see it; it also makes the ids unique.
+        recolour: True: use the colours of the page, light or dark; False: keep the colours.
+
     """
     svg = figure if isinstance(figure, bytes) else picture_bytes(figure, "figure.svg")
     if svg is figure and not _is_ours(svg):
@@ -109,13 +115,13 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
 
 
 def _size_pt(root: ElementTree.Element) -> tuple[float, float]:
-    """Return width and height of a figure; 0 if its viewBox has another form than ours."""
+    """Return width and height of an SVG figure in points; 0, 0 if its viewBox has another form than in our figures."""
     found = re.fullmatch(r"0 0 (\d+(?:\.\d+)?) (\d+(?:\.\d+)?)", root.attrib.get("viewBox", ""))
     return (float(found[1]), float(found[2])) if found else (0.0, 0.0)
 
 
 def _is_ours(svg: bytes) -> bool:
-    """Return whether an SVG contains only elements and attributes that our figures have."""
+    """Return whether the bytes of an SVG contain only elements and attributes that our figures have."""
     try:
         level = [ElementTree.fromstring(svg)]
     except (ElementTree.ParseError, LookupError, ValueError):  # not XML, or an unknown encoding
@@ -135,7 +141,10 @@ def _is_ours(svg: bytes) -> bool:
 
 
 def _restyle(element: ElementTree.Element, recolour: bool) -> None:
-    """Replace each declaration of ``style`` by an attribute of that name; ``recolour`` uses the page's colours."""
+    """Replace each declaration of the ``style`` attribute by an attribute of that name, in place.
+
+    ``recolour`` also replaces the colours by the page's colours.
+    """
     for declaration in element.attrib.pop("style", "").split(";"):
         name, colon, value = declaration.partition(":")
         if colon:

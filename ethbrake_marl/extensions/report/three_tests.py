@@ -22,7 +22,7 @@ TESTS = {
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Return whether the scenario equals the shipped one of its name, apart from its texts."""
+    """Return whether the scenario equals the shipped one of the same name, apart from title, description and source."""
     one, other = (
         each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
     )
@@ -30,7 +30,9 @@ def is_as_shipped(scenario: Scenario) -> bool:
 
 
 def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
-    """Return the two tests to show with results on ``scenario``; none unless it is one of the three, as shipped."""
+    """Return the other two of the three tests (``TESTS``) if ``scenario`` is one of them, as shipped; else an empty
+    tuple.
+    """
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return ()
     return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
@@ -40,9 +42,15 @@ _KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the 
 
 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
-    """Return a table for one screen: collisions and both harms, also in the tests ``beside``, with the notes on them.
+    """Return a table for one screen: each agent's collisions and both harms, and its harm in other tests, and notes
+    below.
 
     Rows of other sources and other measures are left out.
+
+    Args:
+        table: summary of the agents on the main test.
+        beside: summaries of the agents on other tests, by name of the test.
+
     """
     ours = SummaryTable(table)
     sheet = ours.terminal()

@@ -57,7 +57,10 @@ _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digi
 
 @lru_cache(maxsize=1)  # both figures show the same results
 def _shipped_ends(settings: Reproduction) -> Made:
-    """Evaluate shipped policies at both delays, in both readings of when Vehicle 2 may act."""
+    """Evaluate shipped policies at low and high delay, under both assumptions on when Vehicle 2 may act.
+
+    The result has verdicts, a table and data, but no figure.
+    """
     episodes = min(2_000, settings.episodes)
     verdicts, rows, data = [], [], []
     for reading in READINGS:
@@ -85,50 +88,53 @@ def _shipped_ends(settings: Reproduction) -> Made:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Trainings of one recipe at one delay."""
+    """Trainings of one recipe at one delay, one for each seed."""
 
-    returns: SeedCurve  # mean return of training episodes, exploration included
-    harm: SeedCurve  # first-impact harm on the fixed list
+    returns: SeedCurve  # mean return of training episodes (exploration included) against decisions
+    harm: SeedCurve  # first-impact harm on the fixed list (m2/s2) against decisions
 
     @property
     def last_returns(self) -> Floats:
-        """Mean return over the last tenth of the updates, for each seed."""
+        """Mean return over the last tenth of the updates, [seeds]."""
         return np.asarray(self.returns.values[:, -max(len(self.returns.steps) // 10, 1) :].mean(axis=1))
 
     @property
     def rise(self) -> float:
-        """Rise of the return during training, mean over seeds."""
+        """Rise of the return from the first update to the last tenth of the training, mean over seeds."""
         return float((self.last_returns - self.returns.values[:, 0]).mean())
 
     @property
     def decisions_to_converge(self) -> Floats:
-        """Number of decisions until ``_DONE`` of the fall of the harm is reached, for each seed."""
+        """Number of decisions until 90 % of the whole fall of the harm is reached, [seeds] (``_DONE``)."""
         first, least = self.harm.values[:, :1], self.harm.values.min(axis=1, keepdims=True)
         there = self.harm.values <= first - _DONE * (first - least)
         return np.asarray(self.harm.steps[np.argmax(there, axis=1)])
 
     def returns_at(self, shares: Floats) -> Floats:
-        """Return the return of each seed after these shares of the training, [seeds, k]."""
+        """Return the return of each seed at given points of the training, [seeds, k].
+
+        ``shares`` [k] are these points, as shares of the whole training from 0 to 1.
+        """
         steps = shares * self.returns.steps[-1]
         return np.array([np.interp(steps, self.returns.steps, own) for own in self.returns.values])
 
     def unrest(self, points: int) -> Floats:
-        """Return the fluctuation of each seed's return in the second half of the training, as a share of the rise.
+        """Return how much the return of each seed fluctuates in the second half of the training, [seeds].
 
-        It is the standard deviation of the changes between ``points`` at equal distances, so that trainings of
-        different lengths can be compared.
+        The return is taken at ``points`` equally distant times. The result is the standard deviation of the changes
+        from one time to the next, divided by ``rise``, so that trainings of different lengths can be compared.
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
     @property
     def still_rising(self) -> float:
-        """Share of the rise that falls into the last quarter of the training, mean over seeds."""
+        """Rise of the return in the last quarter of the training, as a share of ``rise``; mean over seeds."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return over seeds, at each step of the second half."""
+        """Standard deviation of the return over seeds, at each step of the second half of the training, [k]."""
         return np.asarray(self.returns.values[:, len(self.returns.steps) // 2 :].std(axis=0, ddof=1))
 
 
@@ -136,9 +142,10 @@ Courses = Mapping[str, Course]  # trainings by recipe
 
 
 def reproduce_curves(delay: str, settings: Reproduction) -> Made:
-    """Reproduce the learning curves at this delay from the trainings of ``--full``.
+    """Reproduce the learning curves at one delay (``high`` or ``low``) from the trainings of ``--full``.
 
-    Without these trainings, the results of shipped policies at this delay take their place.
+    Returns verdicts, tables, figures and data. Without these trainings, the results of shipped policies at this delay
+    take their place.
     """
     courses = {
         each: {
@@ -210,7 +217,10 @@ def reproduce_curves(delay: str, settings: Reproduction) -> Made:
 
 
 def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
-    """Return verdicts on the paper's statements about one of the two figures."""
+    """Return verdicts on the paper's statements about the learning curves at one delay.
+
+    ``courses`` holds the trainings by delay and recipe.
+    """
     own, high, low = courses[delay], courses[HIGH], courses[LOW]
     if not own:
         return [Verdict(f"learning curves at {delay} delay", "not run", "no training; --full trains them")]

@@ -23,10 +23,15 @@ _ROW_CHARACTERS = 52  # characters in a line of a row's label
 def estimates_figure(
     panels: Mapping[str, Mapping[str, Mapping[Any, Estimate]]], *, y_label: str, caption: str, x_label: str = ""
 ) -> Figure:
-    """Draw one panel per title, and in it one series of estimates per label.
+    """Draw estimates with their 95 % intervals: one panel per title, and in it one series per label.
 
-    If the keys are numbers, named by ``x_label``: lines with bands for 95 % intervals. If they are texts: groups of
-    bars.
+    Args:
+        panels: title of a panel -> label of a series -> x (a number or a text) -> estimate.
+        y_label: label of the y axis.
+        caption: text below the figure.
+        x_label: label of the x axis if x is a number: lines with bands are drawn. Empty: x is a text, and groups of
+            bars are drawn.
+
     """
     figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)
     for axes, (title, lines) in zip(every, panels.items(), strict=True):
@@ -53,7 +58,10 @@ def estimates_figure(
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
     """Draw trajectories as the paper does: vehicle against position on the road, with an arrow every ten time steps.
 
-    Dashed lines join the vehicles at the same time. There is one panel per record, two in a row.
+    Dashed lines join the positions of all vehicles at the same time. ``records`` are episodes by the title of their
+    panel; there are two panels in a row.
+
+    ``caption`` is the text below the figure.
     """
     figure, panels = _in_pairs(len(records), 1.9, "Position along the road (m)", "Vehicle")
     for axes, (title, record) in zip(panels, records.items(), strict=False):
@@ -72,7 +80,10 @@ def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure
 
 
 def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels on common scales, two in a row, with labels at the left and below."""
+    """Return a figure with ``panels`` panels on common scales, two in a row, and its axes.
+
+    ``height_in`` is the height of a row in inches; ``x`` and ``y`` are the labels of the axes.
+    """
     rows = (panels + 1) // 2
     figure, every = new_panels((10.0, height_in * rows + 1.0), rows, 2, sharex=True, sharey=True)
     for axes in every[::2]:
@@ -83,7 +94,10 @@ def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, li
 
 
 def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
-    """Draw the command of the controlled vehicle over time: one panel per title, one line per label."""
+    """Draw the command of the controlled vehicle over time: one panel per title, one line per label.
+
+    ``panels`` maps the title of a panel to recorded episodes by the label of their line; ``caption`` is the text below.
+    """
     figure, every = _in_pairs(len(panels), 2.3, "Time since Vehicle 1 began to brake (s)", "Command (m/s²)")
     for axes, (title, records) in zip(every, panels.items(), strict=False):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
@@ -96,7 +110,12 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
 
 
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
-    """Draw by how much each change moves a number: one row per change, one mark per label, with its interval."""
+    """Draw by how much each change moves a number: one row per change, one mark per label, with its 95 % interval.
+
+    ``changes`` maps the name of a change to the differences, by label.
+
+    ``x_label`` is the label of the x axis, ``caption`` the text below the figure.
+    """
     rows = list(changes)
     labels = list(dict.fromkeys(label for each in changes.values() for label in each))
     figure, (axes,) = new_panels((9.4, 0.3 * len(rows) + 1.6))

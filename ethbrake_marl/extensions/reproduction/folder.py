@@ -40,14 +40,14 @@ LIMIT_BYTES = 16 << 20  # largest size of a figure file that is read again
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reproduction:
-    """Settings of a reproduction."""
+    """Settings of a reproduction of the paper's figures and tables."""
 
-    mode: Mode
+    mode: Mode  # ``quick``: train nothing, use shipped policies; ``full``: also use trainings
     folder: Path  # folder of all results, and of the trainings
     episodes: int = MOST_EPISODES  # largest number of worlds of a list; the paper has 10,000
-    tell: OnProgress = lambda progress: None
-    machine: str = ""  # description of the machine
-    docs: Path | None = None  # Markdown page of the results to write
+    tell: OnProgress = lambda progress: None  # called with the progress
+    machine: str = ""  # description of the machine, for the results
+    docs: Path | None = None  # Markdown page of the results to write; None: no such page
 
     def __post_init__(self) -> None:
         """Raise ``InvalidInput`` if the name of the Markdown page does not end in ``.md``, or it cannot be written."""
@@ -57,7 +57,10 @@ class Reproduction:
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
-        """Return each recipe of these groups, in order, with the folders of its seeds; empty without --full."""
+        """Return the trainings of the groups named in ``wanted``, as (group, name of the recipe, folder of each seed).
+
+        There is one entry for each recipe of each group. The list is empty in mode ``quick``.
+        """
         return [
             (
                 group,
@@ -70,7 +73,10 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """Return the recipes of these groups whose seeds are all trained, as ``group/recipe``, with their folders."""
+        """Return the recipes whose seeds are all trained, as ``group/recipe``, with the folder of each seed.
+
+        ``wanted`` are names of groups.
+        """
         return {
             f"{group.name}/{name}": paths
             for group, name, paths in self.seeds_of(wanted)
@@ -78,7 +84,7 @@ class Reproduction:
         }
 
     def seconds_left(self, wanted: Collection[str]) -> float:
-        """Return the remaining seconds of one core for the trainings of these groups.
+        """Return the time (s) that one core needs for the remaining trainings of the groups named in ``wanted``.
 
         Unfinished trainings count in full.
         """
@@ -90,7 +96,9 @@ class Reproduction:
         )
 
     def train(self, wanted: Collection[str]) -> bool:
-        """Run the remaining trainings of these groups, in order. Return False if Ctrl-C stopped them."""
+        """Run the remaining trainings of the groups named in ``wanted``, in order. Return False if Ctrl-C stopped
+        them.
+        """
         from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 
         for group in groups().values():
@@ -102,7 +110,7 @@ class Reproduction:
         return True
 
     def cost(self, items: Sequence[Item]) -> str:
-        """Describe the remaining work and its approximate time in one line."""
+        """Return one line of text on the work left to do for ``items`` and the time it takes."""
         wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
         told = (
             f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
@@ -113,73 +121,73 @@ class Reproduction:
 
 @model(frozen=True, config=WRITTEN)
 class Parameter:
-    """A quantity that affects an item, and the origin of its value."""
+    """A quantity that affects an item (a figure or table of the paper), and the origin of its value."""
 
-    name: str
-    value: str
-    origin: str = "our default"
+    name: str  # name of the quantity
+    value: str  # its value as text, with unit
+    origin: str = "our default"  # origin of the value: our default, or the place where the paper states it
 
 
 def stated(name: str, value: str, where: str) -> Parameter:
-    """Return a parameter that the paper states at ``where``; if ``where`` is empty it is our default."""
+    """Return a parameter with the place where the paper states it; if ``where`` is empty, the value is our default."""
     return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
 
 
 @model(frozen=True, config=WRITTEN)
 class Table:
-    """A table as text: each cell has a value and, if there is one, an interval."""
+    """A table as text, as it is stored in a result."""
 
-    title: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[Shown]]
-    note: str = ""
+    title: str  # title above the table
+    head: Sequence[str]  # headings of the columns
+    rows: Sequence[Sequence[Shown]]  # cells of each row: a value and, if there is one, an interval
+    note: str = ""  # text below the table
 
 
 @model(frozen=True, config=WRITTEN)
 class Drawn:
-    """A figure's file stem, title and description in words."""
+    """Names of a figure of an item: the stem of its files, its title, and a description in words."""
 
-    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # stem of its files
-    title: str
-    text: str
+    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # name of its files without ending
+    title: str  # title above the figure
+    text: str  # description of what the figure shows
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """Result of making an item, before it is written."""
+    """Result of reproducing an item (a figure or table of the paper), before it is written to files."""
 
-    verdicts: Sequence[Verdict]
-    parameters: Sequence[Parameter]
-    tables: Sequence[Sheet] = ()
-    figures: Mapping[Drawn, Figure] = field(default_factory=dict)
-    data: Mapping[str, str] = field(default_factory=dict)  # stem of a CSV file -> its text
-    notes: Sequence[str] = ()  # generated sentences on what was run and what was not
+    verdicts: Sequence[Verdict]  # verdict on each comparison with the paper
+    parameters: Sequence[Parameter]  # quantities that affect the item
+    tables: Sequence[Sheet] = ()  # tables to show
+    figures: Mapping[Drawn, Figure] = field(default_factory=dict)  # figures to show, each with its names
+    data: Mapping[str, str] = field(default_factory=dict)  # CSV files: stem of the file name -> its text
+    notes: Sequence[str] = ()  # sentences on what was run and what was not
 
 
 @model(frozen=True, config=WRITTEN, kw_only=True)
 class Result:
-    """An item and its result, as stored in its file and shown on pages."""
+    """An item (a figure or table of the paper) and its result, as stored in its file and shown on pages."""
 
-    name: str
-    labels: Sequence[str]
-    title: str
-    what: str
-    mode: Mode = "quick"
-    episodes: int = MOST_EPISODES
-    trained: Sequence[str]
-    processor_s: float
-    made_utc: str
-    machine: str
-    verdict: Verdict
-    comparisons: Sequence[Verdict]
-    parameters: Sequence[Parameter]
-    tables: Sequence[Table]
-    figures: Sequence[Drawn]
-    data: Sequence[str]
-    notes: Sequence[str]
+    name: str  # name on the command line and of its folder
+    labels: Sequence[str]  # labels in the paper's source
+    title: str  # title of the item
+    what: str  # description of the paper's figure or table, one sentence
+    mode: Mode = "quick"  # ``quick`` or ``full`` (with trainings)
+    episodes: int = MOST_EPISODES  # largest number of worlds of a list
+    trained: Sequence[str]  # trainings that were used, as ``group/recipe``
+    processor_s: float  # processor time without the trainings, s
+    made_utc: str  # date and time (UTC, ISO 8601)
+    machine: str  # description of the machine
+    verdict: Verdict  # summary of all verdicts
+    comparisons: Sequence[Verdict]  # verdict on each comparison with the paper
+    parameters: Sequence[Parameter]  # quantities that affect the item
+    tables: Sequence[Table]  # tables to show
+    figures: Sequence[Drawn]  # names of the figures
+    data: Sequence[str]  # names of the CSV files
+    notes: Sequence[str]  # sentences on what was run and what was not
 
     def in_words(self) -> dict[str, Any]:
-        """Return the result as plain data, with each cell of a table as one text."""
+        """Return the result as plain data (mappings, lists and texts), in which each cell of a table is one text."""
         tables = [
             {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
         ]
@@ -192,16 +200,19 @@ class Item:
 
     name: str  # name on the command line and of its folder
     labels: tuple[str, ...]  # labels in the paper's source
-    title: str
+    title: str  # title of the item
     what: str  # description of the paper's figure or table, one sentence
-    make: Callable[[Reproduction], Made]
+    make: Callable[[Reproduction], Made]  # function that reproduces it with these settings
     most_s: float  # upper estimate of processor seconds with the paper's numbers of worlds
     trained: tuple[str, ...] = ()  # groups of trainings that it shows with ``--full``
-    play: Callable[[], Part] | None = None  # makes the player of episodes for its page
+    play: Callable[[], Part] | None = None  # function that returns the player of episodes for its page; None: no player
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a CSV file as text. An estimate takes three columns: value, low, high."""
+    """Return a CSV file as text: the line ``head``, then ``rows``.
+
+    An ``Estimate`` in a row fills three columns: value, low, high; ``head`` needs a name for each of them.
+    """
     parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
     return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
 
@@ -227,9 +238,10 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 
 
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
-    """Return the quantities of a scenario, each with its origin.
+    """Return the quantities of a scenario as parameters, each with its origin.
 
-    ``places`` overrides the place where the paper states a key; an empty text marks our default.
+    The origin is the place in the paper that states the quantity (``_QUANTITIES``). ``places`` replaces it: key of the
+    scenario -> other place; an empty text marks our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     found = [
@@ -242,7 +254,11 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:
-    """Return the number of worlds and their seed. The seed is ours: the paper only says "a fixed random seed"."""
+    """Return the number of worlds, ``episodes``, and the seed of their list as a parameter.
+
+    The paper states the number at ``where`` (empty: our default). The seed is ours: the paper only says "a fixed random
+    seed".
+    """
     return stated("worlds", f"{episodes:,}, the first of the list of seed {LIST_SEED}", where)
 
 
@@ -264,9 +280,15 @@ def json_text(content: Mapping[str, Any]) -> bytes:
 
 
 def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
-    """Return the result in an item's file.
+    """Return the result that an item's file holds.
 
     Raises ``InvalidInput`` if an entry is missing or has another type than pages need, or if it is another item's.
+
+    Args:
+        content: content of the file.
+        where: path of the file, for the error message.
+        name: name of the item.
+
     """
     try:
         result = TypeAdapter(Result).validate_json(json.dumps(content))

@@ -52,7 +52,11 @@ _ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups of d_1 + 
 
 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
-    """Group worlds by d_1 + d_2. Return the mean distance and the harm of each group; empty groups are left out."""
+    """Group worlds by the sum of both gaps. Return the mean sum of each group (m), and the harm by group and strategy.
+
+    The second result has the form ``{"10-12 m": {"PPO": harm, ...}, ...}`` with the harm of each world in the group.
+    Empty groups are left out.
+    """
     total, found = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}
     for k, (low, high) in enumerate(pairwise(_ENDS_M)):
@@ -63,7 +67,10 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
 
 
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
-    """Return the comparisons of a strategy with others in every group, paired by world."""
+    """Return comparisons: does strategy ``smaller`` do less harm than each of ``larger``, in every group of worlds?
+
+    They are paired by world. ``groups`` maps the name of a group to the harm [n] of each strategy.
+    """
     return [
         Less.of_harms(group if len(larger) == 1 else f"{group}, {other}", harm, smaller, other)
         for group, harm in groups.items()
@@ -72,7 +79,10 @@ def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
 
 
 def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
-    """Return a table of harm with its interval: one row per strategy, one column per group."""
+    """Return a table of mean harm with its interval: one row per strategy, one column per group of worlds.
+
+    ``groups`` maps the name of a group to the harm [n] of each strategy; ``note`` is added below the table.
+    """
     strategies = next(iter(groups.values()))
     rows = [(name, *(mean(harm[name]) for harm in groups.values())) for name in strategies]
     return Sheet(title, ("Strategy", *groups), rows, f"First-impact harm, m²/s²{note}. {ABOUT_BASELINE}")
@@ -86,9 +96,16 @@ def over_distance(
     told: Sequence[Parameter],
     episodes: int,
 ) -> Made:
-    """Make an item from the harm of strategies over the total distance.
+    """Return an item that shows the harm of strategies against the sum of both gaps.
 
-    ``found`` holds the result of ``by_distance`` for each reading (each assumption on when Vehicle 2 may act).
+    Args:
+        stem: name of its files without ending.
+        found: result of ``by_distance`` for each assumption on when Vehicle 2 may act, by the name of the assumption.
+        verdicts: verdicts on the paper's statements.
+        lines: names of the strategies to draw.
+        told: parameters to list besides those of the scenario.
+        episodes: number of worlds.
+
     """
     panels = {
         reading: {
@@ -125,7 +142,10 @@ def over_distance(
 
 
 def reproduce_distance(settings: Reproduction) -> Made:
-    """Reproduce the harm of the four strategies over the total distance, and judge the paper's statements about it."""
+    """Reproduce the harm of the four strategies against the sum of both gaps; return figure, tables and verdicts.
+
+    The verdicts judge the paper's statements about it.
+    """
     episodes, braking = min(_DISTANCE_WORLDS, settings.episodes), NAMES[FULL_BRAKE]
     found, verdicts = {}, []
     for reading in READINGS:
@@ -160,7 +180,10 @@ _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 
 
 def reproduce_delays(settings: Reproduction) -> Made:
-    """Reproduce the harm of the four strategies at three delays, in the figure's world and in a list of worlds."""
+    """Reproduce the harm of the four strategies at three delays; return figures, tables and verdicts.
+
+    There is one figure for the world of the paper's figure, and one for a list of worlds.
+    """
     episodes = min(_DELAY_WORLDS, settings.episodes)
     found: dict[tuple[str, str], Groups] = {}  # by worlds and reading
     for reading in READINGS:
@@ -212,6 +235,6 @@ def reproduce_delays(settings: Reproduction) -> Made:
 
 
 def _delay_name(scenario: Scenario) -> str:
-    """Return the name of a delay with its latencies."""
+    """Return the name of a scenario's delay with its latencies, for instance "low (0.1, 0.3 s)"."""
     _, middle, rear = scenario.model_dump()["latency_s"]
     return f"{scenario.name.removeprefix('paper-delay-')} ({middle:g}, {rear:g} s)"

@@ -46,15 +46,25 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """Evaluate the strategies on the worlds of a scenario."""
+    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of both on a list of worlds.
+
+    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert.
+
+    Args:
+        name: name of a shipped scenario.
+        settings: settings of the reproduction, with the number of worlds.
+        reading: assumption on when Vehicle 2 may act.
+
+    """
     return _driven_hybrid(name, settings, reading, unconverged_policy(settings)[1])
 
 
 @lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """Evaluate the strategies with the unconverged policy that ``about`` describes.
+    """Evaluate the strategies of ``_drive_hybrid``, once for each set of arguments.
 
-    ``about`` is part of the cache key, so that a training that ends meanwhile replaces a shipped policy.
+    ``about`` describes the policy that has not converged. It is part of the cache key, so that a training that ends
+    meanwhile replaces a shipped policy.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
@@ -67,9 +77,11 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Reproduce the harm of E-V2X-BM, an unconverged policy and the hybrid over the total distance.
+    """Reproduce harm against the sum of both gaps, for E-V2X-BM, a policy that has not converged, and the hybrid of
+    both.
 
-    The paper's claim that the hybrid "consistently selects the strategy that results in lower harm" is judged in each
+    Returns figure, tables and verdicts. The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the
+    alert. The paper's claim that it "consistently selects the strategy that results in lower harm" is judged in each
     world and in each group.
     """
     found, verdicts = {}, []
@@ -96,7 +108,10 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 
 
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
-    """Reproduce the paper's table of 5,000 episodes, with both readings of its initial speeds."""
+    """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``); return tables and verdicts.
+
+    The paper allows two sets of initial speeds; both are used.
+    """
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),
         "Standalone DRL": (_ALONE,),
@@ -127,7 +142,9 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
 
 
 def reproduce_random_table(settings: Reproduction) -> Made:
-    """Reproduce collisions, harm and its decrease of the four strategies in the random test (``Table:Random``)."""
+    """Reproduce collisions, harm and decrease of harm in the random test (``Table:Random``); return tables and
+    verdicts.
+    """
     episodes, besides = min(_RANDOM_WORLDS, settings.episodes), []
     ours: dict[str, tuple[str, ...]] = {
         "Non-E": (NAMES[FULL_BRAKE],),

@@ -109,7 +109,7 @@ ITEMS = (  # in the order of the paper
 
 
 def read_results(folder: Path) -> list[Result]:
-    """Return the results that exist, in the order of the paper.
+    """Return the results of all items that exist in ``folder``, in the order of the paper.
 
     Raises ``InvalidInput`` for a damaged result, or a result of another item.
     """

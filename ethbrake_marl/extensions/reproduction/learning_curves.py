@@ -47,16 +47,19 @@ AXES: dict[Against, tuple[str, str, type]] = {  # column, label of the axis, typ
 
 
 class LearningCurves(NamedTuple):
-    """Trainings of several recipes on one scenario, in ``folder/RECIPE-seedK`` for the seeds 0, 1, ... of each."""
+    """Trainings of several recipes with several seeds each on one scenario, stored in ``folder/RECIPE-seedK``."""
 
-    scenario: Scenario
-    plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds
-    folder: Path
-    against: Against = "steps"  # quantity on the x axis
+    scenario: Scenario  # scenario of all trainings
+    plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds: 0, 1, ...
+    folder: Path  # folder of the trainings, the figure and the tables
+    against: Against = "steps"  # quantity on the x axis: ``steps`` or ``cpu``
 
     @staticmethod
     def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
-        """Parse ``ppo:5,sac:3``: recipes (names or paths) with their numbers of seeds. Raises ``InvalidInput``."""
+        """Return recipes with their numbers of seeds from a text such as ``ppo:5,sac:3`` (names or paths).
+
+        Raises ``InvalidInput`` for another form or two recipes of the same name.
+        """
         found = []
         for part in split_names(text, lambda part: os.path.isfile(part.rpartition(":")[0])):
             match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
@@ -70,10 +73,18 @@ class LearningCurves(NamedTuple):
     def train(
         self, *, steps: int | None = None, settings: Sequence[str] = (), jobs: int = 1, tell: OnProgress | None = None
     ) -> bool:
-        """Train every seed of every recipe, ``jobs`` at a time. Finished trainings are kept, unfinished ones continue.
+        """Train every seed of every recipe. Finished trainings are kept, unfinished ones continue.
 
         Returns False if Ctrl-C stopped it. Raises ``InvalidInput`` before any training if the folder holds a different
         training, and the exceptions of ``train_all``.
+
+        Args:
+            steps: training steps of each training; None: the recipe's.
+            settings: ``KEY=VALUE`` changes of scenario and recipe, only to be written to each training's
+                ``config.json``.
+            jobs: number of trainings at a time.
+            tell: called with the progress.
+
         """
         trainings = [
             TrainingJob(
@@ -91,11 +102,13 @@ class LearningCurves(NamedTuple):
             return train_all(trainings, jobs, tell)
 
     def write(self) -> dict[str, Any]:
-        """Draw the finished trainings, write figure, table and summary, and return the summary.
+        """Draw the finished trainings, write figure, table and summary to the folder, and return the summary.
 
-        For each recipe the summary has: the harm of the policy that each training kept, and of its last policy, as
-        interquartile mean over seeds with a stratified bootstrap interval; hashes of the recipe's fixed list and of the
-        kept policies. Raises ``InvalidInput`` if the trainings have no common evaluation step.
+        For each recipe the summary has the harm of the policies that the trainings kept, and of their last policies:
+        each is an interquartile mean over seeds, with a stratified bootstrap interval. It also has the hashes of the
+        recipe's fixed list and of the kept policies.
+
+        Raises ``InvalidInput`` if the trainings have no common evaluation step.
         """
         scenario, curves, lists = self.scenario, self.curves(), set()
         summary: dict[str, Any] = {
@@ -142,9 +155,10 @@ class LearningCurves(NamedTuple):
         return self.folder / f"{recipe.name}-seed{seed}"
 
     def curves(self) -> dict[str, dict[str, SeedCurve]]:
-        """Return the results of the trainings, by metric and recipe; a metric without values is left out.
+        """Return the learning curves: metric -> name of the recipe -> curve over all its seeds.
 
-        Against processor time, a step is placed at the mean over seeds, interpolated between evaluations.
+        Metrics are the counts of harm that the recipes' rewards use, and the return; a metric without values is left
+        out. If ``against`` is ``cpu``, the x value of a step is the processor time that seeds took to it, on average.
         """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
         metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]

@@ -29,7 +29,8 @@ from ethbrake_marl.files.store import write_file, write_output
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items with these names in the order of the paper, or all items if no names are given.
+    """Return the items (figures and tables of the paper) with these names, in the order of the paper; if none is named,
+    all.
 
     Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a repeated name.
     """
@@ -43,9 +44,10 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
-    """Return the study folder, which continues a reproduction with the same settings.
+    """Return the folder of a reproduction as a ``StudyFolder``, which continues an earlier one with the same settings.
 
-    With ``force`` its results are deleted and its trainings stay. Raises ``InvalidInput`` if the folder is a link.
+    ``asked`` are the settings. With ``force`` the results in the folder are deleted; its trainings stay. Raises
+    ``InvalidInput`` if the folder is a link.
     """
     path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
     if path.is_symlink():
@@ -62,11 +64,18 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 
 
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
-    """Make the items. Return all results in the folder, and whether the trainings ran to their end.
+    """Reproduce items (figures and tables of the paper). Return all results in the folder, and whether all trainings
+    ended.
 
     Items without trainings come first. An existing result from the same trainings is kept. After each item the page is
     rewritten. Ctrl-C during a training ends all trainings, and items use the finished ones; a second Ctrl-C stops at
     once. Raises the exceptions of ``open_folder`` and ``StudyFolder.work``.
+
+    Args:
+        asked: settings of the reproduction.
+        items: items to reproduce.
+        force: make existing results again.
+
     """
     full, finished = asked.mode == "full", True
     with open_folder(asked, force=force).work():
@@ -85,7 +94,10 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
 
 
 def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
-    """Make an item; write its figures and data, then its result file, which makes it complete."""
+    """Reproduce an item; write its figures and data, then its result file, which marks it as complete.
+
+    ``trained`` names the trainings that it uses, as ``group/recipe``.
+    """
     place, started = asked.folder / item.name, time.process_time()
     made = item.make(asked)
     result = Result(

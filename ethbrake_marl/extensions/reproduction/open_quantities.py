@@ -43,24 +43,28 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another reading of a quantity, and how to apply it to the random test."""
+    """Another possible value of a quantity that the paper leaves open, and how to apply it to the random test."""
 
-    value: str
-    changes: Mapping[str, Any] = field(default_factory=dict)  # changed keys of the scenario
-    seed: int | None = None  # seed of the list of worlds
-    harm: Literal["first", "total", "sampled", "predicted"] = "first"  # harm that is counted
-    bound: Literal["coupled", "pairwise"] | None = None  # H* of the hybrid that replaces PPO; None: PPO itself
+    value: str  # the value in words
+    changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
+    seed: int | None = None  # seed of the list of worlds; None: the usual one
+    # Harm that is counted: first impacts, all impacts (``total``), harm of the sampled aftermath, or the harm that
+    # E-V2X-BM predicts.
+    harm: Literal["first", "total", "sampled", "predicted"] = "first"
+    # None: PPO drives. Else the paper's hybrid of PPO and E-V2X-BM drives in its place, and this says how the hybrid
+    # finds H*, the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.
+    bound: Literal["coupled", "pairwise"] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gap:
-    """A quantity that the paper leaves open, or that can be read in two ways."""
+    """A quantity that the paper leaves open, or that can be understood in two ways."""
 
-    name: str
+    name: str  # name of the quantity
     paper: str  # statement of the paper, with the label in its source
-    ours: str  # our default
-    alternatives: tuple[Alternative, ...] = ()
-    otherwise: str = ""  # reason for the lack of alternatives
+    ours: str  # our default value
+    alternatives: tuple[Alternative, ...] = ()  # other values that are measured
+    otherwise: str = ""  # reason why no alternative is measured; empty if some are
 
 
 def _of(key: str, *values: float, unit: str = "") -> tuple[Alternative, ...]:
@@ -118,14 +122,17 @@ _SHOWN = tuple(NAMES[spec] for spec in _SPECS)
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """Harm and collisions of each strategy in each world of a list."""
+    """Main results on a list of n worlds: harm and collisions of each strategy."""
 
-    gaps_m: Floats  # [n, P] gaps, to recognise lists of the same worlds
-    harm: Mapping[str, Floats]  # by strategy, [n] m2/s2
-    collided: Mapping[str, Bools]  # by strategy, [n]
+    gaps_m: Floats  # [n, P] gaps at the alert, m, to recognise lists of the same worlds
+    harm: Mapping[str, Floats]  # strategy -> harm, [n] m2/s2
+    collided: Mapping[str, Bools]  # strategy -> True for worlds with a collision, [n]
 
     def change(self, base: Headline, strategy: str) -> Estimate:
-        """Return the harm minus that of ``base``: paired by world if the worlds are the same, else unpaired."""
+        """Return the change of a strategy's mean harm against ``base``, m2/s2.
+
+        The difference is paired by world if the worlds are the same, else unpaired.
+        """
         own, other = self.harm[strategy], base.harm[strategy]
         if np.array_equal(self.gaps_m, base.gaps_m):
             return paired_difference(own, other)
@@ -133,7 +140,10 @@ class Headline:
 
 
 def reproduce_gaps(settings: Reproduction) -> Made:
-    """Make the sensitivity table: every quantity, our default, alternatives, and how far the headline numbers move."""
+    """Measure how far the results on the random test move when one quantity that the paper leaves open changes.
+
+    Returns a register of the open quantities, tables, a figure and verdicts.
+    """
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
     measured = [gap for gap in GAPS if gap.alternatives]
@@ -229,9 +239,10 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """Evaluate the strategies in one alternative.
+    """Evaluate the strategies on the random test under one alternative; return harm and collisions in each world.
 
-    A strategy that predicts no harm counts with its first-impact harm.
+    ``scenario`` is the random test, before the alternative's changes; ``episodes`` is the number of worlds. If the
+    alternative counts predicted harm, strategies without a prediction count with their first-impact harm.
     """
     own = scenario.replace(**alternative.changes) if alternative.changes else scenario
     agents: dict[str, Agent] = lineup(own, *_SPECS)

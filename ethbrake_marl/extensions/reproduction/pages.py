@@ -30,10 +30,10 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Describe the results on a page in four parts, and the run that made them.
+    """Return four texts on the results and the run that made them.
 
-    Returns the lead sentence; the command that makes the results; date, machines and processor time; and a remark if
-    lists are shorter than the paper's.
+    These are the lead sentence; the command that makes the results; date, machines and processor time; and a list with
+    a remark if lists are shorter than the paper's, else empty.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -55,7 +55,7 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 
 
 def render_page(folder: Path, results: Sequence[Result]) -> str:
-    """Return the page as HTML. All content of the results is shown as text.
+    """Return the page with all results as HTML text; ``folder`` holds their figures.
 
     Raises ``InvalidInput`` for a missing figure, or a figure with elements that our figures do not contain.
     """
@@ -112,7 +112,7 @@ def _section(folder: Path, result: Result) -> Section:
 
 
 def _outcome(word: str) -> Markup:
-    """Return the word of a verdict, with a sign and a colour."""
+    """Return the outcome of a verdict, such as "agrees", as HTML with a sign and a colour."""
     return Markup('<span class="outcome {}">{}</span>').format(word.replace(" ", "-"), word)
 
 
@@ -120,9 +120,10 @@ FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the fi
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the Markdown page, the results as ``.json`` beside it, and the figures into ``figures/``.
+    """Write the Markdown page to ``file``, the results as ``.json`` beside it, and the figures into a folder
+    ``figures``.
 
-    Existing files are replaced.
+    Existing files are replaced. ``folder`` holds the figures of the results.
     """
     figures = file.parent / FIGURES
     figures.mkdir(exist_ok=True)
@@ -136,7 +137,7 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 
 
 def docs_page(results: Sequence[Result]) -> str:
-    """Return the Markdown page of these results: the verdicts. The site shows all the rest from the ``.json`` file."""
+    """Return the Markdown page of these results, with the verdict on each item. The ``.json`` file has all the rest."""
     lead, command, made, few = _account(results)
     blocks = [
         f"# {_TITLE}",
@@ -162,12 +163,12 @@ def docs_page(results: Sequence[Result]) -> str:
 
 
 def _wrapped(text: str) -> str:
-    """Return a paragraph wrapped to the width of the pages, in which no line starts a list or a heading."""
+    """Return a paragraph wrapped to lines of 99 characters, of which none starts a list or a heading."""
     lines = textwrap.wrap(text, 99, break_long_words=False, break_on_hyphens=False)
     return "\n".join(re.sub(r"^(?=[-+#>] )", r"\\", line) for line in lines)
 
 
 def _escaped(text: str) -> str:
-    """Return text with Markdown escaped."""
+    """Return ``text`` with the special characters of Markdown escaped."""
     plain = plain_text(text, keep="\u00a0").replace("<", "&lt;")
     return re.sub(r"([\\|*_`])", r"\\\1", plain).replace("](", "]\\(")

@@ -42,13 +42,15 @@ NAMES = {  # names of the strategies in tables and figures
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """An assumption on the time at which Vehicle 2 may act."""
+    """An assumption on the time at which Vehicle 2 may act; the paper allows two."""
 
-    name: str
+    name: str  # name of the assumption
     acts_s: float | None = None  # time at which Vehicle 2 may act; None: the scenario's latency
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Return a shipped scenario under this assumption, with ``changes``."""
+        """Return the shipped scenario ``name`` under this assumption; ``changes`` replace further keys of the
+        scenario.
+        """
         found = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
             return found
@@ -60,12 +62,14 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return the agents of these specs, by their names in ``NAMES`` or else by spec."""
+    """Return the agents of ``specs`` (texts such as ``"full_brake"``), by their names in ``NAMES``, or else by spec."""
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 
 def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
-    """Evaluate every agent on the first ``episodes`` worlds of the list."""
+    """Evaluate every agent on the first ``episodes`` worlds of the scenario's list. ``settings`` receives the
+    progress.
+    """
     return evaluate(
         scenario.sample(episodes, LIST_SEED),
         agents,
@@ -77,9 +81,10 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 
 
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy in each world, [n] m2/s2.
+    """Return the first-impact harm of each strategy, by its name, [n] m2/s2.
 
-    Also holds the harm that E-V2X-BM predicts (``PREDICTED``) and the proven lower bound (``PROVEN``), if known.
+    The mapping also has the harm that E-V2X-BM predicts (``PREDICTED``) and the proven lower bound (``PROVEN``), if
+    known.
     """
     found = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
@@ -95,10 +100,9 @@ _STAND_IN = "ppo-paper-random-obstacle"  # shipped policy that replaces an uncon
 
 
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
-    """Return a policy for the paper's "PPO model obtained from training before convergence occurred".
+    """Return a policy in place of the paper's "PPO model obtained from training before convergence occurred".
 
-    This is the policy that ``--full`` stopped early, or else a shipped policy in its place. Also returns its
-    description.
+    It is the policy that ``--full`` stopped early, or else a shipped policy. Also returns its description.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
@@ -108,7 +112,11 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
 
 
 def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
-    """Return the paper's Algorithm 1 around a policy."""
+    """Return the paper's hybrid (Algorithm 1): at the alert it chooses ``policy`` or E-V2X-BM, whichever expects less
+    harm.
+
+    ``bound`` is the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.
+    """
     return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
 
 

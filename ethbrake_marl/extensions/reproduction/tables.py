@@ -28,21 +28,24 @@ _UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "
 
 
 def collision_rate(collided: Bools) -> Estimate:
-    """Return the share of worlds with an impact."""
+    """Return the share of worlds with an impact, with its 95 % interval. ``collided`` [n] is True for such worlds."""
     return rate(int(collided.sum()), len(collided))
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Our results in one reading, for comparison with the paper's rows."""
+    """Our results under one assumption on when Vehicle 2 may act, for comparison with the paper's rows."""
 
-    title: str
-    evaluation: Evaluation
+    title: str  # description of the assumption
+    evaluation: Evaluation  # outcomes of our strategies
     ours: Mapping[str, Sequence[str]]  # row of the paper -> our strategies; the first one is compared
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, Estimate]]:
-        """Every quantity of every strategy, and the proven minimum under ``NOBODY``."""
+        """Our results: strategy -> quantity (such as "collision rate") -> estimate.
+
+        The key "least possible (proven)" (``NOBODY``), if present, holds the proven minimum over all strategies.
+        """
         found, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
             harm, predicted = outcome.first_impact_harm, outcome.predicted_harm
@@ -60,7 +63,15 @@ class Beside:
         return found
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield our numbers to which a number in a row of the paper may correspond, the compared one first."""
+        """Yield all results of ours that a number in the paper may mean, each as (name, estimate).
+
+        The first one is compared with the paper's number; the others are named if it differs.
+
+        Args:
+            row: name of the strategy in the paper.
+            quantity: "collision rate", "average harm" or "harm decrease".
+
+        """
         for name in self.ours[row]:
             if quantity in self.numbers[name]:
                 yield f"{name} ({self.title})", self.numbers[name][quantity]
@@ -72,7 +83,10 @@ class Beside:
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """Return one verdict per reading, row and quantity."""
+    """Return a verdict on each printed number, once for each of ``besides`` (our results under one assumption).
+
+    ``printed`` are the rows of the paper's table.
+    """
     verdicts = []
     for beside in besides:
         least = beside.numbers.get(NOBODY, {})
@@ -97,9 +111,10 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Judge whether a choice between two strategies, world by world, can avoid as many collisions as printed.
+    """Return a verdict: can a choice between two strategies, world by world, avoid as many collisions as printed?
 
-    It avoids a collision only where one of the two strategies does, so at most as many as both together.
+    It avoids a collision only where one of the two strategies does, so at most as many as both together. ``one`` and
+    ``other`` are the paper's rows of the two strategies, ``chosen`` is its row of the choice.
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]
@@ -112,7 +127,10 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Judge whether a printed harm decrease follows from the printed harms, to the printed digits."""
+    """Return a verdict: does the decrease of harm printed in ``row`` follow from the harms printed in both rows?
+
+    ``baseline`` is the row to which the decrease refers. The two must agree within 0.01 percentage points.
+    """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0
     told = (
@@ -123,7 +141,7 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
 
 
 def rows_table(beside: Beside) -> Sheet:
-    """Return the table of our rows in one reading, with the proven minimum."""
+    """Return the table of our results under one assumption (``beside``), with the proven minimum."""
     columns: dict[str, Column | str] = {
         _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
         _DECREASE: replace(PERCENT, heading="Harm decrease"),
@@ -143,7 +161,17 @@ def beside_printed(
     parameters: Sequence[Parameter],
     notes: Sequence[str] = (),
 ) -> Made:
-    """Make an item from a table of the paper and our rows in each reading."""
+    """Return an item that compares a table of the paper with our results.
+
+    Args:
+        stem: name of its data file without ending.
+        printed: rows of the paper's table.
+        besides: our results, one entry for each assumption on when Vehicle 2 may act.
+        arithmetic: verdicts on the printed numbers alone.
+        parameters: quantities that affect the item.
+        notes: sentences on what was run and what was not.
+
+    """
     columns: dict[str, list[str]] = {
         "Strategy": [row.agent for row in printed],
         "Collisions": [f"{row.collisions:,}" for row in printed],

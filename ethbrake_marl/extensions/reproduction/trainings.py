@@ -26,18 +26,15 @@ _STATED_STATE = (  # the paper's state: positions and speeds of all vehicles, an
 
 @dataclass(frozen=True, slots=True)
 class TrainedRecipe:
-    """A recipe with a number of decisions and the updates between two evaluations.
+    """A training recipe with a number of decisions, and how often it is evaluated."""
 
-    ``per_s``: decisions per second of one core (Intel Xeon), for the estimate of the cost.
-    """
-
-    recipe: str
-    decisions: int
-    every_updates: int
-    per_s: int
+    recipe: str  # name of a shipped recipe
+    decisions: int  # length of the training, in decisions
+    every_updates: int  # number of updates between two evaluations
+    per_s: int  # decisions per second of one core (Intel Xeon), to estimate the cost
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Return the recipe under this name, with ``changes``."""
+        """Return the recipe, renamed to ``name``, with these settings and with ``changes`` of further keys."""
         found = load_recipe(self.recipe)
         evaluation = {**found.evaluation.model_dump(), "every_updates": self.every_updates}
         if "log_every_updates" in type(found).model_fields:  # otherwise the table has a row for every update
@@ -54,14 +51,15 @@ EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's 
 class Group:
     """Trainings on one scenario in one folder, in the order in which they run."""
 
-    name: str
+    name: str  # name of the group and of its folder
     scenario: str  # name of a shipped scenario
-    trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]  # by name of the recipe in the group
-    seeds: int
+    # name of the recipe in the group -> its settings, and the recipe itself
+    trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]
+    seeds: int  # number of seeds of each recipe, from 0 on
 
 
 def groups() -> dict[str, Group]:
-    """Return every group by its name, the quickest first, so that first results exist early."""
+    """Return every group of trainings by its name, the quickest first, so that first results exist early."""
     base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
     changed = {
         "risk-0": {"risk": 0.0},

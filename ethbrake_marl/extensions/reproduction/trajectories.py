@@ -51,7 +51,10 @@ Records = dict[tuple[Reading, int, str], EpisodeRecord]  # by reading, scenario 
 
 
 def reproduce_trajectories(settings: Reproduction) -> Made:
-    """Reproduce the positions of the three vehicles in both scenarios, on the road and over time."""
+    """Reproduce the vehicles' positions in the paper's Scenarios 1 and 2, on the road and over time.
+
+    Returns figures, a table and verdicts.
+    """
     records, figures, verdicts = _record_all(settings), {}, []
     for reading, stem in zip(READINGS, ("stated", "early"), strict=True):
         own = {f"{name}, Scenario {k}": records[reading, k, name] for name in _POLICIES for k in _SCENARIOS}
@@ -88,7 +91,7 @@ def reproduce_trajectories(settings: Reproduction) -> Made:
 
 
 def reproduce_accelerations(settings: Reproduction) -> Made:
-    """Reproduce the commands of Vehicle 2 in both scenarios."""
+    """Reproduce the commands of Vehicle 2 in the paper's Scenarios 1 and 2; return figure, table and verdicts."""
     records, verdicts = _record_all(settings), []
     driven = {key: _asked_of_vehicle_2(record) for key, record in records.items()}
     panels = {
@@ -142,7 +145,10 @@ def _record_all(settings: Reproduction) -> Records:
 
 @cache
 def play() -> Part:
-    """Return the player for the page: both scenarios in both readings, PPO and SAC side by side."""
+    """Return the player of episodes for the page: Scenarios 1 and 2, with both assumptions on when Vehicle 2 may act.
+
+    It shows PPO and SAC side by side.
+    """
     found = []
     for reading, number in _CELLS:
         scenario = reading.scenario(f"paper-scenario-{number}")
@@ -168,9 +174,17 @@ def _parameters() -> list[Parameter]:
 
 
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
-    """Return a column of PPO's and of SAC's record at equal times until the later one ends.
+    """Return one column of PPO's and of SAC's record at equal times until the later one ends.
 
     The record that ends first keeps its last value.
+
+    Args:
+        records: recorded episodes by assumption, scenario and strategy.
+        reading: assumption on when Vehicle 2 may act.
+        number: number of the scenario, 1 or 2.
+        what: array of the record, for instance ``gaps_m``.
+        column: index of its column.
+
     """
     pair = [records[reading, number, name] for name in _POLICIES]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -179,13 +193,24 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 
 
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
-    """Return for each scenario the root mean square difference between Vehicle 2 under PPO and under SAC."""
+    """Return the root mean square difference between Vehicle 2 under PPO and under SAC, for Scenarios 1 and 2.
+
+    ``what`` is the compared array of the records, for instance ``positions_m``; ``reading`` is the assumption on when
+    Vehicle 2 may act.
+    """
     pairs = (_both(records, reading, number, what, 1) for number in _SCENARIOS)
     return [float(np.sqrt(np.mean((one - other) ** 2))) for one, other in pairs]
 
 
 def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Column) -> list[Verdict]:
-    """Judge claims about one world, without intervals. Each has a text, the smaller number and the larger number."""
+    """Return a verdict on each claim about one world, without intervals.
+
+    Args:
+        claims: claim -> text with the numbers, number that should be smaller, number that should be larger.
+        reading: assumption on when Vehicle 2 may act, for the text of the verdict.
+        show: format of the difference.
+
+    """
     return [
         judge_statement(f"{claim} ({reading.name})", [Less(told, Estimate(smaller - larger, None))], show=show)
         for claim, (told, smaller, larger) in claims.items()
@@ -193,9 +218,10 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 
 
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return Vehicle 2's first command (m/s2), the sum of its changes of command (m/s2), and its share of braking.
+    """Return Vehicle 2's first command, the sum of the sizes of its changes of command (both m/s2), and its share of
+    braking.
 
-    The share of braking is over the time until its standstill.
+    The share of braking is over the time until its standstill, from 0 to 1.
     """
     acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
     command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0

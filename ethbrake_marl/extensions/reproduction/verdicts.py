@@ -40,9 +40,9 @@ WRITTEN = ConfigDict(strict=True, extra="forbid")  # for types that are read fro
 class Verdict:
     """Outcome of one comparison with the paper, and the numbers behind it."""
 
-    what: str
-    outcome: Judgement
-    because: str
+    what: str  # what was compared
+    outcome: Judgement  # ``agrees``, ``differs``, ``undecided``, ``cannot agree`` or ``not run``
+    because: str  # the numbers behind the outcome, as text
 
 
 # Formats of quantities.
@@ -60,15 +60,15 @@ def compare_number(
     least: tuple[str, Estimate] | None = None,
     others: Mapping[str, Estimate] | None = None,
 ) -> Verdict:
-    """Compare a number that the paper prints with ours.
+    """Return a verdict on whether a number that the paper prints agrees with ours.
 
     Args:
         what: name of the number.
         printed: the paper's number.
         ours: the same quantity in our results, with its interval over worlds.
         show: format of both numbers.
-        least: description and value of a proven lower bound over our list for all strategies.
-        others: the same quantity under other readings; if ours differs, the nearest of them is named.
+        least: description and value of a proven lower bound over our list for all strategies; None: no bound.
+        others: the same quantity under other assumptions, by description; if ours differs, the nearest one is named.
 
     """
     told = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
@@ -92,7 +92,11 @@ def compare_number(
 
 
 def _off(printed: float, ours: Estimate) -> str:
-    """Describe how far ours is from the printed number; empty if within ``TOLERANCE``, or within chance unless wide."""
+    """Return a text on how far ``ours`` is from the printed number, such as "+3.1 %"; empty if the two agree.
+
+    They agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance (see
+    ``_chance``). Chance does not count if it is above 15 % of the larger number (``WIDE``).
+    """
     chance = _chance(ours)
     told = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
     if abs(ours.value - printed) <= max(told, TOLERANCE * abs(printed)):
@@ -101,39 +105,57 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return how far apart two such estimates over two lists may lie: sqrt 2 times the half-width."""
+    """Return by how much this estimate and that of another list of as many worlds may differ by chance.
+
+    It is sqrt(2) times the half-width of the interval.
+    """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
 
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """One comparison of a statement: ``difference`` (smaller minus larger) should be below 0.
+    """Difference of two quantities, as evidence for or against a statement that the first is smaller than the second.
 
-    ``neither`` is true if both are 0, so that nothing is left to compare. ``least`` is the proven lower bound minus the
-    larger one, if known: above 0, no strategy can bring the smaller one below the larger one.
+    A statement can need several of them, for example one for each group of worlds.
     """
 
-    where: str
-    difference: Estimate
-    neither: bool = False
+    where: str  # worlds or strategies that are compared, in words
+    difference: Estimate  # smaller quantity minus larger one; below 0 if the statement is right
+    neither: bool = False  # True if both are 0 in every world, so that nothing is left to compare
+    # proven lower bound minus the larger quantity; above 0, no strategy can make the statement right. None: no bound
     least: Estimate | None = None
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Compare two samples from different worlds."""
+        """Compare two samples from different worlds: is ``smaller`` [n] below ``larger`` [m] on average?
+
+        ``where`` says in words what is compared.
+        """
         return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
 
     @classmethod
     def of_harms(cls, where: str, harm: Mapping[str, Floats], smaller: str, larger: str) -> Less:
-        """Compare the harm of two strategies in the same worlds, with the proven lower bound."""
+        """Compare the harm of two strategies in the same worlds, with the proven lower bound.
+
+        ``harm`` maps strategies to their harm [n]; ``smaller`` and ``larger`` are names of strategies; ``where``
+        describes the comparison.
+        """
         low, high = harm[smaller], harm[larger]
         least = paired_difference(harm[PROVEN], high) if PROVEN in harm else None
         return cls(where, paired_difference(low, high), not low.any() and not high.any(), least)
 
 
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
-    """Judge whether every comparison of a statement comes out below 0 (or at most 0) with its interval."""
+    """Return a verdict on a statement of the paper: it agrees if the interval of every comparison lies below 0.
+
+    Args:
+        what: the statement.
+        parts: its comparisons.
+        or_equal: True: a difference of 0 also agrees.
+        show: format of the differences.
+
+    """
     compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]
     places = ", ".join(ties) if len(ties) <= 2 else f"{len(ties)} more"
     if not compared:
@@ -164,7 +186,7 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
 
 
 def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
-    """Summarise all verdicts of an item in one line: the number of each outcome, and the first of the worst."""
+    """Return one verdict on an item from all its verdicts: the number of each outcome, and the first of the worst."""
     if not verdicts:
         return Verdict("all", "not run", "nothing was compared")
     counted = {outcome: sum(each.outcome == outcome for each in verdicts) for outcome in get_args(Judgement)}

@@ -22,16 +22,16 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Searched(AgentAround):
-    """Agent that searches around the policy's own episode at the alert and then plays the best commands it found.
+    """Agent that searches around another agent's episode at the alert and then plays the best commands it found.
 
     It knows the model of the line and the other vehicles' scripts, and does not react to anything unexpected.
     ``predicted_harm`` [n] (m2/s2) is never above the policy's own harm, and equals the simulated harm exactly if the
-    others follow their scripts. The commands of a world do not depend on its batch. Raises ``InvalidInput`` for an
-    object that is not an agent, a number of candidates outside 1 to 1,000,000 and, when an episode begins, another
-    vehicle's script whose command is not fixed at the alert.
+    others follow their scripts. Raises ``InvalidInput`` for an object that is not an agent, a number of candidates
+    outside 1 to 1,000,000 and, when an episode begins, another vehicle's script whose command is not fixed at the
+    alert.
 
     Args:
-        policy: any agent.
+        policy: the agent around whose episode it searches.
         scenario: the scenario in which it searches.
         candidates: number of candidates in each world.
         harm_count: harm to minimise, ``first`` or ``total``.
@@ -58,7 +58,14 @@ class Searched(AgentAround):
         self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Search in these worlds and return the commands as memory."""
+        """Simulate the policy's episode from the alert, search around it, and return the best commands as memory.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the controlled vehicle.
+            scripts: scripts of the other vehicles, by index.
+
+        """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         own = record_commands(self.policy, alert, self.scenario, vehicle, int(problem.last_step.max()))
@@ -70,12 +77,22 @@ class Searched(AgentAround):
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the present step, [n] m/s2."""
+        """Return the command of the present step, [n] m/s2, and the unchanged memory.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: result of ``begin``.
+            vehicle: not used.
+
+        """
         return self._outlook.command(worlds, memory), memory
 
 
 def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Return ``+search`` around an agent. It takes no argument."""
+    """Return the agent ``+search``, which searches around the episode of ``policy``.
+
+    ``argument`` must be None; ``settings`` hold the scenario and the harm to minimise.
+    """
     return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
 

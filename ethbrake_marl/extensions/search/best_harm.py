@@ -53,14 +53,24 @@ def best_harm(
     threads: int | None = None,
     known: BestHarmTable | None = None,
 ) -> BestHarmTable:
-    """Search every world (at t = 0) for the profiles of least harm, once per count.
+    """Search every world for the command profiles of least harm, once per harm count; return them as a table.
 
-    ``vehicles`` are the controlled ones (default: the scenario's learners); all others follow their scripts. With both
-    counts, each may take the other's result. The result is never worse than the best constant deceleration of a
-    controlled vehicle (with the other controlled ones braking fully), than the same search with one of them alone, or
-    than ``known`` (a table for these vehicles), with which the search then starts. It does not depend on ``threads``
-    (default: every core) or on the batch. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed
-    at the alert, no count, or a budget below 1.
+    With both counts, the profile found for one also replaces the other's if it does less harm there. The result is
+    never worse than the best constant deceleration of one controlled vehicle while the others brake fully, than the
+    same search for one controlled vehicle alone, or than ``known``. It does not depend on ``threads`` or on the other
+    worlds. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed at the alert, no count, or a
+    budget below 1.
+
+    Args:
+        scenario: the scenario of the worlds.
+        worlds: the worlds at t = 0, [n].
+        counts: harm counts to minimise: ``first``, ``total``, or both.
+        vehicles: indices of the controlled vehicles; None: the scenario's learners. All others follow their scripts.
+        budget: candidates per world and count.
+        seed: seed of the random search.
+        threads: number of threads; None: one for each core.
+        known: a table for these vehicles, whose profiles the search starts with; None: no table.
+
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
         raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
@@ -109,13 +119,25 @@ def search_list(
     chunks: Path | None = None,
     on_progress: Progress | None = None,
 ) -> BestHarmTable:
-    """Run ``best_harm`` on a long list, ``CHUNK`` worlds at a time, resumable.
+    """Run ``best_harm`` on a long list, ``CHUNK`` worlds at a time; it can be interrupted and continued.
 
-    With a folder ``chunks``, each finished chunk is stored there as a file, and a later call with the same question
-    reads it. A file that answers another question is computed again and replaced. A world that the physics cannot
-    advance (a defect) is left out: no table holds it, and the header lists it under ``LEFT_OUT``. Raises
-    ``InvalidInput`` as ``best_harm`` does, and if ``known`` holds no world of the list; ``PhysicsError`` if no world is
-    left.
+    A world that the physics cannot advance (a defect) is left out: no table holds it, and the header lists it under
+    ``LEFT_OUT``. Raises ``InvalidInput`` as ``best_harm`` does, and if ``known`` holds no world of the list;
+    ``PhysicsError`` if no world is left.
+
+    Args:
+        scenario: the scenario of the list.
+        sample: the worlds of the list, with their numbers.
+        counts: harm counts to minimise: ``first``, ``total``, or both.
+        vehicles: indices of the controlled vehicles; None: the scenario's learners.
+        budget: candidates per world and count.
+        seed: seed of the random search.
+        threads: number of threads; None: one for each core.
+        known: a table whose profiles the search starts with; None: no table.
+        chunks: folder in which each finished chunk is stored as a file. A later call with the same arguments reads it;
+            a file of other arguments is computed again and replaced. None: nothing is stored.
+        on_progress: called with the number of worlds done and their total.
+
     """
     parts: list[BestHarmTable] = []
     left_out: dict[int, str] = {}
@@ -150,9 +172,17 @@ def search_list(
 def _kept_or_searched(
     task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
 ) -> BestHarmTable:
-    """Return the table of a chunk, from its file if that answers the same question, else by search.
+    """Return the table of a chunk: from its file if that was made with the same options, else by a new search.
 
-    ``rows`` are the chunk's rows in the list. A new table is stored in the file.
+    A new table is stored in the file.
+
+    Args:
+        task: scenario and controlled vehicles.
+        every: all worlds of the list.
+        file: file of the chunk; None: nothing is read or stored.
+        options: keywords of ``best_harm``.
+        rows: indices of the chunk's worlds in the list.
+
     """
     worlds = every.take(rows)
     known = options["known"]
@@ -171,7 +201,15 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Return how many worlds ``search_list`` would still search with both counts, and the damaged chunk files."""
+    """Return how many worlds ``search_list`` would still search with both counts, and the damaged chunk files.
+
+    Args:
+        scenario: the scenario of the list.
+        sample: the worlds of the list.
+        budget: candidates per world and count.
+        chunks: folder of the chunk files.
+
+    """
     left, damaged = 0, []
     identity = task_problem(sample.worlds, Task(scenario, scenario.learners)).identity
     question = {"counts": list(HARM_COUNTS), "budget": budget, "search_seed": 0}
@@ -187,12 +225,21 @@ def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path
 
 
 def chunk_file(chunks: Path, first: int) -> Path:
-    """Return the file of the chunk that begins with world ``first``."""
+    """Return the path of the chunk file in folder ``chunks`` that begins with world number ``first`` of the list."""
     return chunks / f"{first:07d}.npz"
 
 
 def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
-    """Return a stored chunk if it exists and answers this question. Raises ``CorruptBundle`` for a damaged one."""
+    """Return the stored table of a chunk, or None if there is no file or it was made for other worlds or options.
+
+    Raises ``CorruptBundle`` for a damaged file.
+
+    Args:
+        file: the chunk file.
+        identity: hash of each world of the chunk.
+        question: options of the search (counts, budget, seed), which must equal those in the header of the file.
+
+    """
     if not file.is_file():
         return None
     table = BestHarmTable.load(file)
@@ -201,18 +248,20 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
 
 
 def scripted_commands(worlds: Worlds, task: Task) -> Floats:
-    """Return the commands [n, N] of all vehicles except those of the task, whose columns hold full braking.
+    """Return the commands [n, N] (m/s2) of all vehicles that follow scripts; controlled vehicles have full braking
+    instead.
 
-    Raises ``InvalidInput`` for a script whose command is not fixed at the alert.
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert. ``task`` names the controlled
+    vehicles.
     """
     others = {i: script for i, script in script_agents(task.scenario).items() if i not in task.vehicles}
     return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
 
 
 def task_problem(worlds: Worlds, task: Task) -> ProfileProblem:
-    """Return the problem of choosing the profiles of the task's vehicles in worlds at t = 0.
+    """Return the search problem for a task: choose the command profiles of its controlled vehicles in worlds at t = 0.
 
-    Its ``identity`` distinguishes a world from any other; it does not depend on the count.
+    Its ``identity`` [n] is a hash of everything that affects a world's harm; it does not depend on the harm count.
     """
     return _problem(worlds, task, scripted_commands(worlds, task), task.vehicles)
 
@@ -229,7 +278,17 @@ def _searched(
     worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
     effort: dict[str, int],
 ) -> Found:  # fmt: skip
-    """Return the best profiles of a search that starts with constants, ``given``, and each vehicle's own best."""
+    """Return the best profiles of a search in each world, and their harm under each count.
+
+    Args:
+        worlds: the worlds at t = 0, [n].
+        task: scenario, controlled vehicles and harm to minimise.
+        others: [n, N] commands of the vehicles that follow scripts, m/s2.
+        given: profiles to start with, besides constants and each vehicle's own best.
+        deciders: indices of the vehicles whose latency decides when decisions fall.
+        effort: keywords ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
+
+    """
     problem = _problem(worlds, task, others, deciders)
     starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
     if len(task.vehicles) == 1:
@@ -252,7 +311,10 @@ def _searched(
 
 
 def _startable(profiles: Profiles) -> Profiles:
-    """Replace profiles with too many phases for a search by their first command, held to the end."""
+    """Return profiles that a search can start with.
+
+    A profile with too many phases (times of constant command) is replaced by its first command, held to the end.
+    """
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
     short = ends[:, MOST_PHASES - 1 : MOST_PHASES] == last
@@ -263,7 +325,7 @@ def _startable(profiles: Profiles) -> Profiles:
 
 
 def _joined(parts: list[Profiles], n: int) -> Profiles:
-    """Join several sets of profiles, [n * Q_j] each, into one list [n * Q], world by world."""
+    """Join several sets of profiles, [n * Q_j] each, into one set [n * Q]: all profiles of world 0 first, and so on."""
     parts = Profiles.padded(parts, MOST_PHASES)
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
     shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
@@ -272,9 +334,15 @@ def _joined(parts: list[Profiles], n: int) -> Profiles:
 
 
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
-    """Return the commands of ``agent`` in every step of its episodes as profiles.
+    """Return the commands that ``agent`` gives in its episodes as profiles [n]; neighbouring steps with equal commands
+    become one phase (time of constant command).
 
-    Equal neighbouring steps are joined into one phase.
+    Args:
+        agent: agent of the task's vehicle.
+        worlds: the worlds at t = 0, [n].
+        task: scenario and controlled vehicle.
+        last_step: [n] number of steps of each episode.
+
     """
     commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
     # one phase for each change of command
@@ -289,12 +357,21 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Return the table after replacing values that the episodes of ``agents`` undercut; the header counts the worlds.
+    """Return the table, lowered to the harm of agents' episodes in all worlds where an agent does less harm than the
+    table says.
 
-    ``agents`` holds for each count the agent ``name``, made to minimise it. Each controls the scenario's learner in
-    ``worlds`` (at t = 0; worlds with known harm 0 are skipped), and each count may take either episode. The harm is
-    that of the profiles when driven again. Where an agent cannot drive a world to its end, the table stays unchanged.
-    Raises ``InvalidInput`` unless the scenario has exactly one learner.
+    The header counts these worlds. The harm is that of the recorded commands when played again. Where an agent cannot
+    control a world to its end, the table stays unchanged. Raises ``InvalidInput`` unless the scenario has exactly one
+    learner.
+
+    Args:
+        table: the table to improve.
+        scenario: the scenario of the worlds.
+        worlds: the worlds at t = 0; worlds with known harm 0 are skipped.
+        name: name of the agent, for the header.
+        agents: for each harm count, the agent made to minimise it. Every episode is compared with the table under both
+            counts.
+
     """
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
     check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")

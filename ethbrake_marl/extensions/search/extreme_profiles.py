@@ -40,11 +40,18 @@ _PHASES = 5  # before the first change, its step, until the second change, its s
 
 
 def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
-    """Return the ``KEPT`` best extreme profiles of the one controlled vehicle, [n * KEPT], world by world.
+    """Return the ``KEPT`` best extreme profiles of the one controlled vehicle, [n * KEPT], all of world 0 first, and so
+    on.
 
-    ``states`` [n, WIDTH] is each world at the first decision, in the columns of the lower bound. It is only used to
-    find when two vehicles would meet, so a neighbour that does not brake fully makes the profiles less good, not wrong.
-    ``has_front`` and ``has_rear`` [n] say which neighbours exist.
+    An *extreme* profile changes between full drive and full braking. ``states`` is used only to find when two vehicles
+    would meet, as if neighbours braked fully. If they do not, the profiles are worse but still valid.
+
+    Args:
+        problem: the worlds, with the commands of the other vehicles and the harm to minimise.
+        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
+        has_front: [n] True if a vehicle is ahead.
+        has_rear: [n] True if a vehicle is behind.
+
     """
     n, last = problem.n, problem.last_step
     ends = np.repeat(last, KEPT * MOST_PHASES).reshape(n, KEPT, MOST_PHASES)
@@ -57,7 +64,17 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 def _fill_extremes(
     problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
 ) -> None:
-    """Fill ``ends`` [n, KEPT, K] and ``commands`` [n, KEPT, K, 1] with the best extreme profiles of each world."""
+    """Compute the best extreme profiles (full drive and full braking) of each world.
+
+    Args:
+        problem: the worlds, with the commands of the other vehicles and the harm to minimise.
+        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
+        has_front: [n] True if a vehicle is ahead.
+        has_rear: [n] True if a vehicle is behind.
+        ends: [n, KEPT, K] receives the steps at which the phases end.
+        commands: [n, KEPT, K, 1] receives the commands of the phases, m/s2.
+
+    """
     no_random = np.zeros(states.shape[0], np.uint64)
     for k in range(states.shape[0]):
         world = make_search_world(problem, k, no_random)
@@ -75,7 +92,22 @@ def try_changes(
     world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
     values: Floats,
 ) -> float:  # fmt: skip
-    """Try first changes of command from ``low`` to ``high`` (s), keep the best profiles, and return the best change."""
+    """Simulate profiles whose first change of command lies between ``low`` and ``high`` (s), and keep the best ones.
+
+    Returns the time of the first change with the least harm (s).
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        kind: ``FRONT_FIRST`` or ``REAR_FIRST``: the neighbour to meet.
+        at: the world at the first decision, an array with the columns of ``proofs.line.LINE``.
+        start: [S] state of the simulation at the first decision.
+        low: earliest first change, s.
+        high: latest first change, s.
+        ends: [KEPT, K] ends of the best profiles so far, in steps; changed in place.
+        commands: [KEPT, K, 1] their commands, m/s2; changed in place.
+        values: [KEPT] their harm, m2/s2; changed in place.
+
+    """
     plan, other = empty_plan(), empty_plan()
     states = np.zeros((_PHASES + 1, start.shape[0]))
     copy_rows(start.reshape(1, -1), states, 1)
@@ -104,11 +136,21 @@ def try_changes(
 def fill_extreme(
     world: SearchWorld, kind: int, change: float, meeting: float, early: int, share: float, ends: Ints, commands: Floats
 ) -> None:
-    """Write one profile, with the other command from ``change`` to ``meeting`` (s).
+    """Write one profile: a first command, the opposite one from ``change`` to ``meeting``, then the first one again.
 
-    In the step of the first change, the command leads to the speed that the change in mid-step would. In the step of
-    the second change the first command has the weight ``share``. ``early`` moves the second change earlier by that many
-    steps.
+    Commands can change only between steps. If ``change`` lies within a step, that step gets the mean command, so that
+    the speed after it is the same.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        kind: ``FRONT_FIRST``: drive first; ``REAR_FIRST``: brake first.
+        change: time of the first change, s.
+        meeting: time of the second change, s.
+        early: number of steps by which the second change comes earlier.
+        share: weight of the first command in the step of the second change, 0 to 1.
+        ends: [5] receives the steps at which the phases end.
+        commands: [5, 1] receives the commands, m/s2.
+
     """
     low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]
     last = int(world.episode.clock[CLOCK.LAST_STEP])

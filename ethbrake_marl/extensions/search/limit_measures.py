@@ -10,7 +10,7 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.agent_tally import AgentTally
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import HELD
-from ethbrake_marl.evaluation.measures import BASELINE, GroupColumn, Measure, MeasureSet, Silent
+from ethbrake_marl.evaluation.measure_sets import BASELINE, GroupColumn, Measure, MeasureSet, Silent
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import KNOWN_OF_WORLDS, Between, Regrets, limits_of, regrets_of
@@ -24,7 +24,7 @@ KNOWN, BELOW = "known", "below_best_known"
 class LimitMeasures(MeasureSet):
     """Measures of unavoidable contact, best known harm, and each agent's distance from it.
 
-    The context is ``Regrets``.
+    Their context is a ``Regrets`` object: the best known harm of every world.
     """
 
     measures = (
@@ -111,7 +111,7 @@ class LimitMeasures(MeasureSet):
     not_in_long_lists = f"a list of more than {HELD:,} worlds is driven without proofs"
 
     def prepare(self, evaluation: Evaluation) -> Regrets | Silent:
-        """Return the best known harm of every world, or ``Silent`` if nothing is proven."""
+        """Return the best known harm of every world, or ``Silent`` with the reason if nothing is proven."""
         limits, regrets = limits_of(evaluation), regrets_of(evaluation)
         if isinstance(limits, Unproven):
             return Silent(limits.because)
@@ -119,9 +119,17 @@ class LimitMeasures(MeasureSet):
         return regrets
 
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
-        """Return the share of worlds with a best known harm, and the number of worlds where the agent is below it.
+        """Return further values of one agent's row, by name.
 
-        Also returns the summary of worlds with proven contact but no proven impact (``Between``).
+        ``known_best_share`` is the share of worlds with a best known harm, ``below_best_known`` the number of worlds
+        where the agent is below it, ``best_known_warning`` a warning or None, and ``impact_unproven`` the summary of
+        worlds with proven contact but no proven impact (``Between``).
+
+        Args:
+            tally: counts and means of the agent.
+            worlds: number of worlds.
+            context: result of ``prepare``.
+
         """
         between = None if isinstance(context, Silent) else context.between
         return {
@@ -132,12 +140,19 @@ class LimitMeasures(MeasureSet):
         }
 
     def warnings(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return the warning that a table of best known harm covers only some of the worlds."""
+        """Return the warning that a table of best known harm covers only some of the worlds, as a list; empty if there
+        is none.
+
+        ``rows`` are the summaries of the agents.
+        """
         warning = rows[0].more[NAME]["best_known_warning"]
         return [warning] if warning else []
 
     def notes(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return a note on unavoidable harm and the best known harm; nothing if nothing is proven."""
+        """Return a note on unavoidable harm and the best known harm, as a list; empty if nothing is proven.
+
+        ``rows`` are the summaries of the agents.
+        """
         row, first, total = rows[0], rows[0]["best_known_first_impact_harm"], rows[0]["best_known_total_harm"]
         if first is None or total is None:
             return []
@@ -155,7 +170,9 @@ class LimitMeasures(MeasureSet):
 
 
 def _unavoidable(row: SummaryRow) -> str:
-    """Describe in how many worlds contact and impact are proven, and the worlds between the two."""
+    """Return a sentence on the shares of worlds with proven contact and proven impact, and on the worlds between the
+    two.
+    """
     vehicle = row.parameters.get("controlled_vehicle")
     command = f"command of {str(vehicle).replace('vehicle_', 'Vehicle ')}" if vehicle else "joint command"
     share = Column("", digits=1, scale=100.0, unit=" %")
@@ -168,7 +185,9 @@ def _unavoidable(row: SummaryRow) -> str:
 
 
 def _best(row: SummaryRow, first: float, total: float) -> str:
-    """Describe the best known harm and the proven bound."""
+    """Return a sentence on the best known harm (``first`` and ``total``, mean in m2/s2), the proven bound, and their
+    gap.
+    """
     least = 0.0 if row["proven_harm"] is None else row["proven_harm"].value
     gaps = [
         f"{best - least:.2f} ({f'{100 * (best - least) / best:.1f} %' if best > 0.0 else DASH})"

@@ -22,19 +22,19 @@ _DECIDED = ({1}, {1, 2})  # controlled vehicles, of three, for which avoidabilit
 
 
 class IncompleteTable(UserWarning):
-    """Warning that a table of best known harm covers only some of the worlds."""
+    """Warning that a table of best known harm covers only some of the worlds of an evaluation."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unproven:
-    """Result instead of a proof if nothing is proven for a task in these worlds, with the reason."""
+    """Result in place of a proof if nothing is proven for a task in these worlds."""
 
-    because: str  # reason, as a clause
+    because: str  # the reason, as a clause such as "brakes build up; nothing is proven then"
 
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """What is proven about each world, [n] each."""
+    """Proven facts about each world, [n] each."""
 
     avoidable: Bools | None  # True if some command avoids all contact; None if not decided
     reason: NDArray[np.str_] | None  # reason if unavoidable: "early", "front" or "rear"; "" if avoidable
@@ -42,31 +42,32 @@ class Proof:
 
     @property
     def impact(self) -> Bools:
-        """Worlds in which every command leads to an impact, not only to contact."""
+        """True where no sequence of commands avoids an impact (contact with a closing speed above 0), [n]."""
         return np.asarray(self.harm > 0.0, np.bool_)
 
     @property
     def contact(self) -> Bools | None:
-        """Worlds in which every command leads to contact; None if not decided."""
+        """True for worlds in which every command leads to contact, [n]; None if not decided."""
         return None if self.avoidable is None else ~self.avoidable
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What is known about each world before any agent drives, [n] each."""
+    """Proofs and best known harm of each world before any agent drives, [n] each."""
 
-    proof: Proof
-    first_impact_harm: Floats  # best known (m2/s2): 0 if avoidable, else from a table; NaN if in no table
-    total_harm: Floats  # likewise for total harm
+    proof: Proof  # the proven facts
+    # best known first-impact harm (m2/s2): 0 if contact is avoidable, else from a table; NaN if in no table
+    first_impact_harm: Floats
+    total_harm: Floats  # best known total harm (m2/s2), likewise
 
     @property
     def known(self) -> Bools:
-        """Worlds whose best harm is known for both counts without any agent."""
+        """True for worlds whose best harm is known for both counts without any agent, [n]."""
         return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
     @property
     def warning(self) -> str:
-        """Clause that a table covers only some of the worlds; empty if it covers all or none of them."""
+        """Warning text if a table covers only some of the worlds; empty if it covers all or none of them."""
         known, avoidable = self.known, self.proof.avoidable
         listed = known if avoidable is None else known & ~avoidable
         missing = int((~known).sum())
@@ -83,7 +84,11 @@ class Limits:
 
 
 def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
-    """Return the limits of worlds at the alert; ``Unproven`` if the proofs do not cover the task."""
+    """Return the proven facts and the best known harm of worlds at the alert; ``Unproven`` if the proofs do not cover
+    the task.
+
+    ``task`` names the scenario and the controlled vehicles.
+    """
     proof = prove(worlds, task)
     if isinstance(proof, Unproven):
         return proof
@@ -94,7 +99,10 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
 
 
 def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
-    """Return the proofs for worlds at the alert; ``Unproven`` if they do not cover the task."""
+    """Return the proofs for worlds at the alert; ``Unproven`` if they do not cover the task.
+
+    ``task`` names the scenario and the controlled vehicles.
+    """
     because = unproven_because(worlds, task)
     if because is not None:
         return Unproven(because)
@@ -112,7 +120,10 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
-    """Return why nothing is proven for the task in these worlds, as a clause; None if something is."""
+    """Return the reason why nothing is proven for the task in these worlds, as a clause; None if something is proven.
+
+    ``task`` names the scenario and the controlled vehicles.
+    """
     if worlds.vehicles.in_pieces.any() or (_is_team(task) and worlds.vehicles.build_up.any()):
         return _uneven_because(worlds)
     if not _is_team(task):
@@ -121,12 +132,17 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
-    """Return why it is not decided whether contact can be avoided, as a clause; None if it is."""
+    """Return the reason why it is not decided whether contact can be avoided, as a clause; None if it is decided.
+
+    ``worlds`` are at the alert; ``task`` names the scenario and the controlled vehicles.
+    """
     return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
 
 
 def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason of ``undecided_because``, without the check for brake build-up."""
+    """Return the reason why ``avoidability`` does not cover the task, as a clause; None if it does. Ignores brake
+    build-up.
+    """
     scenario, names = task.scenario, task.scenario.vehicle_names
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
         return f"driven are: {task.names}; avoidability is proven for one vehicle"
@@ -153,7 +169,7 @@ def _uneven_because(worlds: Worlds) -> str:
 
 
 def _is_team(task: Task) -> bool:
-    """Return whether the task needs ``team_bound``.
+    """Return whether the task needs the bound for teams, ``team_bound``.
 
     That is so for several controlled vehicles, and for more vehicles than ``lower_bound`` covers.
     """
@@ -161,7 +177,11 @@ def _is_team(task: Task) -> bool:
 
 
 def _script_because(task: Task, proven: str) -> str | None:
-    """Return that a vehicle follows another script than full_brake, as a clause; None if none does."""
+    """Return a clause that names a vehicle which follows another script than full_brake; None if there is none.
+
+    ``task`` names the scenario and the controlled vehicles; ``proven`` is the subject of the clause, for instance
+    "avoidability is proven".
+    """
     scenario = task.scenario
     for i in range(scenario.vehicles):
         script = scenario.scripts.get(i, "full_brake")

@@ -26,11 +26,11 @@ MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """How an agent looks ahead: which harm counts, how far, and at which decisions."""
+    """Settings of an agent that looks ahead, and the methods with which it decides when to plan and what to command."""
 
-    harm_count: HarmCount
-    horizon_s: float
-    time_step_s: float
+    harm_count: HarmCount  # harm to minimise: ``first`` or ``total``
+    horizon_s: float  # time up to which it looks ahead, s
+    time_step_s: float  # time between two decisions, s
 
     @property
     def decisions(self) -> int:
@@ -38,26 +38,40 @@ class Outlook(NamedTuple):
         return int(np.ceil(self.horizon_s / self.time_step_s)) + 1
 
     def problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
-        """Return the problem of choosing the vehicle's profile from now on."""
+        """Return the search problem: choose the command profile of ``vehicle`` from the present time of ``worlds`` on.
+
+        ``others_mps2`` [n, N] are the commands of the other vehicles.
+        """
         return profile_problem(
             worlds, [vehicle], harm_count=self.harm_count, horizon_s=self.horizon_s, time_step_s=self.time_step_s,
             others_mps2=others_mps2,
         )  # fmt: skip
 
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
-        """Return the worlds that need a new plan: something moves, and a decision was due since the last plan."""
+        """Return the indices of worlds that need a new plan: something moves, and a decision was due since the last
+        plan.
+
+        ``planned_s`` [n] is the time of the last plan, s.
+        """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
         return np.flatnonzero((worlds.time_s > planned_s) & (worlds.time_s < self.horizon_s) & moving)
 
     def command(self, worlds: Worlds, memory: Memory) -> Floats:
-        """Return the present command, [n], from ``commands_mps2`` [n, decisions], which start at ``start_s``."""
+        """Return the present command in each world, [n] m/s2.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: holds ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n], the time
+                of the first one.
+
+        """
         step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
         now: Floats = memory["commands_mps2"][np.arange(worlds.n), np.clip(step, 0, self.decisions - 1)]
         return now
 
 
 def budget_of(argument: str) -> int | None:
-    """Return the argument as a number of candidates, or None if it is not a valid number."""
+    """Return ``argument`` as a number of candidates (1 to ``MOST_CANDIDATES``), or None if it is not such a number."""
     number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     return number if 1 <= number <= MOST_CANDIDATES else None
 
@@ -74,10 +88,10 @@ class Planner:
     argument or count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
 
     Args:
-        argument: candidates per world and decision.
+        argument: number of candidates per world and decision, as text; None: ``CANDIDATES``.
         harm_count: harm to minimise, ``first`` or ``total``.
         horizon_s: time up to which it looks ahead, s.
-        most_candidates: upper limit of the number of candidates, whatever ``argument`` says.
+        most_candidates: upper limit of the number of candidates, whatever ``argument`` says; None: no limit.
         time_step_s: time between two decisions, s.
 
     >>> import ethbrake_marl as eb
@@ -112,7 +126,14 @@ class Planner:
         self._outlook = Outlook(harm_count, horizon_s, time_step_s)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Make the first plan of these episodes."""
+        """Make the first plan of these episodes, and return the memory.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the controlled vehicle.
+            scripts: scripts of the other vehicles, by index.
+
+        """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem = self._outlook.problem(alert, vehicle, others)
         pairwise = -optimise_pairwise(alert, vehicle).deceleration_mps2
@@ -121,7 +142,15 @@ class Planner:
         return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the first command of the new plans, [n] m/s2."""
+        """Return the first command of each world's plan, [n] m/s2, and the new memory. A new plan is searched where a
+        decision is due.
+
+        Args:
+            worlds: the worlds now, [n].
+            memory: memory from ``begin`` or the previous ``act``.
+            vehicle: index of the controlled vehicle.
+
+        """
         rows = self._outlook.due(worlds, memory["planned_s"])
         if rows.size:
             now, held = worlds.take(rows), take_memory(memory, rows)
@@ -131,7 +160,14 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """Return the rest of the plans from ``time_s`` on."""
+        """Return the part of each stored plan that is still ahead, as profiles [m] for the new problem.
+
+        Args:
+            held: memory of the worlds that plan again.
+            time_s: [m] present time, s.
+            problem: the search problem from that time on.
+
+        """
         plan = Profiles(*held["plan"])
         passed = np.rint((time_s - held["planned_s"]) / self._outlook.time_step_s).astype(np.int64)[:, np.newaxis]
         ends = np.minimum(np.maximum(plan.ends - passed, 0), problem.last_step[:, np.newaxis])
@@ -139,7 +175,9 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Return the best plans from a search that starts with ``plan`` and constants, and their harm."""
+        """Return the best plan of each world, and its harm [n] (m2/s2), from a search that starts with ``plan`` and
+        constants.
+        """
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
@@ -151,7 +189,7 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``planner`` or ``planner:CANDIDATES``."""
+    """Make the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of candidates, or None."""
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -159,7 +197,10 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``planner:believed`` or ``planner:CANDIDATES:believed``, which searches in the estimated world."""
+    """Make the agent ``planner:believed`` or ``planner:CANDIDATES:believed``, which searches in the estimated world.
+
+    ``argument`` is the number of candidates, or None.
+    """
     return Believing(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 

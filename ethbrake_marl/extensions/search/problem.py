@@ -16,7 +16,7 @@ _MIX = 0xD1342543DE82EF95  # odd multiplier that spreads seeds over 64 bits
 
 
 def seeded(identity: UInt64s, seed: int) -> UInt64s:
-    """Return the initial random state of each world, [n], from its identity and the seed alone."""
+    """Return the initial random state of each world, [n], from its hash ``identity`` [n] and the seed alone."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * _MIX) % 2**64)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -28,11 +28,19 @@ Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
 def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
-    """Return the best profiles, of at most ``MOST_PHASES`` phases, that about ``budget`` candidates per world find.
+    """Return the best command profile of each world that the search finds, and its harm [n] (m2/s2) under each count.
 
-    Also returns their harm [n] under each count (m2/s2), as the engine counts it. ``given`` [n * Q] holds Q profiles of
-    each world, world by world, with which the search starts; the result is never worse than any of them. Raises
-    ``InvalidInput`` for a budget below 1, and ``PhysicsError`` with the worlds in which no profile could be followed.
+    A profile has at most ``MOST_PHASES`` phases of constant command. The result is never worse than any profile of
+    ``given``. Raises ``InvalidInput`` for a budget below 1, and ``PhysicsError`` with the worlds in which no profile
+    could be followed.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        given: [n * Q] starting profiles: the Q profiles of world 0 first, then those of world 1, and so on.
+        budget: approximate number of candidates per world.
+        seed: seed of the random search.
+        threads: number of threads.
+
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)

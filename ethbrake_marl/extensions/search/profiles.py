@@ -35,7 +35,7 @@ CHANGE_WIDTH = 4
 
 @compiled
 def draw(random: UInt64s) -> float:
-    """Return the next number of the stream, uniform in [0, 1). The generator is splitmix64; its state is one word."""
+    """Return the next random number, uniform in [0, 1), of a splitmix64 generator whose state is ``random`` [1]."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -46,20 +46,23 @@ def draw(random: UInt64s) -> float:
 
 @compiled
 def draw_below(random: UInt64s, n: int) -> int:
-    """Return a random whole number from 0 to n - 1."""
+    """Return a random whole number from 0 to n - 1. ``random`` [1] is the state of the random stream."""
     return min(int(draw(random) * n), n - 1)
 
 
 @compiled
 def allowed(command: float, low: float, high: float) -> float:
-    """Return the command within its bounds, rounded toward 0 to the resolution."""
+    """Return ``command`` cut to ``low`` and ``high`` (m/s2), rounded toward 0 to a multiple of 1 / 2^20."""
     command = min(max(command, low), high)
     return int(command * RESOLUTION) / RESOLUTION
 
 
 @compiled
 def draw_command(random: UInt64s, low: float, high: float) -> float:
-    """Return a random command: often a bound or 0, else a uniform value between the bounds."""
+    """Return a random command (m/s2): often ``low``, ``high`` or 0, else a uniform value between them.
+
+    ``random`` [1] is the state of the random stream.
+    """
     u = draw(random)
     if u < 0.35:
         return low
@@ -72,11 +75,18 @@ def draw_command(random: UInt64s, low: float, high: float) -> float:
 
 @compiled
 def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -> bool:
-    """Change a profile in place. Return False if nothing changed.
+    """Apply one change to a profile, in place. Return False if it had no effect.
 
-    COMMAND_CHANGE adds to one command. TRADE also changes the next command, so that the speed after both phases stays
-    and only the position changes. SET_COMMAND replaces a command. MOVE_END moves the border between two phases by whole
-    steps.
+    Kinds of change: COMMAND_CHANGE adds to one command. TRADE also changes the next command, so that the speed after
+    both phases stays and only the position changes. SET_COMMAND replaces a command. MOVE_END moves the border between
+    two phases by whole steps.
+
+    Args:
+        change: [CHANGE_WIDTH] columns KIND, VEHICLE, PHASE and AMOUNT (m/s2, or steps).
+        bounds: [C, 2] least and largest command of each vehicle, m/s2.
+        ends: [K] steps at which the phases end; changed in place.
+        commands: [K, C] commands of the phases, m/s2; changed in place.
+
     """
     kind, c, k, amount = int(change[KIND]), int(change[VEHICLE]), int(change[PHASE]), change[AMOUNT]
     low, high, before = bounds[c, 0], bounds[c, 1], commands[k, c]
@@ -104,7 +114,15 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
 
 @compiled
 def compact(ends: Ints, commands: Floats, phases: int) -> int:
-    """Remove empty phases and join equal neighbours among the first ``phases``, in place; return how many are left."""
+    """Remove empty phases (times of constant command) of a profile and join neighbouring ones with equal commands, in
+    place; return how many are left.
+
+    Args:
+        ends: [K] steps at which the phases end.
+        commands: [K, C] commands of the phases, m/s2.
+        phases: number of phases in use before.
+
+    """
     last, kept = ends[ends.shape[0] - 1], 0
     for k in range(phases):
         begin = ends[kept - 1] if kept > 0 else 0
@@ -142,10 +160,10 @@ ATTENTION_STEPS = 30  # number of first steps in which phases are divided
 
 
 class Population(NamedTuple):
-    """Profiles that are improved together (the *field*)."""
+    """Profiles that are improved together (the *field*). A profile has up to K phases of constant command."""
 
-    ends: Ints  # [M, K]
-    commands: Floats  # [M, K, C]
+    ends: Ints  # [M, K] steps at which the phases end
+    commands: Floats  # [M, K, C] commands of the C controlled vehicles in each phase, m/s2
     phases: Ints  # [M] number of phases in use; 0 for an empty place
     values: Floats  # [M] harm to minimise (m2/s2)
 
@@ -154,10 +172,19 @@ class Population(NamedTuple):
 def search_world(
     world: SearchWorld, start: Floats, seed_ends: Ints, seed_commands: Floats, budget: int, ends: Ints, commands: Floats
 ) -> int:
-    """Fill ``ends`` [K] and ``commands`` [K, C] with the best profile of the search; return its number of phases.
+    """Search for the best profile of one world and write it to ``ends`` and ``commands``; return its number of phases.
 
-    ``start`` [S] is the state at the first decision. ``seed_ends`` [Q, K] and ``seed_commands`` [Q, K, C] are starting
-    profiles; the result is never worse than any of them. Returns 0 if no profile could be followed.
+    The result is never worse than any starting profile. Returns 0 if no profile could be followed.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        start: [S] state at the first decision.
+        seed_ends: [Q, K] steps at which the phases of the Q starting profiles end.
+        seed_commands: [Q, K, C] their commands, m/s2.
+        budget: number of candidates to simulate.
+        ends: [K] receives the steps at which the phases end.
+        commands: [K, C] receives the commands, m/s2.
+
     """
     K, C = commands.shape
     states = np.zeros((K + 1, start.shape[0]))
@@ -198,7 +225,9 @@ def search_world(
 
 @compiled
 def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
-    """Copy the phases of one profile over the first phases of another."""
+    """Copy one profile (``ends``, ``commands``) over the first phases (times of constant command) of another one
+    (``to_ends``, ``to_commands``).
+    """
     for k in range(ends.shape[0]):
         to_ends[k] = ends[k]
     copy_rows(commands, to_commands, commands.shape[0])
@@ -206,7 +235,18 @@ def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Float
 
 @compiled(apart=True)
 def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
-    """Improve a profile in place by random changes until ``budget`` candidates have run; return its value."""
+    """Improve a profile in place by random changes until ``budget`` candidates have run; return its harm, m2/s2.
+
+    The result is infinite if the profile could not be followed.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        ends: [K] steps at which the phases end; changed in place.
+        commands: [K, C] commands of the phases, m/s2; changed in place.
+        states: [K + 1, S] state at the start of each phase; row 0 is given.
+        budget: number of candidates to simulate.
+
+    """
     new_ends, new_commands, new_states = ends.copy(), commands.copy(), states.copy()
     change = np.zeros(CHANGE_WIDTH)
     value, active, spent, phase, again = math.inf, 0, -1, 0, False  # the first candidate is the profile itself
@@ -256,7 +296,17 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
 def gather(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Population
 ) -> None:
-    """Fill the field with the best of the starting profiles and of ``drawn`` random ones, all with different values."""
+    """Fill the field with the best of the starting profiles and of ``drawn`` random ones, all with different harm.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        seed_ends: [Q, K] steps at which the phases of the Q starting profiles end.
+        seed_commands: [Q, K, C] their commands, m/s2.
+        states: [K + 1, S] working memory: the state at the start of each phase; row 0 is the first decision.
+        drawn: number of random profiles.
+        field: receives the profiles.
+
+    """
     Q, K = seed_ends.shape
     last = int(world.episode.clock[CLOCK.LAST_STEP])
     ends, commands = np.zeros(K, np.int64), np.zeros(field.commands.shape[1:])
@@ -291,7 +341,7 @@ def gather(
 
 @compiled(apart=True)
 def sort(field: Population, left: int) -> None:
-    """Sort the first ``left`` places of the field by value."""
+    """Sort the first ``left`` profiles of the field by harm, in place."""
     for here in range(1, left):
         m = here
         while m > 0 and field.values[m] < field.values[m - 1]:
@@ -308,7 +358,7 @@ def sort(field: Population, left: int) -> None:
 
 @compiled
 def is_among(value: float, values: Floats) -> bool:
-    """Return whether one of ``values`` belongs to the same profile as this value."""
+    """Return whether ``value`` equals one of ``values`` up to ``SAME``, so that both belong to the same profile."""
     for other in values:  # noqa: SIM110  # any() is not compiled
         if abs(other - value) < SAME:
             return True
@@ -317,7 +367,7 @@ def is_among(value: float, values: Floats) -> bool:
 
 @compiled
 def largest(values: Floats) -> int:
-    """Return the index of the first largest value."""
+    """Return the index of the largest of ``values``; of several equal ones, the first."""
     place = 0
     for k in range(values.shape[0]):
         if values[k] > values[place]:
@@ -327,7 +377,16 @@ def largest(values: Floats) -> int:
 
 @compiled(apart=True)
 def divide(world: SearchWorld, field: Population) -> None:
-    """Divide phases of the best profile of the field until it has the largest number of phases."""
+    """Divide phases (times of constant command) of the best profile of the field, in place, until it has the largest
+    number of phases.
+
+    The longest phase is halved first. Only the first ``ATTENTION_STEPS`` steps of the episode count towards its length.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        field: the profiles that are improved together.
+
+    """
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
         K = field.ends.shape[1]
@@ -355,10 +414,19 @@ def divide(world: SearchWorld, field: Population) -> None:
 def select_stepwise(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
 ) -> None:
-    """Switch to stepwise advance, and put the best of the field and the starting profiles in the first place.
+    """Switch to stepwise simulation, and put the best of the field and the starting profiles in the first place of the
+    field.
 
-    Stepwise (decision by decision) gives the engine's rounding, which may decide on which side of a jump a profile
-    lands.
+    Stepwise simulation (decision by decision) rounds as the engine does. Where harm jumps, rounding may decide how much
+    harm a profile does.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        seed_ends: [Q, K] steps at which the phases of the Q starting profiles end.
+        seed_commands: [Q, K, C] their commands, m/s2.
+        states: [K + 1, S] working memory: the state at the start of each phase; row 0 is the first decision.
+        field: the profiles that are improved together.
+
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0
     Q, K = seed_ends.shape

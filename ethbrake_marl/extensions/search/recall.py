@@ -32,14 +32,22 @@ Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
 
 
 class BestHarm:
-    """Agent that drives the profile of least known harm, while the others follow their scripts (or else brake fully).
+    """Agent that plays the command profile of least known harm.
 
-    ``recall`` returns the stored profiles. A world without one is searched at the alert with ``budget`` candidates. If
-    no other vehicle of a given ``scenario`` learns, a second search with as many candidates starts from the better of
-    that result and the episode of ``universal``, so the harm is never above that policy's. Decisions come every
-    ``time_step_s`` from the vehicle's latency on. ``predicted_harm`` [n] equals the engine's harm (m2/s2) bit for bit
-    if the engine has this time step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and, when an
-    episode begins, for another vehicle's script whose command is not fixed at the alert.
+    A world without a stored profile is searched at the alert. If the ``scenario`` has no other learner, a second search
+    with as many candidates starts from the better of that result and the episode of ``universal`` (a trained policy in
+    the package), so the harm is never above that policy's. ``predicted_harm`` [n] (m2/s2) equals the engine's harm
+    exactly if the engine has the same time step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
+    when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+
+    Args:
+        recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+        scenario: scenario of the worlds; None: unknown, without the second search.
+        harm_count: harm to minimise, ``first`` or ``total``.
+        horizon_s: end of the episode, s.
+        budget: candidates in a world without a stored profile.
+        time_step_s: time between two decisions, s.
+
     """
 
     name = "best_harm"
@@ -63,9 +71,13 @@ class BestHarm:
 
     @classmethod
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
-        """Make ``best_harm`` or ``best_harm:CANDIDATES``.
+        """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``.
 
-        Raises ``InvalidInput`` for an argument that is not such a number.
+        Args:
+            argument: number of candidates, or None for the default; ``InvalidInput`` if it is not such a number.
+            settings: scenario, harm to minimise and other settings of agents.
+            recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+
         """
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
         if budget is None:
@@ -80,7 +92,14 @@ class BestHarm:
         )  # fmt: skip
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Look up these worlds, and search the unknown ones."""
+        """Look up the stored profiles of these worlds, search worlds without one, and return the commands as memory.
+
+        Args:
+            alert: the worlds at the alert, [n].
+            vehicle: index of the controlled vehicle.
+            scripts: scripts of the other vehicles, by index.
+
+        """
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
         profiles, known = self._recall(problem, outlook.harm_count)
@@ -98,11 +117,21 @@ class BestHarm:
         }
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command of the present step, [n] m/s2."""
+        """Return the command of the present step, [n] m/s2, and the unchanged memory.
+
+        Args:
+            worlds: the worlds now, [n]; only their time is read.
+            memory: result of ``begin``.
+            vehicle: not used.
+
+        """
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
-        """Return the best commands from a search in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2."""
+        """Return the best commands from a search in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2.
+
+        ``others`` [n, N] are the commands of the other vehicles, m/s2.
+        """
         problem, outlook = self._outlook.problem(worlds, vehicle, others), self._outlook
         coupled = optimise_coupled(
             worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
@@ -120,7 +149,7 @@ class BestHarm:
         return best, harm
 
     def _stepwise(self, profiles: Profiles) -> Floats:
-        """Return the commands of profiles decision by decision, [n, decisions] m/s2."""
+        """Return the command of each profile at each decision, [n, decisions] m/s2."""
         n = len(profiles.ends)
         steps = [profiles.at(np.full(n, step))[:, 0] for step in range(self._outlook.decisions)]
         return np.stack(steps, axis=1)

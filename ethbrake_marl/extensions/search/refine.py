@@ -54,19 +54,26 @@ NO_HARM = 1e-9  # m2/s2; less harm than this counts as none
 
 
 class Plan(NamedTuple):
-    """Commands of one world, and the states that they lead to."""
+    """Commands of one world in every step, and the states that they lead to."""
 
-    commands: Floats  # [T] command of each step
-    states: Floats  # [T + 1, S] state at the start of each step
+    commands: Floats  # [T] command of the controlled vehicle in each step, m/s2
+    states: Floats  # [T + 1, S] state of the simulation at the start of each step
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Search around ``commands_mps2`` [n, T] of the one controlled vehicle, with ``budget`` candidates per world.
+    """Search around given commands of the one controlled vehicle. Return the best commands [n, T] (m/s2) and their harm
+    [n].
 
-    Returns the best commands, never worse than the given ones, and their harm [n] under the problem's count, as the
-    engine counts it (m2/s2). Worlds are independent of each other. Raises ``InvalidInput`` for several vehicles,
-    commands of another shape or beyond a capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which
-    the given commands cannot be played.
+    The result is never worse than the given commands. Harm (m2/s2) is counted as the engine counts it. Worlds are
+    independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or beyond a
+    capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which the given commands cannot be played.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        commands_mps2: [n, T] command of each step to start from.
+        budget: candidates per world.
+        seed: seed of the random search.
+
     """
     check_whole_number("budget", budget, 1)
     n, steps = problem.n, int(problem.last_step.max(initial=0))
@@ -88,7 +95,18 @@ def _refine_worlds(
     problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
     failed: Bools,
 ) -> None:  # fmt: skip
-    """Improve ``commands`` [n, T] in place, and fill ``first`` and ``total`` harm [n] and ``failed`` worlds [n]."""
+    """Improve the commands of each world, in place.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        random: [n] initial state of each world's random stream.
+        budget: candidates per world.
+        commands: [n, T] commands of each step, m/s2; changed in place.
+        first: [n] receives the first-impact harm, m2/s2.
+        total: [n] receives the total harm, m2/s2.
+        failed: [n] receives True for worlds in which the commands cannot be played.
+
+    """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     mine, other = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     room = Plan(np.zeros(T), np.zeros((T + 1, S)))
@@ -107,7 +125,16 @@ def _refine_worlds(
 
 @compiled(apart=True)
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
-    """Improve ``mine`` in place. Return False if it cannot be played."""
+    """Improve the commands ``mine`` of one world in place. Return False if they cannot be played.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        mine: commands to improve.
+        other: working memory.
+        room: working memory.
+        budget: number of candidates.
+
+    """
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
     if reached < 0:
@@ -125,10 +152,17 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Play a plan from the start of step ``begin``, and fill its states. Return its value, and the number of steps.
+    """Play the commands of ``plan`` from a step on, and write its states. Return the harm (m2/s2) and the number of
+    steps.
 
-    Stops as soon as the value is not below ``bound``, because harm never falls. The number of steps is -1 if the
-    physics failed.
+    The number of steps is -1 if the physics failed.
+
+    Args:
+        world: the world, with the commands of the other vehicles.
+        plan: commands to play, with the state at step ``begin``; the later states are written.
+        begin: first step to play.
+        bound: harm at which to stop, m2/s2, because harm never falls.
+
     """
     table, clock = world.table, world.clock
     grid, restitution, total, last = (
@@ -154,9 +188,18 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
 @compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
-    """Improve a plan with this value in place, with ``budget`` candidates; return its value and number of steps.
+    """Improve ``plan`` in place by random changes; return its harm (m2/s2) and its number of steps.
 
-    A successful addition is repeated with twice the amount.
+    If adding an amount to the commands of some steps lowers the harm, twice the amount is tried next.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        plan: commands and states, already simulated.
+        room: working memory.
+        value: harm of the plan, m2/s2.
+        reached: number of its steps until the end of the episode.
+        budget: number of candidates.
+
     """
     low, high = world.bounds[0, 0], world.bounds[0, 1]
     longest = steps_in(world.episode, LONGEST_CHANGE_S)
@@ -197,9 +240,18 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
 
 @compiled(apart=True)
 def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
-    """Fill ``best`` with the best of some random templates; return its value and number of steps.
+    """Simulate random templates and write the best one to ``best``; return its harm (m2/s2) and its number of steps.
 
-    The number of steps is 0 if no template is below ``bound``.
+    A *template* is one command, another one for a short while, then full braking. The number of steps is 0 if no
+    template is below ``bound``.
+
+    Args:
+        world: the world, with its commands, bounds and random stream.
+        best: receives the best template.
+        room: working memory.
+        bound: harm that a template must be below, m2/s2.
+        number: number of templates.
+
     """
     low, high, T = world.bounds[0, 0], world.bounds[0, 1], room.commands.shape[0]
     attention, longest = steps_in(world.episode, ATTENTION_S), steps_in(world.episode, LONGEST_WHILE_S)
@@ -220,12 +272,14 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
 
 @compiled
 def steps_in(world: Episode, duration_s: float) -> int:
-    """Return how many steps fit into a duration, at least 1."""
+    """Return the number of decision steps in ``duration_s``, rounded to a whole number of at least 1. ``world`` holds
+    the length of a step.
+    """
     return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
 
 
 @compiled
 def copy_steps(commands: Floats, to: Floats, first: int) -> None:
-    """Copy the commands from step ``first`` on."""
+    """Copy the commands of one array to another, ``to``, from step ``first`` on."""
     for t in range(first, commands.shape[0]):
         to[t] = commands[t]

@@ -25,37 +25,42 @@ TOLERANCE = 1e-6  # m2/s2; a harm below the best known by less than this is roun
 
 @dataclass(frozen=True)
 class Regrets:
-    """Best known harm after all agents of an evaluation drove, [n] each."""
+    """Best known harm of each world after all agents of an evaluation drove, [n] each."""
 
-    limits: Limits
-    first_impact_harm: Floats  # best known, including the agents of this evaluation (m2/s2)
-    total_harm: Floats  # likewise for total harm
-    source: NDArray[np.str_]  # source of the best known harm: witness, table, agents or below_table
+    limits: Limits  # proofs and best known harm before any agent drove
+    first_impact_harm: Floats  # best known first-impact harm, including the agents of this evaluation, m2/s2
+    total_harm: Floats  # best known total harm, including the agents of this evaluation, m2/s2
+    # origin of the best known harm: witness (contact proven avoidable), table, agents (in no table), below_table (an
+    # agent beat the table)
+    source: NDArray[np.str_]
 
     def best(self, harm_count: HarmCount) -> Floats:
-        """Return the best known harm under one count, [n] m2/s2."""
+        """Return the best known harm under ``harm_count`` (``first`` or ``total``), [n] m2/s2."""
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def regret(self, outcome: Outcome, harm_count: HarmCount) -> Floats:
-        """Return the outcome's harm minus the best known harm, [n] m2/s2, never negative."""
+        """Return an agent's harm minus the best known harm, [n] m2/s2, never negative.
+
+        ``outcome`` is the agent's outcome in these worlds; ``harm_count`` is ``first`` or ``total``.
+        """
         return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
-        """Return the worlds [n] in which the outcome is below the previously known best, beyond rounding.
+        """Return True for worlds in which an agent's outcome is below the best harm known before, beyond rounding, [n].
 
-        Either count suffices.
+        Either harm count suffices.
         """
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
 
     @property
     def avoidable(self) -> Bools | None:
-        """Worlds in which contact can be avoided, [n]; None if not decided."""
+        """True for worlds in which contact can be avoided, [n]; None if not decided."""
         return self.limits.proof.avoidable
 
     @property
     def between(self) -> Between | None:
-        """Worlds with proven contact but no proven impact; None if contact is not decided."""
+        """Summary of the worlds with proven contact but no proven impact; None if contact is not decided."""
         if self.avoidable is None:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
@@ -63,7 +68,7 @@ class Regrets:
 
 @dataclass(frozen=True, slots=True)
 class Between:
-    """Worlds with proven contact but no proven impact, and the best known harm in them (m2/s2)."""
+    """Summary of the worlds with proven contact but no proven impact, with the best known harm in them (m2/s2)."""
 
     rate: float  # share of all worlds
     mean_first: float | None  # mean best known first-impact harm; None if unknown in all of them
@@ -72,7 +77,7 @@ class Between:
 
     @property
     def text(self) -> str:
-        """A sentence on these worlds that follows another one; empty if there are none."""
+        """A sentence with the share of these worlds and their least known harm, to append; empty if there are none."""
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % contact is certain, but perhaps no impact"
@@ -85,7 +90,15 @@ class Between:
 
     @classmethod
     def of(cls, contact: Bools, impact: Bools, first: Floats, total: Floats) -> Between:
-        """Summarise worlds with these proofs. ``first`` and ``total`` [n] are the best known harms; NaN if unknown."""
+        """Return the summary of the worlds in which contact is proven but no impact.
+
+        Args:
+            contact: [n] True if contact is proven.
+            impact: [n] True if an impact is proven.
+            first: [n] best known first-impact harm, m2/s2; NaN if unknown.
+            total: [n] best known total harm, m2/s2; NaN if unknown.
+
+        """
         there = contact & ~impact
         known = there & np.isfinite(first) & np.isfinite(total)
         if not known.any():
@@ -109,9 +122,10 @@ KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
 
 
 def limits_of(evaluation: Evaluation) -> Limits | Unproven:
-    """Return the limits of each world for any agent, computed once per evaluation.
+    """Return proofs and best known harm of each world before any agent drives; ``Unproven`` if nothing is proven.
 
-    Warns with ``IncompleteTable`` if a table of best known harm covers only some of the worlds.
+    They are computed once per evaluation. Warns with ``IncompleteTable`` if a table of best known harm covers only some
+    of the worlds.
     """
     return evaluation.once(_limits)
 

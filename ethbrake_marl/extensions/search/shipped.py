@@ -28,11 +28,11 @@ def shipped_tables() -> tuple[BestHarmTable, ...]:
 
 
 def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
-    """Return the best known harm of each world (at t = 0) under each count, [n] m2/s2; NaN if no shipped table has it.
+    """Return the best known harm of each world (at t = 0) from the shipped tables, by harm count, [n] m2/s2.
 
-    Worlds are recognised by everything that affects their harm: state, parameters, scripts of the others, time step,
-    horizon and the controlled vehicles. Raises ``InvalidInput`` for a script whose command is not fixed at the alert,
-    because no search covers it.
+    NaN if no shipped table has it. Worlds are recognised by everything that affects their harm: state, parameters,
+    scripts of the others, time step, horizon and the controlled vehicles (in ``task``). Raises ``InvalidInput`` for a
+    script whose command is not fixed at the alert, because no search covers it.
     """
     identity = task_problem(worlds, task).identity
     known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
@@ -42,7 +42,10 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
 
 
 def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
-    """Return the stored profiles of a problem with one controlled vehicle, [n], and the worlds that have one, [n]."""
+    """Return the stored profiles of a problem with one controlled vehicle, [n], and a mask [n] of worlds that have one.
+
+    ``harm_count`` is the harm that the profiles minimise, ``first`` or ``total``.
+    """
     last_step = problem.last_step
     profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
     for table in shipped_tables():
@@ -55,7 +58,10 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make ``best_harm[:candidates]``: the shipped profile, or a search with that many candidates if there is none."""
+    """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``, which plays the shipped profile of each world.
+
+    A world without a shipped profile is searched. ``argument`` is the number of candidates of that search, or None.
+    """
     return BestHarm.make(argument, settings, shipped_profiles)
 
 

@@ -43,26 +43,27 @@ COUNTS: tuple[HarmCount, ...] = ("first", "total")
 
 
 class BestKnown(NamedTuple):
-    """Best known harm under one count."""
+    """Best known harm of n worlds under one harm count."""
 
-    harm: Floats  # [n] m2/s2
-    profiles: Profiles  # [n] profiles with that harm; all ends are 0 where only the harm is known
+    harm: Floats  # [n] best known harm, m2/s2
+    profiles: Profiles  # [n] command profiles with that harm; all ends are 0 where only the harm is known
 
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
-    """Best known harm of n worlds, for one or both counts; ``header`` describes how it was computed."""
+    """Best known harm of n worlds, for one or both harm counts."""
 
-    identity: UInt64s  # [n] hash of each world
-    best: Mapping[HarmCount, BestKnown]
-    header: Mapping[str, Any]
+    identity: UInt64s  # [n] hash of each world, by which it is found
+    best: Mapping[HarmCount, BestKnown]  # harm and profiles, by harm count
+    header: Mapping[str, Any]  # entries that describe how the table was computed: scenario, vehicles, budget, ...
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Read a table. Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` if it is not a table.
+        """Return the table that is stored in the file ``path``.
 
-        Names, types, shapes and sizes are checked from the headers before anything is unpacked. The harm of a world is
-        not verified; ``check_fits`` checks that the profiles fit a problem.
+        Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` if it is not a table. Names, types, shapes
+        and sizes are checked from the headers before anything is unpacked. The harm of a world is not verified;
+        ``check_fits`` checks that the profiles fit a problem.
         """
         if not os.path.exists(path):
             raise InvalidInput(f"{path}: there is no such table of best known harm")
@@ -82,23 +83,25 @@ class BestHarmTable:
         return cls(arrays["identity"].astype(np.uint64), best, header)
 
     def save(self, path: Path) -> None:
-        """Write the table atomically."""
+        """Write the table to the file ``path``, whole or not at all."""
         write_file(path, table_bytes(self))
 
     @property
     def left_out(self) -> Mapping[str, str]:
-        """Number in the list -> reason for leaving the world out."""
+        """Worlds that are not in the table because of a failure: number in the list -> reason."""
         return dict(self.header.get(LEFT_OUT, {}))
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the row of each world; -1 if it is not in the table."""
+        """Return the row of each world, given by its hash ``identity`` [m]; -1 if it is not in the table."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def check_holds_any(self, identity: UInt64s) -> None:
-        """Raise ``InvalidInput`` if none of these worlds is in the table, which then belongs to another list."""
+        """Raise ``InvalidInput`` if the table holds none of the worlds with hashes ``identity``: it then belongs to
+        another list.
+        """
         if not (self.rows(identity) >= 0).any():
             made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
             raise InvalidInput(
@@ -107,7 +110,7 @@ class BestHarmTable:
             )
 
     def check_fits(self, problem: ProfileProblem) -> None:
-        """Raise ``InvalidInput`` if a stored profile of one of these worlds cannot be driven there."""
+        """Raise ``InvalidInput`` if a stored profile of a world of ``problem`` cannot be played there."""
         for harm_count in self.best:
             try:
                 problem.check(self.profiles(problem.identity, harm_count, problem.last_step)[0])
@@ -115,16 +118,24 @@ class BestHarmTable:
                 raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
 
     def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
-        """Return the best known harm of each world (m2/s2); NaN if it is not in the table."""
+        """Return the best known harm of each world, given by its hash ``identity`` [m]: [m] m2/s2, NaN if it is not in
+        the table.
+        """
         rows = self.rows(identity)
         if harm_count not in self.best:
             return np.full(rows.shape, np.nan)
         return np.where(rows >= 0, self.best[harm_count].harm[rows], np.nan)
 
     def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
-        """Return the stored profiles [n], with coasting for unknown worlds, and the worlds [n] that have one.
+        """Return the stored profile of each world, [m], and a mask [m] of the worlds that have one.
 
-        ``last_step`` [n] is the end of each profile.
+        A world without a profile gets coasting.
+
+        Args:
+            identity: [m] hash of each world.
+            harm_count: harm that the profiles minimise, ``first`` or ``total``.
+            last_step: [m] number of steps of each episode, at which a profile ends.
+
         """
         rows = self.rows(identity)
         if harm_count not in self.best:
@@ -139,11 +150,17 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """Return the table with every value replaced that ``harm`` [m] undercuts by more than ``TOLERANCE``.
+        """Return the table with smaller values replaced, and a mask [m] of the worlds that were replaced.
 
-        Also returns the mask [m] of the replaced values. ``profiles`` [m] cause this harm; without them only the harm
-        is stored. Worlds that are not in the table are ignored. Raises ``InvalidInput`` for a count that the table does
-        not hold, or for shapes that do not match.
+        A value is replaced if ``harm`` is smaller by more than ``TOLERANCE``. Worlds that are not in the table are
+        ignored. Raises ``InvalidInput`` for a count that the table does not hold, or for shapes that do not match.
+
+        Args:
+            identity: [m] hash of each world.
+            harm_count: ``first`` or ``total``.
+            harm: [m] harm of each world, m2/s2.
+            profiles: [m] command profiles that cause this harm; None: store the harm only.
+
         """
         if harm_count not in self.best:
             raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
@@ -166,7 +183,7 @@ class BestHarmTable:
 
 
 def table_bytes(table: BestHarmTable) -> bytes:
-    """Return the table as a compressed .npz without pickles.
+    """Return the bytes of a table file: a compressed .npz without pickles.
 
     Only phases in use are stored, and the bytes of commands are grouped by significance to compress well.
     """
@@ -189,7 +206,10 @@ def table_bytes(table: BestHarmTable) -> bytes:
 
 
 def _rows(harm_count: HarmCount) -> list[ArrayRow]:
-    """Return the arrays of a table for one count: n worlds, m phases in all, C controlled vehicles."""
+    """Return name, type and shape of each array that a table file holds for one harm count.
+
+    n worlds, m phases in all, C controlled vehicles.
+    """
     return [
         ArrayRow("header", "|u1", ("bytes",)),
         ArrayRow("identity", "<u8", ("n",)),
@@ -201,23 +221,26 @@ def _rows(harm_count: HarmCount) -> list[ArrayRow]:
 
 
 class _Header(BaseModel):
-    """Entries of a header that other code relies on. A header may have more entries."""
+    """Entries of a table's header that other code relies on. A header may have more entries."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
-    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # refuses true and 1.0
-    scenario: str = ""
-    vehicles: list[str] = []
-    budget: int = 0
-    search_seed: int = 0
-    episodes: int = 0
-    list_seed: int = 0
-    after: dict[str, Any] = {}
-    lowered_by: dict[str, dict[str, int]] = {}
+    format: Annotated[int, Field(ge=TABLE_FORMAT, le=TABLE_FORMAT)]  # version of the file format; refuses true and 1.0
+    scenario: str = ""  # name of the scenario
+    vehicles: list[str] = []  # names of the controlled vehicles
+    budget: int = 0  # candidates per world and count of the search
+    search_seed: int = 0  # seed of the search
+    episodes: int = 0  # number of worlds of the list
+    list_seed: int = 0  # seed of the list
+    after: dict[str, Any] = {}  # header of the table with which the search started
+    lowered_by: dict[str, dict[str, int]] = {}  # agent -> count -> number of worlds in which the agent did less harm
 
 
 def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
-    """Return one count of a table whose arrays have the right shapes. Raises ``ValueError`` for impossible numbers."""
+    """Return harm and profiles of one count from the arrays of a table file, which have the right shapes.
+
+    Raises ``ValueError`` for impossible numbers.
+    """
     harm = arrays[f"{harm_count}_harm"].astype(np.float64)
     used = arrays[f"{harm_count}_phases"].astype(np.int64)
     planes = arrays[f"{harm_count}_commands"]
@@ -247,5 +270,7 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
 
 
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many phases each profile uses, [n]; 0 if there is no profile."""
+    """Return the number of phases that each profile uses, [n]; 0 if there is no profile. ``ends`` [n, K] are their
+    ends.
+    """
     return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

@@ -17,11 +17,18 @@ from ethbrake_marl.physics.state import Floats, Ints, UInt64s
 
 
 def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-    """Return the best of ``number`` templates below ``bound`` [n] (m2/s2) in each world, for one controlled vehicle.
+    """Return the best of some random templates in each world: its commands [n, T] (m/s2), and its number of steps [n].
 
-    Returns its commands [n, T] (m/s2), and the number of steps to its end [n]: 0 if none is below the bound. Each world
-    draws its own templates and is independent of the others. Raises ``InvalidInput`` for several vehicles, or no
-    template.
+    A *template* is a whole episode: brake fully, give way, brake again. The number of steps is 0 if no template is
+    below the bound. Each world draws its own templates and is independent of the others. Raises ``InvalidInput`` for
+    several controlled vehicles, or no template.
+
+    Args:
+        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
+        bound: [n] harm that a template must be below, m2/s2.
+        number: number of templates per world.
+        seed: seed of the random draws.
+
     """
     check_whole_number("templates", number, 1)
     if len(problem.vehicles) != 1:
@@ -36,7 +43,11 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
 def _best_templates(
     problem: ProfileProblem, random: UInt64s, bound: Floats, number: int, commands: Floats, steps: Ints
 ) -> None:
-    """Fill ``commands`` [n, T] and ``steps`` [n] with the best template of each world."""
+    """Write the best random template of each world to ``commands`` [n, T] and its number of steps to ``steps`` [n].
+
+    ``random`` [n] is the initial state of each world's random stream, ``bound`` [n] the harm to be below, ``number``
+    the number of templates per world.
+    """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))
     for k in range(start.shape[0]):

@@ -167,7 +167,7 @@ def tune_command(
 
 
 def _end_study(out: Out, told: str, *, interrupted: bool, failed: bool) -> None:
-    """Print the result of a sweep or a tuning, and end with its exit status."""
+    """Print ``told``, the result of a sweep or tuning, and end the command: status 130 if interrupted, 1 if failed."""
     if interrupted:
         out.interrupted(f"interrupted; {told}; {KEPT}")
     out.note(told)
@@ -295,7 +295,10 @@ def falsify_command(
 
 
 def _spelled(**options: Any) -> str:
-    """Return the command line of a search. Options that are None are left out; a tuple repeats its option."""
+    """Return the command line ``ethbrake study falsify`` with these options, by name.
+
+    Options that are None are left out; a tuple repeats its option.
+    """
     words = ["ethbrake", "study", "falsify"]
     for option, value in options.items():
         if value is not None:
@@ -305,7 +308,11 @@ def _spelled(**options: Any) -> str:
 
 
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
-    """Measure the worlds of a file once more, and compare. Exit status 1 if one is worse or could not be driven."""
+    """Measure the worlds of a file of ``study falsify`` once more, and print a comparison.
+
+    ``agent`` drives; None: the agent that the file names. Ends the command with status 1 if a world is worse than
+    before or could not be driven.
+    """
     import numpy as np
 
     from ethbrake_marl.agents.spec import parse_spec

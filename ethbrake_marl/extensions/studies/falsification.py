@@ -32,21 +32,30 @@ _LAST = np.nextafter(1.0, 0.0)
 
 
 class Scored(NamedTuple):
-    """All points that were tried, in order."""
+    """All n points of the unit cube that were tried, in order, with their scores."""
 
-    points: Floats  # [n, d]
-    scores: Floats  # [n]
+    points: Floats  # [n, d] coordinates in [0, 1)
+    scores: Floats  # [n] score of each point, the larger the better; minus infinity: the point does not count
 
 
 def search(
     score: Score, dimensions: int, budget: int, seed: int, *, adaptive: bool = True, on_round: Watcher | None = None
 ) -> Scored:
-    """Score ``budget`` points. With ``adaptive`` the search looks around the best points; else points are uniform.
+    """Search the unit cube for points with a high score, and return all points that were tried.
 
     One part of a round's points is spread evenly (scrambled Sobol). The other part is one step from the best points so
     far that are far apart: a normal step in some coordinates, or the difference of two other points (differential
     evolution). While no point is better than the median, all points are spread evenly. The same seed gives the same
     points.
+
+    Args:
+        score: function from points [n, d] to scores [n].
+        dimensions: number of coordinates, d.
+        budget: number of points to try.
+        seed: seed of the points.
+        adaptive: whether to look around the best points; False: all points are uniform.
+        on_round: called after each round with the number of points so far and ``budget``.
+
     """
     check_whole_number("search: budget", budget, 1)
     check_whole_number("search: seed", seed, 0)
@@ -68,7 +77,10 @@ def search(
 
 
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
-    """Yield scrambled Sobol points. Whole rounds are drawn, because their balance needs powers of two."""
+    """Yield points that are evenly spread over the unit cube (scrambled Sobol points), one by one, each [d].
+
+    ``dimensions`` is d. The sequence has no end, and the same seed gives the same points.
+    """
     from scipy.stats import qmc  # imported here, because it takes a second to load
 
     sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
@@ -77,9 +89,9 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(found: Scored, count: int) -> Ints:
-    """Return the rows of the best points, best first, at most ``count``.
+    """Return the row numbers of the best points of ``found`` that are far apart, best first, at most ``count``.
 
-    Any two of them differ by at least ``APART`` in some coordinate.
+    Any two of them differ by at least 0.1 in some coordinate. Points that do not count (score not finite) are omitted.
     """
     order = np.argsort(-found.scores, kind="stable")
     order = order[np.isfinite(found.scores[order])]
@@ -92,7 +104,7 @@ def far_apart(found: Scored, count: int) -> Ints:
 
 
 def _above_median(found: Scored) -> Scored:
-    """Return the same points, with the score -inf for those that are no better than the median."""
+    """Return the points of ``found`` with the score -inf for those that are no better than the median."""
     good = np.isfinite(found.scores)
     if not good.any():
         return found
@@ -100,7 +112,7 @@ def _above_median(found: Scored) -> Scored:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Return points near parents, [count, d], with equal shares for all parents."""
+    """Return ``count`` new points near the points ``parents`` [m, d], with equal shares for all parents."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]
@@ -117,15 +129,16 @@ def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Falsified:
-    """The worst worlds of a search, worst first, and the scores of all worlds that were tried."""
+    """Result of a search for worlds in which an agent does badly: the worst worlds, worst first, and all scores."""
 
-    sample: Sample  # the worst worlds
-    worlds: list[NamedWorld]  # the same worlds with names and measurements
-    scores: Floats  # score of every world tried, in order; minus infinity: not a world of the scenario
-    first_above: int | None  # number of worlds tried until the first score above zero
+    sample: Sample  # the worst worlds at the alert
+    worlds: list[NamedWorld]  # the same worlds with names, initial states and measurements
+    # Score of every world tried, in order (m2/s2). Minus infinity: not a world of the scenario, or the physics failed.
+    scores: Floats
+    first_above: int | None  # number of worlds tried up to the first score above zero; None: no score is above zero
 
     @property
     def share_above(self) -> float:
-        """Share of the counted worlds with a score above zero."""
+        """Share, 0 to 1, of worlds with a score above zero among those with a finite score."""
         good = self.scores[np.isfinite(self.scores)]
         return float((good > 0.0).mean()) if len(good) else 0.0

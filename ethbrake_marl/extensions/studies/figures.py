@@ -31,11 +31,11 @@ HARM = "harm"  # key beside FIGURES: the quantity by which the kept policy is th
 
 REASON = "reason"  # key instead of FIGURES: why a training cannot succeed
 
-Evaluation = Mapping[str, float]  # steps, and the measures at that time
+Evaluation = Mapping[str, float]  # one evaluation during a training: steps, and the measures at that time, by name
 
 
 def is_done(job: TrainingJob) -> bool:
-    """Return whether the folder holds the finished training with its policies.
+    """Return whether the folder of ``job`` holds the finished training with its policies.
 
     Raises ``InvalidInput`` for another training.
     """
@@ -47,10 +47,10 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Bring a training to its end, from where it stopped. Return False if ``stop_at`` stopped it.
+    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped early.
 
-    Raises the exceptions of a training, ``InvalidInput`` if the folder holds another training, and ``BlockingIOError``
-    if another worker has just begun it.
+    ``stop_at`` takes each evaluation and returns a reason to stop, or None. Raises the exceptions of a training,
+    ``InvalidInput`` if the folder holds another training, and ``BlockingIOError`` if another worker has just begun it.
     """
     run = RunDirectory(job.folder)
     if run.status.is_file():
@@ -65,7 +65,10 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """Return the evaluations in the training's folder so far. Raises ``InvalidInput`` if its table is damaged."""
+    """Return the evaluations so far in the folder of ``job``, each with steps and measures by name.
+
+    Raises ``InvalidInput`` if its table ``progress.csv`` is damaged.
+    """
     run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
     try:
         rows = [row for row in (run.rows() if run.progress.is_file() else []) if row.get(f"eval/{_MEASURED[0]}")]
@@ -81,7 +84,11 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return the quantity ``HARM`` and the figures of a table after these evaluations, without the policy's hash."""
+    """Return the figures of the training ``job`` for a table, given its evaluations so far, by name.
+
+    The names are ``harm`` (the quantity by which the best policy is chosen) and those in ``FIGURES``, without
+    ``policy_sha256``; for example ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
+    """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     kept, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
     return {
@@ -94,7 +101,7 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return the quantity ``HARM`` and all figures of a finished training.
+    """Return the figures of the finished training ``job`` for a table, by name: ``harm`` and all in ``FIGURES``.
 
     Raises ``InvalidInput`` for a damaged file.
     """

@@ -1,4 +1,4 @@
-"""The folder of a study: it belongs to one question, and one process at a time works in it."""
+"""The folder of a study: it holds the results of one set of settings, and one process at a time works in it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ class StudyFolder:
 
     Args:
         path: the folder; it is created when work begins.
-        kind: what the folder holds, for messages.
-        question: everything that the results depend on, as plain data; None if each result stores its own.
-        record: name of the file that stores the question.
-        more: further entries of that file.
-        advice: what to do about a folder with another question.
-        beside: names that may exist in a folder without a record; None: any.
-        writes: names of files that the work replaces.
+        kind: what the folder holds, for messages: ``a sweep``.
+        question: all settings and versions that the results depend on, as plain data, so that a folder with other ones
+            is refused; None if each result stores its own.
+        record: name of the file inside the folder that stores ``question``.
+        more: further entries of that file, which are not compared.
+        advice: what the user can do about a folder with another ``question``, for messages.
+        beside: names of files that may exist in a folder without that file; None: any.
+        writes: names of files that the work replaces, and that must therefore be writable.
 
     """
 
@@ -47,10 +48,11 @@ class StudyFolder:
         self._record, self._more = path / record, dict(more or {})
 
     def check(self) -> bool:
-        """Return whether the record of the question must still be written. Writes nothing.
+        """Check that work may begin in this folder, and return whether the file ``record`` must still be written.
 
-        Raises ``InvalidInput`` if the path is not a folder, if it or one of ``writes`` cannot be written, or if it
-        holds another question (with the differences); ``AlreadyExists`` for a folder with other content.
+        Writes nothing. Raises ``InvalidInput`` if the path is not a folder, if it or one of ``writes`` cannot be
+        written, or if it belongs to other settings (the message lists the differences); ``AlreadyExists`` for a folder
+        with other content.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
@@ -78,7 +80,9 @@ class StudyFolder:
 
     @contextmanager
     def work(self) -> Iterator[None]:
-        """Lock the folder while the block runs, and remove what killed writers left.
+        """Context manager that creates the folder, and locks it against other processes while the block runs.
+
+        At the start it also removes unfinished files of processes that were killed.
 
         Raises the exceptions of ``check``, and ``InvalidInput`` if another process works in the folder.
         """
@@ -95,7 +99,10 @@ class StudyFolder:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the differences between two questions, in words. For lists, and entries of one side only, the name."""
+    """Return the differences of the settings ``now`` from ``before``, in words: ``["seeds 2, here 5", "recipes"]``.
+
+    For a list or an object, only the name is given. ``inside`` is the text before each name.
+    """
     found: list[str] = []
     for name in dict.fromkeys([*now, *before]):
         old, new = before.get(name), now.get(name)

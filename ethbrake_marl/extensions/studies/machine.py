@@ -15,17 +15,17 @@ import ethbrake_marl as eb
 class Machine:
     """Processor, load and versions of this machine, which belong to every figure of speed."""
 
-    processor: str
-    cores_usable: int
-    cores: int
+    processor: str  # model of the processor
+    cores_usable: int  # number of cores that this process may use
+    cores: int  # number of cores of the machine
     load: float  # mean number of running processes over the last minute
-    python: str
-    numpy: str
-    numba: str
-    ethbrake_marl: str
+    python: str  # version of Python
+    numpy: str  # version of numpy
+    numba: str  # version of numba
+    ethbrake_marl: str  # version of this package
 
     def __str__(self) -> str:
-        """Return the machine in words."""
+        """Return the description of the machine in one line, for captions."""
         return (
             f"{self.processor}, {self.cores_usable} of {self.cores} cores usable, load {self.load:.1f};"
             f" Python {self.python}, numpy {self.numpy}, numba {self.numba}, ethbrake_marl {self.ethbrake_marl}"
@@ -33,7 +33,7 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """Return the description of this machine."""
+    """Return processor, cores, present load and versions of this machine."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text("utf-8").splitlines() if information.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -27,38 +27,46 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class NamedWorld(FileModel):
-    """One world: its name, its initial state by the columns of a table, and its measurements (m2/s2)."""
+    """One world of the file: its name, its initial state, and what was measured in it (m2/s2)."""
 
+    # Name of the world, unique in the file.
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
-    score: Number
-    harm: Number
-    reference: Number | None = None
+    score: Number  # value of the measure that was searched for, the larger the worse for the agent (m2/s2)
+    harm: Number  # harm of the agent (m2/s2)
+    reference: Number | None = None  # harm of the agent to compare with, or bound of the shield (m2/s2)
+    # Initial state: column of a table of worlds (``gap_1_m``, ``speed_1_mps``) -> value.
     state: Annotated[dict[str, Number], Field(min_length=1, max_length=1000)]
 
 
 class NamedWorlds(FileModel):
-    """Content of a file of named worlds."""
+    """Content of a YAML file of worlds that a search for an agent's worst worlds found, to be driven again."""
 
-    format: Literal["ethbrake-worlds"]
-    version: Annotated[int, Field(ge=1, le=1)]  # not a Literal, which would accept true and 1.0
-    scenario: str
+    format: Literal["ethbrake-worlds"]  # mark of this kind of file
+    # Version of the format; not a Literal, which would accept true and 1.0.
+    version: Annotated[int, Field(ge=1, le=1)]
+    scenario: str  # name or path of the scenario of the worlds
+    # Hash of the scenario's content, which must be the same when the worlds are driven again.
     scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     settings: list[str] = Field(default=[])  # settings of the scenario, as for ``--set``
-    agent: str
-    measure: Literal["harm", "regret", "difference", "bound"]
-    against: str | None = None
-    harm_count: HarmCount
+    agent: str  # spec of the agent that drove
+    measure: Literal["harm", "regret", "difference", "bound"]  # what was searched for, as in ``weakness.Measure``
+    against: str | None = None  # spec of the agent to compare with; None: none, or the default
+    harm_count: HarmCount  # impacts that harm counts: each pair's first one (``first``) or all (``total``)
     found_by: str  # command of the search
+    # The worlds, worst first.
     worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
 
     @classmethod
     def of(cls, scenario: Scenario, /, **told: Any) -> NamedWorlds:
-        """Return the file of worlds of this scenario."""
+        """Return the content of a file of worlds that were drawn from ``scenario``.
+
+        ``told`` are the other fields of this class, except format, version and hash.
+        """
         return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **told)
 
     @classmethod
     def read(cls, path: str | Path) -> NamedWorlds:
-        """Read a file of named worlds. Raises ``InvalidInput`` with file, line and key."""
+        """Read and check a file of named worlds; raise ``InvalidInput`` with file, line and key of an error."""
         document = read_yaml(path, SIZE_LIMIT)
         found = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
         names = [world.name for world in found.worlds]
@@ -68,7 +76,7 @@ class NamedWorlds(FileModel):
 
     @property
     def text(self) -> str:
-        """The text of the file. Reading it back gives the same worlds, bit for bit."""
+        """The YAML text of the file. Reading it back gives the same worlds, bit for bit."""
         head = self.model_dump(exclude={"worlds"}, exclude_none=True)
         lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
         lines.append("worlds:")
@@ -78,7 +86,15 @@ class NamedWorlds(FileModel):
         return "\n".join(lines) + "\n"
 
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
-        """Return the worlds at the alert. Raises ``InvalidInput`` if ``scenario`` is not their scenario."""
+        """Return the worlds of the file at the alert.
+
+        Args:
+            scenario: the scenario that the file names, loaded.
+            where: name of the file, for messages.
+
+        Raises ``InvalidInput`` if the content of ``scenario`` is not that of the worlds' scenario.
+
+        """
         if scenario_sha256(scenario) != self.scenario_sha256:
             raise InvalidInput(
                 f"{where}: its worlds were found in scenario {self.scenario!r}"

@@ -1,4 +1,4 @@
-"""Optuna's proposals for a tuning, through Ray Tune, stored in a file and proposed again first after a restart.
+"""Optuna's proposals (values to try) for a tuning, through Ray Tune, stored in a file and reused after a restart.
 
 Each trial has a new sampler, seeded by a seed and the trial's number. So a proposal depends on the trials that have
 ended, and not on interruptions of the command.
@@ -27,14 +27,17 @@ Proposal = Mapping[str, Any]  # key -> value in Optuna's form
 
 
 class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
-    """Optuna's search of a space. The configuration of a trial is its number, ``trial``, and its ``values``.
+    """Optuna's search as Ray Tune uses it, which stores each proposal in a file.
+
+    A *proposal* is the values to try in one trial, by key, in Optuna's form. The configuration of a trial is its
+    number, ``trial``, and its proposal, ``values``.
 
     Args:
-        file: file of the proposals; created with the first one.
-        known: proposals in that file.
-        space: distribution of each key.
-        sampler: makes the sampler of the trial with a given number.
-        first: the first proposal if none is known.
+        file: JSON file of the proposals; created with the first one.
+        known: proposals that the file holds already; they are proposed again, before new ones.
+        space: key -> Optuna's distribution of its values.
+        sampler: function from the number of a trial to its Optuna sampler.
+        first: proposal of the very first trial, used if ``known`` is empty; None: it is sampled like the others.
 
     """
 
@@ -58,7 +61,10 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
         )
 
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
-        """Return the next trial."""
+        """Return the configuration of the next trial: ``{"trial": number, "values": proposal}``.
+
+        A proposal that is not in the file yet is stored there. ``trial_id`` is Ray's name of the trial.
+        """
         values, number = super().suggest(trial_id), self._asked
         if number == len(self.known):
             self.known.append(values)
@@ -68,7 +74,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
 
 class _SamplerOfTrial(BaseSampler):
-    """Sampler that makes a new sampler for each trial."""
+    """Optuna sampler that makes a new sampler for each trial; ``of`` returns it for the number of the trial."""
 
     def __init__(self, of: Callable[[int], BaseSampler]) -> None:
         self._of = of

@@ -1,4 +1,4 @@
-"""Common parts of the files of a sweep and of a tuning: reading them, and loading scenario and recipe."""
+"""Common parts of the YAML files of a sweep and of a tuning: reading them, and loading scenario and recipe."""
 
 from __future__ import annotations
 
@@ -22,14 +22,23 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class StudyFile(FileModel):
-    """Common base of the files of a sweep and of a tuning."""
+    """Base class of the content of a study's YAML file, of a sweep or of a tuning."""
 
     title: str = Field(default="", description="one line, for you")
     _document: Document = PrivateAttr(Document("the file", {}, {}))  # source document, for messages
 
     @classmethod
     def read_as(cls, path: str | Path, page: str, needed: str) -> Self:
-        """Read a file. Raises ``InvalidInput`` with file, line, key, value and what would be right."""
+        """Read and check a YAML file of this class.
+
+        Args:
+            path: the file.
+            page: name of the page of docs/ that shows an example, for messages.
+            needed: what the file must contain, for messages: ``with a grid or a list of jobs``.
+
+        Raises ``InvalidInput`` with file, line, key, value and what would be right.
+
+        """
         document = read_yaml(path)
         found = read_model(document, cls, Wording(cls, f"it is needed; docs/{page}.md shows an example"), needed)
         found._document = document
@@ -37,7 +46,7 @@ class StudyFile(FileModel):
 
 
 def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:
-    """Load scenario and recipe, by name or path, with the settings ``KEY=VALUE`` applied.
+    """Load scenario and recipe, by name or path, and apply the settings ``KEY=VALUE`` to the one that has the key.
 
     Raises ``InvalidInput`` for an unknown name or key, and for a value that is not allowed.
     """
@@ -47,9 +56,9 @@ def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Sce
 
 
 def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
-    """Return the part that causes ``load_parts`` to fail: ``recipe``, ``scenario`` or the key of a setting.
+    """Return which argument causes ``load_parts`` to fail: ``recipe``, ``scenario`` or the key of a setting.
 
-    Empty if each part alone is valid.
+    The result is empty if each of them alone is valid.
     """
     tried: dict[str, Callable[[], object]] = {
         "recipe": partial(load_recipe, recipe),
@@ -65,5 +74,5 @@ def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
 
 
 def texts_of(values: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the values as ``KEY=VALUE`` texts."""
+    """Return values by key as ``KEY=VALUE`` texts, as ``--set`` takes them."""
     return tuple(f"{key}={flow_text(value)}" for key, value in values.items())

@@ -38,7 +38,10 @@ _GRID: YamlPath = ("grid",)
 
 
 class _OneOrMore:
-    """Annotation of a list that accepts a single entry in its JSON schema; a validator makes it a list."""
+    """Annotation of a list for which the file may contain a single entry instead.
+
+    It only changes the JSON schema; a validator turns a single entry into a list.
+    """
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
@@ -64,16 +67,16 @@ _Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
 
 
 class Request(NamedTuple):
-    """One job as the file requests it."""
+    """One training of a sweep, as the sweep's file requests it."""
 
-    path: YamlPath  # place in the file: the grid, or a listed job
-    scenario: str  # name or path
-    recipe: str  # name or path
-    settings: tuple[str, ...]  # KEY=VALUE texts, as for ``train --set``
-    seed: int
+    path: YamlPath  # keys that lead to its place in the file: ``("grid",)``, or ``("jobs", k)`` for a listed job
+    scenario: str  # name or path of the scenario
+    recipe: str  # name or path of the recipe
+    settings: tuple[str, ...]  # ``KEY=VALUE`` texts, as for ``train --set``
+    seed: int  # seed of the training
 
     def __str__(self) -> str:
-        """Return the job in words."""
+        """Return place, scenario, recipe, seed and settings of the job in words, for messages."""
         settings = f", {', '.join(self.settings)}" if self.settings else ""
         return f"{_place(self.path)} ({self.scenario}, {self.recipe}, seed {self.seed}{settings})"
 
@@ -83,7 +86,7 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """Range of ``count`` seeds, starting with ``first``."""
+    """Seeds of the trainings as a range: ``count`` seeds, from ``first`` on."""
 
     first: Seed = Field(default=0, description="the smallest seed")
     count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
@@ -97,7 +100,7 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """Jobs for all combinations of the listed values."""
+    """One training for every combination of the listed scenarios, recipes, settings and seeds."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={}, alias="set", description="a list of values for each dotted key"
@@ -113,14 +116,14 @@ class Grid(FileModel):
 
     @property
     def seeds(self) -> Sequence[int]:
-        """The seeds as a sequence."""
+        """The seeds of the trainings, listed one by one."""
         if isinstance(self.seed, SeedRange):
             return range(self.seed.first, self.seed.first + self.seed.count)
         return self.seed
 
 
 class ListedJob(FileModel):
-    """One single job."""
+    """One training: a scenario, a recipe, settings and a seed."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
     scenario: str = Field(description="a name or a path, as train --scenario")
@@ -129,14 +132,14 @@ class ListedJob(FileModel):
 
 
 class SweepFile(StudyFile):
-    """Content of a sweep's file; ``settings`` apply to every job."""
+    """Content of the YAML file of a sweep: trainings as a grid of combinations, as a list of single jobs, or both."""
 
     settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
     grid: Grid | None = Field(default=None, description="every combination of what it lists")
     jobs: tuple[ListedJob, ...] = Field(default=(), strict=False, description="single jobs, after those of the grid")
 
     def size(self) -> int:
-        """Return the number of jobs."""
+        """Return the number of jobs that the file requests."""
         grid = self.grid
         lists = [] if grid is None else [grid.scenario, grid.recipe, grid.seeds, *grid.settings.values()]
         return (math.prod(map(len, lists)) if lists else 0) + len(self.jobs)
@@ -158,7 +161,11 @@ class SweepFile(StudyFile):
             yield Request(("jobs", k), job.scenario, job.recipe, self._texts(job.settings, ("jobs", k)), job.seed)
 
     def where(self, asked: Request, part: str = "") -> str:
-        """Return file and line of a job, or of a ``part`` of it: ``recipe``, ``scenario``, or the key of a setting."""
+        """Return file and line of a requested job, for messages: ``sweep.yaml, line 7``.
+
+        ``part`` names a part of the job, whose line is returned instead: ``recipe``, ``scenario``, or the key of a
+        setting. Empty: the line of the job itself.
+        """
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
             path = ("set", part)
@@ -181,21 +188,21 @@ TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # names inside th
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One job with its training's identity, so that nothing must be loaded again."""
+    """One job of a sweep, checked and loaded: one row of the sweep's table."""
 
-    asked: Request
-    identity: str  # identity of its training
-    name: str  # name of its folder
-    first: Training  # training with the same settings and the first seed
+    asked: Request  # the job as the file requests it
+    identity: str  # SHA-256 of everything that affects its training (``Training.identity``)
+    name: str  # name of the job and of its folder
+    first: Training  # training with the settings of the job, but perhaps another seed; jobs of equal settings share it
 
     @property
     def settings(self) -> dict[str, str]:
-        """Key -> value of each setting, as text."""
+        """Settings of the job: key -> value, as texts."""
         return dict(text.split("=", 1) for text in self.asked.settings)
 
     @property
     def about(self) -> dict[str, Any]:
-        """First columns of the tables for this job."""
+        """Columns of the tables that describe the job: hash, scenario, recipe, algorithm, scheme, seed, steps."""
         return {
             "hash": self.identity,
             "scenario": self.asked.scenario,
@@ -209,9 +216,9 @@ class Row:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All jobs of a sweep, in the order of its table. Common parts are loaded once."""
+    """All jobs of a sweep, checked and loaded, in the order of its table."""
 
-    rows: Sequence[Row]
+    rows: Sequence[Row]  # the jobs
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
@@ -223,7 +230,7 @@ class SweepPlan:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read the file of a sweep, and resolve every job.
+        """Read the file of a sweep, and load scenario and recipe of every job.
 
         Raises ``InvalidInput`` with file, line and job for invalid content: an unknown scenario or recipe, an unknown
         setting, parts that do not fit together, or two jobs with the same hash.
@@ -257,26 +264,36 @@ class SweepPlan:
 
     @staticmethod
     def folder(path: Path) -> StudyFolder:
-        """Return the folder of a sweep. It has no record, because each job stores its own question."""
+        """Return the object that checks and locks the folder ``path`` of a sweep.
+
+        The folder itself stores no settings, because each job's folder stores the settings of its training.
+        """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:
-        """Return the training of a row in the folder of a sweep."""
+        """Return the training of the job ``row``, with its folder inside the sweep's folder ``path``."""
         training = Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
     def train(self, row: Row, path: Path) -> None:
-        """Bring the training of a row to its end."""
+        """Bring the training of the job ``row`` in the sweep's folder ``path`` to its end, from where it stopped."""
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        """Return the figures (``HARM`` and ``FIGURES``) of each finished job, by its name."""
+        """Return the results of each finished job in the sweep's folder ``path``, by the job's name.
+
+        A result holds the figures of the training by name (``figures.FIGURES``, and ``harm`` of the kept policy), as
+        in ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
+        """
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}
 
     def states(self, path: Path) -> list[dict[str, Any]]:
-        """Return every job and its state: new, begun or finished."""
+        """Return one object for each job: ``hash``, ``job`` (name), ``set`` (settings) and ``state``.
+
+        The state is ``new``, ``begun`` or ``finished``. ``path`` is the sweep's folder.
+        """
         done = self.results(path)
         return [
             {
@@ -339,7 +356,10 @@ class SweepPlan:
     def _train(
         self, left: list[int], path: Path, jobs: int | None, ray: str, retries: int, tell: OnProgress | None
     ) -> dict[str, str]:
-        """Train the jobs with these numbers. Return the reasons of failed jobs, by name."""
+        """Train jobs on Ray, and return the reason of each failed job, by its name.
+
+        ``left`` holds the numbers of the jobs in ``rows``; the other arguments are those of ``run``.
+        """
         with connected(ray, jobs):
             from ray import tune
 
@@ -361,19 +381,26 @@ class SweepPlan:
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """Result of a sweep."""
+    """Numbers of jobs after a run of a sweep, and the file of its table."""
 
-    table: Path
-    jobs: int
-    finished: int
-    failed: int
+    table: Path  # CSV file with a row for each finished job
+    jobs: int  # number of all jobs
+    finished: int  # number of jobs that have finished, including earlier runs
+    failed: int  # number of jobs that failed in this run
 
     @property
     def interrupted(self) -> bool:
-        """Whether some jobs did not end."""
+        """Whether some jobs neither finished nor failed, because Ctrl-C stopped the run."""
         return self.finished + self.failed < self.jobs
 
 
 def do_job(config: dict[str, Any], plan: SweepPlan, path: Path) -> None:
-    """Train one job; runs in a worker process."""
+    """Train one job, in a worker process of Ray.
+
+    Args:
+        config: ``{"job": number}`` with the job's number in ``plan.rows``.
+        plan: the sweep.
+        path: folder of the sweep.
+
+    """
     plan.train(plan.rows[config["job"]], path)

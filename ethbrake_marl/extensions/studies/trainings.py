@@ -26,10 +26,18 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Bring every training to its end, ``jobs`` at a time. Return False if Ctrl-C stopped one.
+    """Bring every training to its end, from where it stopped. Return False if Ctrl-C stopped one.
 
-    The policies do not depend on ``jobs`` or on interruptions. Raises the exceptions of ``steps_left`` before any
-    training begins, and the exception of the first training that fails.
+    The policies do not depend on ``jobs`` or on interruptions.
+
+    Args:
+        trainings: trainings with their folders.
+        jobs: number of trainings at once, one process each.
+        tell: called with the progress; None: silent.
+
+    Raises the exceptions of ``steps_left`` before any training begins, and the exception of the first training that
+    fails.
+
     """
     left = [training for training in trainings if training.steps_left()]
     if jobs == 1 or len(left) < 2:
@@ -45,19 +53,22 @@ def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress 
 
 @dataclass(frozen=True, slots=True)
 class TrainingJob:
-    """A training and its folder."""
+    """A training of a study, and the folder in which it runs."""
 
-    training: Training
-    folder: Path
-    noted: tuple[str, ...] = ()  # overrides of scenario and recipe, for ``config.json``
+    training: Training  # recipe and scenario
+    folder: Path  # folder of the run; it need not exist yet
+    noted: tuple[str, ...] = ()  # how scenario and recipe differ from their files, ``KEY=VALUE``, for ``config.json``
 
     @property
     def per_update(self) -> int:
-        """Decisions of all learners between two updates."""
+        """Number of decisions of all learners together between two updates."""
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:
-        """Return the number of remaining decisions. Raises ``InvalidInput`` if the folder holds another training."""
+        """Return the number of decisions until the end of the training; 0 if it has finished.
+
+        Raises ``InvalidInput`` if the folder holds another training.
+        """
         run, total = RunDirectory(self.folder), self.training.recipe.total_steps
         if not run.status.exists():
             if self.folder.exists():
@@ -74,9 +85,14 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Bring the training to its end. Return None if it was stopped before, also by ``stop_at``.
+        """Bring the training to its end, from where it stopped. Return True, or None if it was stopped early.
+
+        Args:
+            tell: called with the progress; None: silent.
+            stop_at: takes each evaluation, and returns a reason to stop, or None.
 
         Raises the exceptions of ``train`` and ``resume``.
+
         """
         from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
 
@@ -97,7 +113,10 @@ class TrainingJob:
         return True if ended.status == "finished" else None
 
     def time(self, sample: Sample | None = None) -> Timed:
-        """Time a few updates, and the policy on the first worlds of ``sample``; None: of the recipe's list."""
+        """Measure the speed of this training: of a few updates, and of its policy on 50 worlds.
+
+        ``sample``: worlds for the policy; None: the first ones of the list on which the recipe evaluates.
+        """
         from ethbrake_marl.training.session import train
 
         told: list[Progress] = []
@@ -115,7 +134,7 @@ class TrainingJob:
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
     def world_seconds(self, sample: Sample) -> float:
-        """Return the seconds that its team needs to drive one world."""
+        """Return the seconds that the trained policies need to drive one of the worlds of ``sample``."""
         team = {"team": load_team(self.folder, self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
@@ -124,14 +143,14 @@ class TrainingJob:
 class Timed(NamedTuple):
     """Measured speed of a training on one core, by the wall clock."""
 
-    job: TrainingJob
+    job: TrainingJob  # the measured training
     decision_s: float  # seconds per decision of a learner, including its share of the learning
-    world_s: float  # seconds per world of an evaluation
+    world_s: float  # seconds per world when its policies are evaluated
 
     def seconds(self, steps: int) -> float:
-        """Return the seconds for ``steps`` decisions of whole trainings, including evaluations.
+        """Return the estimated seconds for ``steps`` decisions of such trainings, including their evaluations.
 
-        A training evaluates its policies on the fixed list at the start, now and then, and at the end.
+        A training evaluates its policies on the recipe's fixed list at the start, every few updates, and at the end.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
@@ -139,7 +158,10 @@ class Timed(NamedTuple):
 
     @staticmethod
     def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
-        """Return the seconds per world of some work on at most ``most`` worlds. One world runs first, to compile."""
+        """Measure and return the seconds per world of ``work(worlds)``, on at most ``most`` of these worlds.
+
+        One world runs first, so that compilation is not timed.
+        """
         work(worlds.take([0]))
         some, started = worlds.take(range(min(worlds.n, most))), time.monotonic()
         work(some)
@@ -147,7 +169,7 @@ class Timed(NamedTuple):
 
     @staticmethod
     def in_words(seconds: float) -> str:
-        """Return a duration as seconds, minutes or hours."""
+        """Return a duration as text in seconds, minutes or hours: ``40 s``, ``12 min``."""
         if seconds < 90.0:
             return f"{seconds:.0f} s"
         return f"{seconds / 60.0:.0f} min" if seconds < 36_000.0 else f"{seconds / 3600.0:.0f} h"

@@ -33,16 +33,18 @@ def run_trials(
     retries: int,
     told: Told,
 ) -> list[dict[str, Any]]:
-    """Run the trials and return the last report of each trial that began, in order. Ctrl-C ends all of them early.
+    """Run trials on Ray Tune, and return the last report of each trial that began, in order.
 
-    Ray must be connected. A report of a trial that ended has ``done``, one of a failed trial ``REASON``.
+    A report is the dictionary that ``work`` passed to ``tune.report``, with Ray's own entries. Its entry ``reason``
+    says why a trial failed; ``done`` is true if Ray has ended the trial. Ctrl-C ends all trials early. Ray must be
+    connected (see ``cluster.connected``).
 
     Args:
         work: called as ``work(config, **given)`` in a worker process; reports with ``tune.report``.
         given: arguments that are the same for all trials.
         folder: folder of all results; every computer of a cluster must see it.
-        config: what Ray Tune searches, and how.
-        space: space of the trials.
+        config: Ray Tune's settings: search algorithm, scheduler and number of trials.
+        space: Ray Tune's space of configurations: key -> values.
         jobs: trials at once; None: one for each core.
         retries: further attempts at a trial whose process was lost, or that failed with an error from outside this
             package.
@@ -74,7 +76,10 @@ def run_trials(
 
 
 def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
-    """Run one attempt at a trial. Errors of this package are reported, not raised, so that Ray does not try again."""
+    """Run one attempt at a trial with the configuration ``config``; arguments as in ``run_trials``.
+
+    Errors of this package are reported, not raised, so that Ray does not try again.
+    """
     try:
         if not folder.is_dir():
             raise InvalidInput(f"{folder}: is not there on {os.uname().nodename}; every computer must see this folder")
@@ -84,29 +89,37 @@ def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[s
 
 
 class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
-    """Callback that reports how many trials have ended, and why some failed."""
+    """Callback of Ray Tune that reports how many trials have ended, and why some failed.
+
+    Args:
+        name: name of the study, for the progress.
+        done: number of trials that had ended before.
+        total: number of all trials.
+        tell: called with a ``Progress``; None: silent.
+
+    """
 
     def __init__(self, name: str, done: int, total: int, tell: OnProgress | None) -> None:
         self._name, self._done, self._total, self._tell = name, done, total, tell or (lambda progress: None)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return nothing: Ray's stored state is not read."""
+        """Return an empty state for Ray to store, because it is never read."""
         return {}
 
     def say(self, note: str = "") -> None:
-        """Report how many trials have ended, with a note."""
+        """Report how many trials have ended, with ``note`` as a message to print once."""
         self._tell(Progress(self._name, self._done, self._total, note=note))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Count a trial that ended, or that cannot succeed."""
+        """Count a trial that ended, or that cannot succeed, and report why; Ray calls this method."""
         self._done += 1
         self.say(str(trial.last_result.get(REASON, "")))
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Count a trial that used up its attempts."""
+        """Count a trial that has failed after all its attempts; Ray calls this method."""
         self._done += 1
         self.say("a process was lost or failed, too often: the table says why")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Report that a trial is tried again."""
+        """Report that a trial is tried again; Ray calls this method."""
         self.say("a process was lost or failed: tried again")

@@ -58,7 +58,10 @@ _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 def _check_number(value: Any) -> int | float:
-    """Check for a finite number. A whole number stays an ``int``, which limits the search to whole numbers."""
+    """Return ``value`` unchanged if it is a finite number, else raise ``ValueError``.
+
+    A whole number stays an ``int``, which limits the search to whole numbers.
+    """
     if not isinstance(value, int | float) or isinstance(value, bool):
         raise ValueError("must be a number")
     if not math.isfinite(value):
@@ -70,7 +73,7 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 
 
 class Range(FileModel):
-    """Range of a setting from ``low`` to ``high``, both included.
+    """Numbers that a search may try for one setting: a range from ``low`` to ``high``, both included.
 
     If both ends are written without a point, only whole numbers are tried.
     """
@@ -80,13 +83,13 @@ class Range(FileModel):
     log: bool = Field(default=False, description="the logarithm is searched, not the number")
 
     def __str__(self) -> str:
-        """Return the range in words."""
+        """Return the range in words: ``from 0.001 to 0.1, by its logarithm``."""
         kind = ", whole" * self.whole + ", by its logarithm" * self.log
         return f"from {flow_text(self.low)} to {flow_text(self.high)}{kind}"
 
     @property
     def whole(self) -> bool:
-        """Whether only whole numbers are tried."""
+        """Whether only whole numbers are tried: both ends are written without a point."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @model_validator(mode="after")
@@ -99,11 +102,11 @@ class Range(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """Values that are checked before the search starts."""
+        """Both ends of the range; the recipe must allow them, which is checked before the search starts."""
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
-        """Return a recipe's value as the search would try it; None if it is not in the range."""
+        """Return ``value``, a recipe's own value of this setting, as a number of the range; None if it is not in it."""
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             return None
         if not self.whole:
@@ -111,7 +114,7 @@ class Range(FileModel):
         return int(value) if value == int(value) else None
 
     def distribution(self) -> BaseDistribution:
-        """Return the range as an Optuna distribution."""
+        """Return Optuna's distribution from which values of this range are proposed."""
         from optuna.distributions import FloatDistribution, IntDistribution
 
         if self.whole:
@@ -119,19 +122,19 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """Return a value in Optuna's form, which is the value itself."""
+        """Return a value as Optuna stores it; for a range, this is the value itself."""
         return value
 
     value = stored
 
 
 class Choices(FileModel):
-    """List of values of a setting, of any kind."""
+    """Values that a search may try for one setting: a list of values of any kind."""
 
     choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
 
     def __str__(self) -> str:
-        """Return the values in words."""
+        """Return the values in words: ``one of relu, tanh``."""
         return f"one of {', '.join(map(flow_text, self.choices))}"
 
     @model_validator(mode="after")
@@ -144,25 +147,25 @@ class Choices(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """Values that are checked before the search starts."""
+        """All choices; the recipe must allow them, which is checked before the search starts."""
         return self.choices
 
     def own(self, value: Any) -> Any:
-        """Return a recipe's value as the search would try it; None if it is not one of the choices."""
+        """Return the choice that equals a recipe's own value of this setting; None if it is not one of the choices."""
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
-        """Return the choices as an Optuna distribution."""
+        """Return Optuna's distribution from which choices, as texts, are proposed."""
         from optuna.distributions import CategoricalDistribution
 
         return CategoricalDistribution([*map(flow_text, self.choices)])
 
     def stored(self, value: Any) -> str:
-        """Return a value in Optuna's form: as text, because Optuna's choices cannot be lists."""
+        """Return a value as Optuna stores it: as text, because Optuna's choices cannot be lists."""
         return flow_text(value)
 
     def value(self, stored: Any) -> Any:
-        """Return the value of a choice in Optuna's form."""
+        """Return the choice that Optuna stores as the text ``stored``."""
         return {flow_text(value): value for value in self.choices}[stored]
 
 
@@ -181,20 +184,26 @@ def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
 
 
 class Measuring(FileModel):
-    """List of worlds on which trials are judged and pruned, and the number of evaluations in a training."""
+    """How trials are judged: the list of worlds on which their policies are evaluated, and how often in a training."""
 
+    # Number of worlds of the list.
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
+    # Seed from which these worlds are drawn.
     seed: Seed = Field(default=4007, description="of the list")
+    # Number of evaluations in the course of a training.
     times: int = Field(default=10, ge=1, le=1000, description="how often a training is measured")
 
 
 class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
-    A trial stops if its least harm so far is above the median of the other trials' mean harm up to the same time.
+    A trial (one training) stops if its least harm so far is above the median of the other trials' mean harm up to the
+    same evaluation.
     """
 
+    # Least number of other trials that must have reached the same evaluation before a trial may be stopped.
     after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
+    # Number of evaluations, apart from that before the training, that every trial is allowed to make.
     after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
 
     def rule(self) -> TrialScheduler:
@@ -212,14 +221,16 @@ class Pruning(FileModel):
 
 
 class Sampling(FileModel):
-    """Source of the proposals: Optuna's TPE, or random values."""
+    """How the values of the next trial are chosen: by Optuna's TPE from the results of earlier trials, or at random."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
+    # Seed of the proposed values.
     seed: Seed = Field(default=0, description="of what is proposed")
+    # Number of first trials with random values, before TPE chooses.
     random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
 
     def of_trial(self, number: int) -> BaseSampler:
-        """Return the Optuna sampler of one trial."""
+        """Return the Optuna sampler that proposes the values of trial ``number``; its seed depends on the number."""
         from optuna.samplers import RandomSampler, TPESampler
 
         seed = int(np.random.SeedSequence([self.seed, number]).generate_state(1)[0])
@@ -229,7 +240,7 @@ class Sampling(FileModel):
 
 
 class TuningFile(StudyFile):
-    """Content of a tuning's file."""
+    """Content of the YAML file of a tuning: a training, and the settings of its recipe to search for the least harm."""
 
     scenario: str = Field(description="a name or a path, as train --scenario")
     recipe: str = Field(description="a name or a path, as train --recipe")
@@ -245,15 +256,18 @@ class TuningFile(StudyFile):
     sampler: Sampling = Field(default=Sampling(), description="who proposes")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of a proposal in YAML's form."""
+        """Return the values of a proposal as in a YAML file: key -> value.
+
+        ``proposal`` maps each searched key to its value as Optuna stores it.
+        """
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
     def space(self) -> dict[str, BaseDistribution]:
-        """Return the space as Optuna distributions."""
+        """Return key -> Optuna's distribution of its values, for each searched key."""
         return {key: dimension.distribution() for key, dimension in self.search.items()}
 
     def points(self, number: int) -> Iterator[dict[str, Any]]:
-        """Return random points of the space, the same ones each time."""
+        """Return ``number`` random points of the space, each as key -> value; the same ones each time."""
         with naming_extras():
             import optuna
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -282,12 +296,12 @@ TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # names ins
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """Everything that the trials of a tuning have in common."""
+    """A tuning, checked and loaded: everything that its trials have in common."""
 
-    file: TuningFile
-    recipe: TrainingRecipe  # recipe with the file's settings and seed
-    scenario: Scenario
-    question: Mapping[str, Any]  # everything that a trial's harm depends on, including versions
+    file: TuningFile  # content of the tuning's file
+    recipe: TrainingRecipe  # recipe with the file's settings and seed, before any searched value
+    scenario: Scenario  # scenario with the file's settings
+    question: Mapping[str, Any]  # all settings and versions that a trial's harm depends on, as plain data
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
@@ -342,8 +356,9 @@ class TuningPlan:
         return plan
 
     def training(self, values: Values) -> Training:
-        """Return the training of a trial, with evaluations so often that all trials can be compared on the way.
+        """Return the training of a trial with these values of the searched keys.
 
+        It is evaluated as often as the file's ``measure.times`` says, so that all trials can be compared on the way.
         Raises ``InvalidInput`` if the values do not go together.
         """
         recipe = read_settings(texts_of(values), [self.recipe]).change(self.recipe)
@@ -353,17 +368,17 @@ class TuningPlan:
         return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
-        """Return the number of updates of a whole training."""
+        """Return the number of updates of a whole training by this recipe."""
         return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
 
     def own_values(self) -> dict[str, Any] | None:
-        """Return the recipe's own values; None if one of them is not in the space."""
+        """Return the recipe's own value of each searched key; None if one of them is not in the space."""
         content = self.recipe.model_dump(mode="json")
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
 
     def example(self) -> str:
-        """Return a command line that trains the same as a trial.
+        """Return a command line ``ethbrake train ...`` that trains the same as one of the trials.
 
         It is the first trial if the space contains the recipe's own values, else one with random values.
         """
@@ -394,13 +409,13 @@ class TuningPlan:
             raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """Return the study folder, which belongs to this tuning only."""
+        """Return the object that checks and locks the folder ``path``, which may belong to this tuning only."""
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
     def proposals(self, path: Path) -> list[Values]:
-        """Return the stored proposals of a folder in Optuna's form.
+        """Return the proposals (values of each trial so far) in the tuning's folder ``path``, as Optuna stores them.
 
-        Raises ``InvalidInput`` if one is not in the space.
+        Raises ``InvalidInput`` if one has other keys or values than the file's ``search`` allows.
         """
         file, space = path / PROPOSALS, self.file.search
         if not file.exists():
@@ -416,7 +431,10 @@ class TuningPlan:
         return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
-        """Return the training of a trial in the folder of a tuning. Equal trials share one training."""
+        """Return the training of a trial with these values, with its folder inside the tuning's folder ``path``.
+
+        Trials with equal values share one training.
+        """
         training = self.training(values)
         return TrainingJob(training, path / TRIALS / training.identity[:16], texts_of({**self.file.settings, **values}))
 
@@ -475,7 +493,10 @@ class TuningPlan:
     def _search(
         self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
-        """Return the proposals, and the last report of each of their trials."""
+        """Run the trials on Ray, and return all proposals and the last report of each of their trials.
+
+        ``known`` are the proposals of earlier runs; the other arguments are those of ``run``.
+        """
         from ray import tune
 
         from ethbrake_marl.extensions.studies.proposals import Proposals
@@ -503,9 +524,15 @@ class TuningPlan:
         return search.known, ends
 
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
-        """Return the text of a recipe that repeats the training with these values, named like its file.
+        """Return the YAML text of a recipe that repeats the training with these values.
+
+        Args:
+            values: value of each searched key.
+            file: path that the text will be written to; its name becomes the recipe's.
+            source: text for the recipe's key ``source``.
 
         Raises ``InvalidInput`` if the file's name is not a valid name of a recipe.
+
         """
         check_file_name("recipe", file.stem)
         described = f"Settings of {self.file.recipe} that `ethbrake study tune` found."
@@ -523,7 +550,7 @@ class TuningPlan:
         return recipe.text(f"# The best trial of a tuning, trained again: {command}\n")
 
     def has_exported(self, path: Path, file: Path) -> bool:
-        """Return whether a file is the exported recipe of one of the trials in this folder."""
+        """Return whether ``file`` is the exported recipe of one of the trials in the tuning's folder ``path``."""
         try:
             source, text = load_recipe(file).source, file.read_text("utf-8")
         except InvalidInput:
@@ -537,18 +564,18 @@ State = Literal["running", "finished", "pruned", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One trial and how it ended."""
+    """One trial of a tuning (a training with some values of the searched keys), and how it ended."""
 
-    number: int  # counted from 0
-    state: State
-    values: Values
-    harm: float | None  # m2/s2 on the tuning's list; None unless finished
-    figures: Mapping[str, Any]  # figures of a table; of a pruned trial, at the time when it stopped
-    reason: str  # reason of a failure
+    number: int  # number of the trial, from 0
+    state: State  # how it ended; ``pruned``: stopped early because of too much harm
+    values: Values  # value of each searched key
+    harm: float | None  # harm of its best policy on the tuning's list (m2/s2); None unless finished
+    figures: Mapping[str, Any]  # entries for the table (``FIGURES``) at its end, or when it was pruned
+    reason: str  # reason of a failure; else empty
 
     @classmethod
     def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
-        """Return a trial from its last report."""
+        """Return the trial ``number`` with these values, from its last report ``end`` (see ``run_trials``)."""
         reason = str(end.get(REASON, ""))
         state: State = "running"
         if reason:
@@ -561,31 +588,40 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TuningResult:
-    """Result of a tuning."""
+    """Trials after a run of a tuning, and the file of their table."""
 
-    table: Path
-    asked: int
-    trials: tuple[Trial, ...]
+    table: Path  # CSV file with a row for each trial that ended
+    asked: int  # number of trials that the folder should have at the end
+    trials: tuple[Trial, ...]  # trials that were begun, in order
 
     @property
     def counts(self) -> Counter[State]:
-        """Number of trials in each state."""
+        """State (``finished``, ``pruned``, ...) -> number of trials in it."""
         return Counter(each.state for each in self.trials)
 
     @property
     def interrupted(self) -> bool:
-        """Whether some trials did not end."""
+        """Whether some of the requested trials did not end, because Ctrl-C stopped the run."""
         return len(self.trials) < self.asked or "running" in self.counts
 
     @property
     def best(self) -> Trial | None:
-        """The finished trial with the least harm, the first one of equals; None if none has finished."""
+        """The finished trial with the least harm; of equal ones the first. None if no trial has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train to the end and report every evaluation. Ray stops a pruned trial in a report."""
+    """Train one trial to its end, in a worker process of Ray, and report every evaluation.
+
+    Ray stops a pruned trial at such a report.
+
+    Args:
+        config: ``{"trial": number, "values": proposal}``, values as Optuna stores them.
+        plan: the tuning.
+        path: folder of the tuning.
+
+    """
     from ray.tune import report
 
     job = plan.job(plan.file.values(config["values"]), path)
@@ -628,7 +664,7 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
 
 
 def _value_at(content: Any, key: str) -> Any:
-    """Return the value at a dotted key; None if there is none."""
+    """Return the value at a dotted key (``network.policy.0``) of the nested data ``content``; None if there is none."""
     for part in key.removeprefix("recipe.").split("."):
         if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
             content = content[int(part)]

@@ -1,4 +1,4 @@
-"""Measures of an agent's weakness, world by world."""
+"""Measures of how badly an agent does in each world, to search for its worst worlds."""
 
 from __future__ import annotations
 
@@ -30,29 +30,30 @@ HINDSIGHT = "best_harm"  # default reference of regret
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Measurements in some worlds, [n] each, m2/s2; minus infinity and NaN where the physics failed."""
+    """Measurements of an agent in n worlds (m2/s2)."""
 
-    score: Floats
-    harm: Floats
-    reference: Floats | None  # harm of the reference agent, or the bound of the shield
+    score: Floats  # [n] value of the measure, the larger the worse for the agent; -inf where the physics failed
+    harm: Floats  # [n] harm of the agent; NaN where the physics failed
+    # [n] harm of the agent to compare with, or bound of the agent's shield; None for the measure ``harm``.
+    reference: Floats | None
 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """Measure of how bad a world is for an agent.
+    """Measure of how badly an agent does in a world; calling it with a sample measures every world.
 
     ``harm``: its harm. ``regret``: its harm minus the harm of the reference, by default the best profile that a search
     finds with hindsight. ``difference``: the absolute difference between its harm and that of the reference. ``bound``:
     its harm minus the bound of its shield at the alert; above zero the bound is broken.
     """
 
-    name: MeasureName
-    agents: Mapping[str, Driver]  # the agent, and the reference agent if there is one
-    scenario: Scenario
-    harm_count: HarmCount
+    name: MeasureName  # one of the four measures above
+    agents: Mapping[str, Driver]  # by name: the agent, then the reference agent if there is one
+    scenario: Scenario  # scenario whose learners they drive
+    harm_count: HarmCount  # impacts that harm counts: each pair's first one (``first``) or all (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Measure in these worlds. If the physics fails with one of the agents the score is minus infinity."""
+        """Return the measurements in the worlds of ``sample``; if the physics fails in a world, its score is -inf."""
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
         try:
@@ -79,12 +80,20 @@ class Measure:
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
     ) -> Falsified:
-        """Try ``budget`` worlds of the scenario, and keep at most ``most`` of the worst that are far apart.
+        """Search the worlds of the scenario for those in which the agent is worst.
 
         Worlds without harm, regret or difference are not kept, so the result may be empty.
 
+        Args:
+            budget: number of worlds to try.
+            seed: seed of the search.
+            most: largest number of worst worlds to keep; they differ clearly from one another.
+            adaptive: whether to look around the worst worlds so far; False: worlds are drawn uniformly.
+            on_round: called with the number of worlds tried so far and ``budget``.
+
         Raises ``InvalidInput`` if the scenario draws nothing, or if none of the tried worlds belongs to it, and the
         exceptions of ``scenario.ranges``.
+
         """
         drawn = ranges(self.scenario)
 
@@ -122,7 +131,18 @@ class Measure:
 
     @classmethod
     def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
-        """Return the measure with that name. Raises ``InvalidInput`` if a reference is missing or not allowed."""
+        """Return the measure called ``name`` for an agent.
+
+        Args:
+            name: ``harm``, ``regret``, ``difference`` or ``bound``.
+            agent: spec of the agent.
+            against: spec of the agent to compare with; None: for ``regret`` the best profile that a search finds.
+            scenario: scenario whose learners they drive.
+            harm_count: impacts that harm counts.
+
+        Raises ``InvalidInput`` if an agent to compare with is missing or not allowed.
+
+        """
         chosen = next((each for each in MEASURES if each == name), None)
         if chosen is None:
             raise unknown_name("measure", name, MEASURES)

@@ -17,7 +17,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.chunks import Lineup
 from ethbrake_marl.evaluation.evaluation import Evaluation
-from ethbrake_marl.evaluation.measures import measures
+from ethbrake_marl.evaluation.measure_sets import measures
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import chunks_of, drive_chunk, evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise

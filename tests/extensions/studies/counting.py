@@ -106,6 +106,13 @@ def parent(process: int) -> int:
         return 0
 
 
+def works_for(process: int, driver: int) -> bool:
+    """Whether a process was begun by a driver, or by a process that the driver began."""
+    while process > 1 and process != driver:
+        process = parent(process)
+    return process == driver
+
+
 def end_when(command: list[Any], ready: Callable[[int], bool], by: signal.Signals) -> tuple[int, str]:
     """Run a command until ``ready(its process)``, then send it a signal; its exit status and what it told."""
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as driver:

@@ -18,6 +18,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.studies.cluster import connected
 from ethbrake_marl.extensions.studies.sweep import SweepFile, SweepPlan
 from ethbrake_marl.extensions.studies.tuning import TuningFile, TuningPlan
 from ethbrake_marl.files.yaml import read_yaml
@@ -25,7 +26,7 @@ from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.settings import read_settings
 from ethbrake_marl.training.training import Training
 from tests.extensions.studies.conftest import TRIALS, Write, study, write_yaml
-from tests.extensions.studies.counting import PROGRAM, ROOT, end_when, finished, holders
+from tests.extensions.studies.counting import PROGRAM, ROOT, end_when, finished, holders, works_for
 from tests.fixtures.commands import rows_of as read
 from tests.learning.tiny import marked
 
@@ -187,13 +188,28 @@ def test_disturbed_sweep__has_the_same_table(work: str, tiny: Path, write_sweep:
     alone = [*program[work], str(tmp_path / "alone"), "--jobs", "1"]
     subprocess.run(alone, cwd=ROOT, stderr=subprocess.DEVNULL, check=True)
     for number, by, status in ((1, signal.SIGKILL, -signal.SIGKILL), (2, signal.SIGINT, 130), (3, signal.SIGTERM, 130)):
-        found, _ = end_when(command, lambda _, number=number: finished(folder) >= number and holders(folder), by)
+
+        def ready(driver: int, number: int = number) -> bool:  # workers of the driver before may go on for a moment
+            return finished(folder) >= number and any(works_for(each, driver) for each in holders(folder))
+
+        found, _ = end_when(command, ready, by)
         assert found == status
         while holders(folder):  # processes whose driver was killed end by themselves
             time.sleep(0.01)
     ended = subprocess.run(command, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     assert (folder / TABLE).read_bytes() == (tmp_path / "alone" / TABLE).read_bytes()
+
+
+@pytest.mark.slow
+def test_connected__leaves_the_handlers_of_signals_as_they_were() -> None:
+    pytest.importorskip("ray")
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+    before = [signal.getsignal(number) for number in numbers]
+    with connected("local", 1):
+        for number in numbers:  # as Ray Tune does
+            signal.signal(number, lambda number, frame: None)
+    assert [signal.getsignal(number) for number in numbers] == before
 
 
 @pytest.mark.parametrize(("kind", "package"), [("sweep", "ray"), ("tuning", "ray"), ("tuning", "optuna")])

@@ -12,6 +12,7 @@ from ethbrake_marl.agents.learned import TRAINED_POLICY
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.reproduction.folder import Reproduction
+from ethbrake_marl.extensions.reproduction.making import choose_items, make_items
 from ethbrake_marl.scenario.catalogue import load_scenario
 from tests.extensions.report.browser.conftest import AGENTS, PAPER, wait_until
 from tests.extensions.report.test_report import whole_page
@@ -32,7 +33,7 @@ def report_page(open_page: Open, report_file: Path) -> Any:
 def reproduction_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of three items of the paper made again in few worlds."""
     settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction") / "out", 10)
-    settings.make(Reproduction.choose(["harm-distance", "accelerations", "gaps"]))
+    make_items(settings, choose_items(["harm-distance", "accelerations", "gaps"]))
     return settings.folder / "index.html"
 
 

@@ -27,91 +27,117 @@ BASELINE = "full_brake"
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One measure of an agent: a rate where each world has a true/false value, a mean where it has a number.
+    """One measure of an agent. Tables show its rate if its values are true/false, its mean if they are numbers.
 
-    ``of`` is a function of the outcome and the context of the measure's set. It returns a value for every world, [n],
-    or None where the outcome has none. Or ``of`` is the name of another measure, whose values are compared with the
-    baseline.
+    ``of`` is a function that takes the agent's outcome and the context that ``MeasureSet.prepare`` returned. It returns
+    a value for every world, [n], or None if the measure does not exist for this outcome. Alternatively ``of`` is the
+    name of another measure: then this measure compares the values of that one with the baseline's, as ``against`` says.
     """
 
-    name: str  # name in JSON
-    of: Callable[[Outcome, Any], Values | None] | str
+    name: str  # key in JSON results, unique among all measures
+    of: Callable[[Outcome, Any], Values | None] | str  # how the values are computed, see above
     heading: str = ""  # heading of its column in tables; "": no column
-    short: str = ""  # heading in a terminal
-    about: str = ""  # explanation for users; one is enough for headings that begin alike
+    short: str = ""  # short heading for terminals, possibly with line breaks
+    about: str = ""  # explanation for users; "": that of the measure whose heading begins with the same words
     percent: bool = False  # whether tables show percent
-    against: Literal["", "difference", "decrease"] = ""  # kind of comparison with the baseline, paired by world
+    # Comparison with the baseline, paired by world: none, mean difference, or relative decrease of the mean.
+    against: Literal["", "difference", "decrease"] = ""
     always: bool = True  # whether JSON shows null for a missing value, instead of omitting the key
 
     def values(self, outcome: Outcome, context: Any) -> Values | None:
-        """Return the measure's value in every world of an outcome, [n]; None if the measure does not exist for it."""
+        """Return the measure's value in every world of an outcome, [n].
+
+        ``context`` is what the measure's set prepared for the evaluation (``contexts_of``). Returns None if the measure
+        only compares another one with a baseline, if its set does not apply (context ``Silent``), or if the outcome
+        lacks it.
+        """
         if isinstance(self.of, str) or isinstance(context, Silent):
             return None
         return self.of(outcome, context)
 
     def column(self) -> Column:
-        """Return the measure's column in a table."""
+        """Return the measure's column in a table: heading, name, and how its numbers are shown."""
         shown = {"digits": 1, "scale": 100.0, "unit": " %"} if self.percent else {}
         return Column(self.heading, self.name, short=self.short, **shown)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """Context of a set of measures that does not apply to an evaluation."""
+    """Context of a set of measures that does not apply to an evaluation; its measures then have no values."""
 
-    because: str  # reason, as a clause
+    because: str  # reason for users, as a clause without capital and full stop
 
 
 @dataclass(frozen=True, slots=True)
 class GroupColumn:
-    """Column of a set of measures in a table of several scenarios: one measure, and a note below the table."""
+    """Column that a set of measures adds to the table of ``ethbrake evaluate`` on a group of scenarios."""
 
-    column: Column
-    measures: Mapping[HarmCount, str]  # name of the shown measure, by the harm that agents minimise
-    note: str  # sentence with a placeholder ``{harm}``
+    column: Column  # heading, and how the numbers are shown
+    measures: Mapping[HarmCount, str]  # harm count that the agents minimise -> name of the measure to show
+    note: str  # sentence below the table; its placeholder ``{harm}`` becomes ``first-impact`` or ``total``
 
 
 class MeasureSet:
-    """Measures that need the same knowledge of the worlds, their *context*, computed once per evaluation.
+    """Base class of a set of measures that are computed from the same knowledge of the worlds.
 
-    A subclass lists its measures, and overrides the methods that it needs.
+    A subclass must list its measures in ``measures``. It may override ``prepare``, which computes the common knowledge
+    (the *context*) once per evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``,
+    which add texts to a results table. By default there is no context, and nothing is added.
     """
 
-    measures: tuple[Measure, ...] = ()
-    counted: tuple[Measure, ...] = ()  # true/false measures that are only counted, for ``row``, without an interval
+    measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
+    counted: tuple[Measure, ...] = ()  # true/false measures without a column, whose true worlds ``row`` can read
     baseline: str | None = None  # agent to compare with; None: the baseline of ``summarise``
-    whole: str | None = None  # counted measure; unless it is true everywhere, no comparisons, and means marked "≥"
-    narrow: tuple[str, ...] = ()  # columns that a narrow terminal shows, too, if they have values
-    notebook: tuple[str, ...] = ()  # columns that a notebook shows
-    group_column: GroupColumn | None = None
-    per_world: Mapping[str, Callable[[Outcome, Any], Values | None]] = {}  # columns of files with every world
+    # Name of a measure in ``counted`` that says whether a world's values are complete. If it is false in some world,
+    # means are marked "≥" and comparisons are omitted. None: all values are complete.
+    whole: str | None = None
+    narrow: tuple[str, ...] = ()  # names of measures that a narrow terminal also shows, if they have values
+    notebook: tuple[str, ...] = ()  # names of measures that a notebook shows
+    group_column: GroupColumn | None = None  # column in the table of a group of scenarios; None: no column
+    # Columns of files with one row per world: name -> function of outcome and context that returns values [n], or None.
+    per_world: Mapping[str, Callable[[Outcome, Any], Values | None]] = {}
     texts: frozenset[str] = frozenset()  # names of the ``per_world`` columns that hold texts
     because_key: str | None = None  # key in a result's conditions for the reason why the set does not apply
-    not_in_long_lists: str = ""  # why the set does not apply to lists that are not held in memory; "": it applies
+    not_in_long_lists: str = ""  # why the set does not apply to lists of more than 100,000 worlds; "": it applies
 
     def prepare(self, evaluation: Any) -> Any:
-        """Return the context that ``Measure.of`` gets for this ``Evaluation``, or ``Silent`` with a reason."""
+        """Return the context of this ``Evaluation``, which ``Measure.of`` gets as its second argument.
+
+        Return ``Silent`` with a reason if the set does not apply.
+        """
         return None
 
     def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
-        """Return more fields of an agent's JSON object, computed from its ``AgentTally``.
+        """Return fields that the set adds to an agent's object in the JSON results.
 
-        The keys must be the same where the set does not apply. ``context`` is None for a list that is not held in
-        memory.
+        The keys must be the same whether or not the set applies.
+
+        Args:
+            tally: the agent's ``AgentTally``, with the sums of its measures.
+            worlds: number of evaluated worlds.
+            context: what ``prepare`` returned, or ``Silent`` if the set does not apply; None for a list of more than
+                100,000 worlds.
+
         """
         return {}
 
     def warnings(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return warnings about these rows (``SummaryRow``), as clauses."""
+        """Return warnings about a results table, each a clause without capital and full stop; by default none.
+
+        ``rows`` are the table's rows (``SummaryRow``, one per agent).
+        """
         return ()
 
     def notes(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return notes below a table of these rows (``SummaryRow``), as sentences."""
+        """Return notes to print below a results table, each a whole sentence; by default none.
+
+        ``rows`` are the table's rows (``SummaryRow``, one per agent).
+        """
         return ()
 
 
 class EpisodeMeasures(MeasureSet):
-    """The core's measures, which need no knowledge of the worlds beyond the episodes."""
+    """The core's measures, computed from the episodes alone; their context is None."""
 
     measures = (
         Measure(
@@ -176,7 +202,12 @@ class EpisodeMeasures(MeasureSet):
 
 
 class RegisteredMeasures(MeasureSet):
-    """Measures that the user registered, one for each column of an outcome; see ``register_measure``."""
+    """Measures that the user registered with ``register_measure``, one for each of ``Outcome.metrics``.
+
+    Args:
+        columns: keys of ``Outcome.metrics``.
+
+    """
 
     def __init__(self, columns: Iterable[str] = ()) -> None:
         self.measures = tuple(Measure(COLUMN + name, partial(_registered, name), heading_of(name)) for name in columns)
@@ -190,10 +221,11 @@ EPISODE = EpisodeMeasures()
 
 
 def register_measure_set(name: str, measures: MeasureSet) -> None:
-    """Add a set of measures to every evaluation.
+    """Add a set of measures to every evaluation, under a name that is a key of ``MEASURE_SETS``.
 
-    This function also adds the entry points of ``ethbrake_marl.measure_sets``. Raises ``InvalidInput`` if ``measures``
-    is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one of its measures is taken.
+    An installed package does the same with an entry point of the group ``ethbrake_marl.measure_sets``. Raises
+    ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one of its
+    measures is taken.
     """
     if not isinstance(measures, MeasureSet):
         raise InvalidInput(f"set of measures {name!r}: must be a MeasureSet")
@@ -208,32 +240,44 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 
 
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
-    """Return the context of every installed set for an evaluation, by the set's name; each is computed once.
+    """Return the context of each installed set of measures for an ``Evaluation``, by the set's name.
 
-    ``long_list``: the evaluation is a part of a list that is not held in memory.
+    The context is what ``MeasureSet.prepare`` returned: the set's knowledge of the worlds, or ``Silent`` with the
+    reason why the set does not apply. It is computed once per evaluation. ``long_list``: the evaluation is a part of a
+    list of more than 100,000 worlds, to which some sets do not apply.
     """
     silent = silent_in_long_lists() if long_list else {}
     return {name: silent.get(name) or evaluation.once(each.prepare) for name, each in MEASURE_SETS.items()}
 
 
 def silent_in_long_lists() -> dict[str, Silent]:
-    """Return the sets that do not apply to lists that are not held in memory, by name."""
+    """Return why sets of measures do not apply to lists of more than 100,000 worlds: name of the set -> ``Silent``."""
     return {name: Silent(why) for name, each in MEASURE_SETS.items() if (why := each.not_in_long_lists)}
 
 
 def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
-    """Return why sets do not apply, by their key in the conditions; None where they do."""
+    """Return why sets of measures do not apply, by ``MeasureSet.because_key``; None for a set that applies.
+
+    ``contexts`` are those of ``contexts_of``. Sets without such a key are omitted.
+    """
     found = {key: contexts[name] for name, each in MEASURE_SETS.items() if (key := each.because_key) is not None}
     return {key: context.because if isinstance(context, Silent) else None for key, context in found.items()}
 
 
 def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
-    """Iterate over all sets by name, in the order of JSON; ``columns`` are an outcome's registered measures."""
+    """Yield (name, set) for all sets of measures, in the order in which JSON results hold their measures.
+
+    The set of the core (``EpisodeMeasures``) and that of the user's measures have the name "". ``columns`` are the keys
+    of ``Outcome.metrics``, the measures that the user registered.
+    """
     yield "", EPISODE
     yield "", RegisteredMeasures(columns)
     yield from MEASURE_SETS.items()
 
 
 def measures(columns: Iterable[str] = ()) -> tuple[Measure, ...]:
-    """Return all measures, in the order of JSON; ``columns`` as in ``every_set``."""
+    """Return the measures of all sets, in the order in which JSON results hold them.
+
+    ``columns`` are the keys of ``Outcome.metrics``, the measures that the user registered.
+    """
     return tuple(measure for _, each in every_set(columns) for measure in each.measures)
