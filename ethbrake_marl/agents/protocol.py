@@ -16,6 +16,7 @@ from ethbrake_marl.engine.engine import Engine, Guard
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, is_state_free
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.physics.state import Floats, Worlds
 
 
@@ -142,10 +143,12 @@ def fixed_commands(
         is_fixed: whether the command of a script is fixed at the alert.
         advice: end of the error message.
 
-    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, and for worlds whose braking profiles
-    are not those of the scripts.
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, for worlds whose braking profiles are
+    not those of the scripts, and where messages lack a piece that looking ahead needs.
 
     """
+    if vehicle is not None:
+        refuse_untold(worlds, [vehicle], who)
     command = -worlds.vehicles.braking_capacity_mps2
     for i, script in scripts.items():
         if i == vehicle:

@@ -137,7 +137,8 @@ class Evaluation:
 
         It does where messages arrive late, only from time to time, or not at all.
         """
-        from_each = [self.worlds.vehicles.hide_from(i) | Messages.of(self.worlds).periodic for i in self.vehicles]
+        messages, hides = Messages.of(self.worlds), self.worlds.vehicles.hide_from
+        from_each = [hides(i) | messages.periodic | messages.withhold_from(i) for i in self.vehicles]
         hidden: Bools = np.logical_or.reduce([np.zeros(self.worlds.n, np.bool_), *from_each])
         return hidden
 

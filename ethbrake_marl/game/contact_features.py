@@ -18,6 +18,7 @@ from ethbrake_marl.game.features import CONTACT_COMMANDS, CONTACT_SIDES
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.contact_forecast import CONTACT, forecast_contacts
 from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.messages import knows_line
 from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.rows import FLAG, ROW, place_obstacle, place_rates
 from ethbrake_marl.physics.state import Bools, Floats, Ints
@@ -100,7 +101,8 @@ def observe_contacts(
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
     """Write the part of a world that a vehicle knows into a table; return the first and last column that it knows.
 
-    Unknown vehicles are placed far away. If an obstacle is known, it is the first column.
+    Unknown vehicles are placed far away, and so are those of which a piece is unknown that a forecast needs. If an
+    obstacle is known, it is the first column.
 
     Args:
         table: table to fill, in the layout of ``physics.rows``, [rows, N + at].
@@ -116,10 +118,14 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
     braking, latency, mass, limit, news = of.braking, of.latency, of.mass, of.limit, of.news
     by_link, time = params.shape[1] > of.own_latency, state[k, of.time]
     own_part = of.own_latency if by_link else latency
-    first, last = i, i
+    first, last, told = i, i, params[k, of.messages :]
     while first > 0 and time >= params[k, news + i * N + first - 1 if by_link else latency + i]:
+        if not knows_line(told, N, i, first - 1, time):
+            break
         first -= 1
     while last < N - 1 and time >= params[k, news + i * N + last + 1 if by_link else latency + i]:
+        if not knows_line(told, N, i, last + 1, time):
+            break
         last += 1
     for j in range(N):
         known = first <= j <= last

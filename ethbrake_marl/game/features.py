@@ -15,7 +15,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
-from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.messages import INTENT, PIECES, Messages, Piece
 from ethbrake_marl.physics.state import Floats, Worlds, make_worlds
 from ethbrake_marl.registry import Registry
 
@@ -139,6 +139,7 @@ class RegisteredFeature:
     of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
     unknown: float  # value for an unknown neighbour, in the feature's unit
     tried: tuple[float, ...]  # values in a few test worlds, which reveal a changed function
+    reads: tuple[Piece, ...] | None = None  # pieces of a neighbour's message that the function reads; None: not said
 
     def scaled(self, value: Floats) -> Floats:
         """Return the observed number ``clip(value / scale, low, high)`` for a ``value`` in the feature's unit."""
@@ -187,6 +188,11 @@ def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     return np.where(np.isfinite(told), told, 0.0)
 
 
+def intent(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
+    """Return the command that the neighbour chose at its last decision, as its newest message told it, [n] m/s2."""
+    return Messages.of(worlds).intents(vehicle)[:, neighbour]
+
+
 def build_up_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
     """Return the time in which the brakes of the neighbour build up from 0 to full, [n] s; 0: at once.
 
@@ -213,8 +219,21 @@ def place(worlds: Worlds, vehicle: int) -> Floats:
     return np.full(worlds.n, float(vehicle))
 
 
-def _single(name: str, high: float, function: Callable[..., Floats], of: Of, meaning: str) -> RegisteredFeature:
-    return RegisteredFeature(Feature(name, "s", 1.0, 0.0, high, meaning), function, of, 0.0, (0.0, 0.0, 0.0))
+def _single(
+    name: str, high: float, function: Callable[..., Floats], of: Of, meaning: str, *reads: Piece
+) -> RegisteredFeature:
+    return RegisteredFeature(Feature(name, "s", 1.0, 0.0, high, meaning), function, of, 0.0, (0.0, 0.0, 0.0), reads)
+
+
+def _knows(piece: Piece) -> RegisteredFeature:
+    """Return the feature that is 1 where the vehicle knows this piece of the neighbour."""
+    meaning = f"1 if its {piece.replace('_', ' ')} is known: a message told it, or, where sensors can, it is measured"
+    feature = Feature(f"{piece}_known", "1", 1.0, 0.0, 1.0, meaning)
+    return RegisteredFeature(feature, _certain, "neighbour", 0.0, (1.0, 1.0, 1.0), (piece,))
+
+
+def _certain(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
+    return np.ones(worlds.n)
 
 
 _BUILT_IN: dict[str, RegisteredFeature] = {
@@ -222,10 +241,31 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
         "age", 8.0, age, "neighbour", "time since the sample that was last told of it; 0 where the present is known"
     ),
     "build_up_time": _single(
-        "build_up_time", 4.0, build_up_time, "neighbour", "time in which its brakes build up from 0 to full; 0: at once"
+        "build_up_time",
+        4.0,
+        build_up_time,
+        "neighbour",
+        "time in which its brakes build up from 0 to full; 0: at once",
+        "braking_capacity",
     ),
+    "intent": RegisteredFeature(
+        Feature(
+            "intent", "m/s2", 10.0, -2.0, 2.0, "command that it chose at its last decision; where messages tell it"
+        ),
+        intent,
+        "neighbour",
+        0.0,
+        (0.0, 0.0, 0.0),
+        (PIECES[INTENT],),
+    ),
+    **{f"{piece}_known": _knows(piece) for piece in PIECES},
     "release_time": _single(
-        "release_time", 4.0, release_time, "neighbour", "time in which its full brakes are released; 0: at once"
+        "release_time",
+        4.0,
+        release_time,
+        "neighbour",
+        "time in which its full brakes are released; 0: at once",
+        "braking_capacity",
     ),
     "own_build_up_time": _single(
         "own_build_up_time", 4.0, build_up_time, "own", "time in which own brakes build up from 0 to full; 0: at once"
@@ -357,6 +397,7 @@ def register_feature(
     high: float,
     of: Of = "own",
     unknown: float = 0.0,
+    reads: Sequence[Piece] | None = None,
 ) -> None:
     """Register ``name`` as a feature that an ``observation:`` may list; its meaning is the function's docstring.
 
@@ -375,6 +416,8 @@ def register_feature(
         high: see ``scale``; above ``low``.
         of: ``own`` or ``neighbour``. A neighbour's feature is observed only if the vehicle has its news.
         unknown: value of a neighbour's feature if the vehicle knows nothing of the neighbour, in ``unit``.
+        reads: pieces of the neighbour's message that the function needs (``v2x: tells``); where one is not known, the
+            value is ``unknown``. None: not said, so scenarios whose messages lack a piece refuse the feature.
 
     A channel hides nothing from a feature of kind ``own``: its author decides what it reveals of other vehicles.
     Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is taken; ``InvalidInput``
@@ -392,8 +435,13 @@ def register_feature(
             f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: must be own, or neighbour (with any unknown)"
         )
 
+    if reads is not None and not (of == "neighbour" and not isinstance(reads, str) and set(reads) <= set(PIECES)):
+        raise InvalidInput(
+            f"feature {name!r}: reads = {reads!r}: a neighbour's feature names some of {', '.join(PIECES)}"
+        )
+
     feature = Feature(name, str(unit), float(scale), float(low), float(high), " ".join(str(function.__doc__).split()))
-    entry = RegisteredFeature(feature, function, of, float(unknown), ())
+    entry = RegisteredFeature(feature, function, of, float(unknown), (), None if reads is None else tuple(reads))
     entry = replace(entry, tried=_tried(entry))
     sides = (f"{side}_{k}" for side in ("front", "rear") for k in range(MOST_NEIGHBOURS + 1))
     taken = {*GROUPS._fields[:-1], *sides, *(feature.name for group in GROUPS for feature in group)}

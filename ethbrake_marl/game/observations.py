@@ -28,6 +28,18 @@ from ethbrake_marl.game.features import (
 from ethbrake_marl.physics.columns import Packed, columns
 from ethbrake_marl.physics.estimates import estimate_rows
 from ethbrake_marl.physics.jit import compiled
+from ethbrake_marl.physics.messages import (
+    ACCELERATION,
+    BRAKING_CAPACITY,
+    INTENT,
+    LATENCY,
+    MASS,
+    PIECES,
+    PLACE,
+    SPEED,
+    Messages,
+    knows_piece,
+)
 from ethbrake_marl.physics.motion import stopping_distance
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
@@ -193,6 +205,24 @@ class Extra(NamedTuple):
     offset: int  # place of the neighbour relative to the vehicle, -1 is the next one ahead; 0: the vehicle itself
     known: int  # column of the neighbour's feature ``known`` among the built-in features
 
+    def known_in(self, worlds: Worlds, vehicle: int, neighbour: int) -> NDArray[np.bool_]:
+        """Return the worlds [n] in which ``vehicle`` knows every piece of the neighbour that the feature reads.
+
+        Raises ``InvalidInput`` for a feature that does not say what it reads, where messages do not contain everything.
+        """
+        messages, reads = Messages.of(worlds), self.entry.reads
+        if not messages.says_contents:
+            return np.full(worlds.n, PIECES[INTENT] not in (reads or ()))
+        if reads is None:
+            for piece in messages.lacks(neighbour):
+                raise InvalidInput(
+                    f"feature {self.entry.feature.name!r}: vehicle_{neighbour + 1} does not tell its {piece} (v2x:"
+                    " tells), and the feature does not say what it reads: register_feature(..., reads=['place'])"
+                )
+            return np.ones(worlds.n, np.bool_)
+        known = messages.known_pieces(vehicle, worlds.time_s)[:, neighbour]
+        return np.asarray(known[:, [PIECES.index(piece) for piece in reads]].all(axis=1), np.bool_)
+
 
 class Plan(NamedTuple):
     """How to compute an observation from worlds: kernels fill whole groups, functions compute registered features."""
@@ -216,19 +246,31 @@ class Plan(NamedTuple):
             steps: number of steps so far, [n], for messages.
 
         """
-        if not Packed(state, params).has_messages:
+        packed = Packed(state, params)
+        if not packed.has_messages:
             return self._observe_present(state, params, vehicles, steps)
+        messages = Messages(params[:, packed.column.messages :], packed.column.vehicles)
+        says = messages.says_contents
+        if not messages.periodic.any():
+            return self._observe_present(state, params, vehicles, steps, says=says)
         estimate, seen = np.empty(state.shape), []
         for vehicle in vehicles.tolist():
             estimate_rows(state, params, vehicle, estimate)
-            seen.append(self._observe_present(estimate, params, np.array([vehicle]), steps))
+            seen.append(self._observe_present(estimate, params, np.array([vehicle]), steps, says=says))
         return np.concatenate(seen, axis=1)
 
-    def _observe_present(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None) -> Observations:
-        """Version of ``observe`` without estimation: a known vehicle is observed in its present state."""
+    def _observe_present(
+        self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None, *, says: bool = False
+    ) -> Observations:
+        """Version of ``observe`` without estimation: a known vehicle is observed in its present state.
+
+        ``says``: whether the worlds say what messages contain.
+        """
         shape = len(state), len(vehicles)
         whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
         _observe_rows(state, params, vehicles, *self.scaling, whole)
+        if says:
+            _hide_untold(state, params, vehicles, *self.scaling[:3], whole)
         if self.contacts is not None:
             found = np.zeros((*shape, self.contacts.features.shape[1]), np.float32)
             failed = np.zeros(len(state), np.bool_)
@@ -246,6 +288,8 @@ class Plan(NamedTuple):
         for extra, (o, vehicle) in product(self.extras, enumerate(vehicles.tolist())):
             neighbour = vehicle + extra.offset if extra.offset else None
             counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
+            if neighbour is not None and counts.any():
+                counts &= extra.known_in(worlds, vehicle, neighbour)
             if counts.any():  # a neighbour's feature counts where the neighbour is known
                 values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
             else:  # no such neighbour, or no news of it
@@ -373,6 +417,37 @@ def _observe_rows(
                     value[c + 4] = _fitting_deceleration(own_speed, own_latency, gap)
             for c in range(out.shape[2]):
                 out[k, o, c] = min(max(value[c] * features[0, c], features[1, c]), features[2, c])
+
+
+@compiled
+def _hide_untold(
+    state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, out: Observations
+) -> None:
+    """Set features in ``out`` to 0 that need a piece of a neighbour which the observer does not know.
+
+    Where no piece of it is known, all of its features are 0. The obstacle is known with the place of Vehicle 1.
+    """
+    of = columns(state)
+    N, knows = of.vehicles, np.zeros(len(PIECES), np.bool_)
+    for k in range(out.shape[0]):
+        told, time = params[k, of.messages :], state[k, of.time]
+        for o in range(observers.shape[0]):
+            i, c = observers[o], _OWN
+            for offset in offsets:
+                if out[k, o, c] == 1.0:
+                    for piece in range(len(PIECES)):
+                        knows[piece] = knows_piece(told, N, i, i + offset, piece, time)
+                    stops = knows[PLACE] and knows[SPEED] and knows[BRAKING_CAPACITY] and knows[LATENCY]
+                    kept = (
+                        knows.any(), knows[PLACE], knows[SPEED], knows[ACCELERATION], knows[BRAKING_CAPACITY],
+                        knows[MASS], knows[LATENCY], knows.any(), stops, stops,
+                    )  # fmt: skip
+                    for f in range(_NEIGHBOUR):
+                        out[k, o, c + f] = out[k, o, c + f] if kept[f] else 0.0
+                c += _NEIGHBOUR
+            c += _ROLE if role else 0
+            if with_obstacle and i > 0 and not knows_piece(told, N, i, 0, PLACE, time):
+                out[k, o, c : c + _OBSTACLE] = 0.0
 
 
 @compiled

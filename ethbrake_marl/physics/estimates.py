@@ -6,7 +6,17 @@ import numpy as np
 
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.jit import compiled
-from ethbrake_marl.physics.messages import CHANNEL, LINK, link_at, place_at
+from ethbrake_marl.physics.messages import (
+    ACCELERATION,
+    CHANNEL,
+    LINK,
+    PLACE,
+    SPEED,
+    has_contents,
+    knows_piece,
+    link_at,
+    place_at,
+)
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
 
@@ -18,7 +28,8 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
     For a vehicle that the observer knows: the newest received place and speed, extrapolated alone under the command
     received with them. A pair in which the observer sees both vehicles at present has its true gap. Hit flags are known
     for the observer's own pairs only. A vehicle that the observer does not know is put at rest, at the place of the
-    next vehicle towards the observer, so that it gives no information.
+    next vehicle towards the observer, so that it gives no information. A piece that messages do not tell is replaced
+    likewise: a place by that of the next vehicle, a speed or a command by 0.
 
     Args:
         state: true state rows of the worlds, [n, S], in the layout of ``physics.columns``.
@@ -36,6 +47,7 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
         if params[k, head + CHANNEL.PERIOD] == 0.0:
             continue
         told, time = params[k, head:], state[k, column.time]
+        says = has_contents(told, N)
         place[observer], fresh[observer] = told[place_at(N) + observer], True
         for way in (-1, 1):
             last = place[observer]
@@ -47,10 +59,19 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
                 out[k, speed + j], out[k, command + j], place[j] = 0.0, 0.0, last
                 if known:
                     limit, age = params[k, column.limit + j], time - told[link + LINK.TOLD_S]
-                    after, passed = moved_on(told[link + LINK.TOLD_SPEED], told[link + LINK.TOLD_COMMAND], limit, age)
-                    out[k, speed + j], out[k, command + j] = after, told[link + LINK.TOLD_COMMAND]
-                    place[j] = told[link + LINK.TOLD_PLACE] + passed
-                    last = place[j]
+                    then, force = told[link + LINK.TOLD_SPEED], told[link + LINK.TOLD_COMMAND]
+                    if says and not knows_piece(told, N, observer, j, ACCELERATION, time):
+                        force = 0.0
+                    after, passed = moved_on(then, force, limit, age)
+                    out[k, command + j] = force
+                    if says and not knows_piece(told, N, observer, j, SPEED, time):
+                        after = passed = 0.0
+                    out[k, speed + j] = after
+                    if says and not knows_piece(told, N, observer, j, PLACE, time):
+                        fresh[j] = False
+                    else:
+                        place[j] = told[link + LINK.TOLD_PLACE] + passed
+                        last = place[j]
                 j += way
         for p in range(N - 1):
             if not (fresh[p] and fresh[p + 1]):

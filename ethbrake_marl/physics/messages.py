@@ -16,15 +16,26 @@ place   N, present place of each vehicle (m; 0 is the front of Vehicle 1 at the 
 links   N * N times the columns of ``_Link``, ordered by receiver, then sender
 ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
         and places, speeds and commands in force of all vehicles
+
+Where the scenario says what a message contains (``v2x: tells``), the link of Vehicle 1 to itself is marked, a block of
+contents stands between links and ring, and each sample also has the commands chosen at the last decision (*intents*,
+N columns). Such columns exist without periodic messages too.
+
+contents    N * CONTENTS: 1 if messages of this vehicle contain the piece
+intents     N, present intent of each vehicle (m/s2)
+told        N * N, by receiver, then sender: intent in the newest message received (m/s2)
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.columns import Columns, columns
 from ethbrake_marl.physics.episode import onset_s
 from ethbrake_marl.physics.jit import compiled
@@ -33,6 +44,18 @@ from ethbrake_marl.physics.pieces import force_at, force_now
 from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, place_forces, place_obstacle, rows_for
 from ethbrake_marl.physics.segment import advance_table
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
+
+Piece = Literal["place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent"]
+
+PIECES: tuple[Piece, ...] = get_args(Piece)  # what a message may contain
+
+MEASURED = PIECES[:3]  # what sensors measure of a vehicle in sight
+
+USUAL_PIECES = PIECES[:-1]  # what a message contains unless the scenario says otherwise
+
+PLACE, SPEED, ACCELERATION, BRAKING_CAPACITY, LATENCY, MASS, INTENT = range(7)  # indices into PIECES
+
+CONTENTS = len(PIECES)  # number of columns that say what messages of one vehicle contain
 
 
 class _Channel(NamedTuple):
@@ -94,12 +117,72 @@ def link_at(receiver: int, sender: int, vehicles: int) -> int:
 
 
 @compiled
-def ring_at(vehicles: int) -> int:
+def contents_at(vehicles: int) -> int:
+    """Return the first column of the contents, relative to the head; without contents the ring begins here."""
+    return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
+
+
+@compiled
+def intent_at(vehicles: int) -> int:
+    """Return the first column of the intents, relative to the head; those that were told follow after N columns."""
+    return contents_at(vehicles) + CONTENTS * vehicles
+
+
+@compiled
+def has_contents(told: Floats, vehicles: int) -> bool:
+    """Return whether a row of message columns says what messages contain."""
+    return bool(told.shape[0] > 0 and told[link_at(0, 0, vehicles) + LINK.NUMBER] == 1.0)
+
+
+@compiled
+def ring_at(told: Floats, vehicles: int) -> int:
     """Return the first column of the ring buffer of samples, counted from the first column of the messages.
 
     ``vehicles`` is N.
     """
-    return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
+    contents = vehicles * (CONTENTS + 1 + vehicles) if has_contents(told, vehicles) else 0
+    return contents_at(vehicles) + contents
+
+
+@compiled
+def sample_width(told: Floats, vehicles: int) -> int:
+    """Return the number of columns of a sample in the ring buffer."""
+    return RING_HEAD + (4 if has_contents(told, vehicles) else 3) * vehicles
+
+
+@compiled
+def knows_piece(told: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
+    """Return whether ``receiver`` knows a piece of ``sender``, whose message or sight has arrived by ``time`` (s).
+
+    ``told`` is a row of message columns, or empty. Place, speed and acceleration are measured once the sender is in
+    sight. The intent comes by message alone. A piece that messages contain but sensors do not measure is known from the
+    first message or sight on.
+    """
+    if not has_contents(told, vehicles):
+        return piece != INTENT
+    link = link_at(receiver, sender, vehicles)
+    if piece <= ACCELERATION and told[link + LINK.SEEN_FROM] <= time:
+        return True
+    heard = told[link + LINK.NUMBER] > 0.0 or told[link + LINK.NEXT_SENT] + told[CHANNEL.DELAY] <= time
+    said: bool = told[contents_at(vehicles) + CONTENTS * sender + piece] == 1.0
+    return said and (piece != INTENT or heard)
+
+
+@compiled
+def knows_line(told: Floats, vehicles: int, receiver: int, sender: int, time: float) -> bool:
+    """Return whether ``receiver`` knows every piece of ``sender`` that is needed to foretell its motion."""
+    known = True
+    for piece in range(INTENT):
+        known = known and knows_piece(told, vehicles, receiver, sender, piece, time)
+    return known
+
+
+@compiled
+def _known_pieces(told: Floats, time: Floats, vehicles: int, receiver: int, known: NDArray[np.bool_]) -> None:
+    for k in range(known.shape[0]):
+        for j in range(vehicles):
+            for piece in range(CONTENTS):
+                known[k, j, piece] = knows_piece(told[k], vehicles, receiver, j, piece, time[k])
 
 
 class Told(NamedTuple):
@@ -139,7 +222,7 @@ class Messages(NamedTuple):
     @classmethod
     def silent(
         cls, heard_s: Floats, seen_s: Floats, key: Floats, samples: int, *, period_s: float, delay_s: float,
-        loss_begins: float, loss_ends: float,
+        loss_begins: float, loss_ends: float, contents: Bools | None = None,
     ) -> Messages:  # fmt: skip
         """Return the messages of n worlds at the alert (time 0), before any message is sent.
 
@@ -152,10 +235,16 @@ class Messages(NamedTuple):
             delay_s: time from sending a message to its use, s.
             loss_begins: probability that a good channel turns bad, per message.
             loss_ends: probability that a bad channel turns good again, per message.
+            contents: whether messages of vehicle j contain each of ``PIECES``, [N, CONTENTS]; None: all but intent.
 
         """
         n, N = heard_s.shape[:2]
-        silent = cls(np.zeros((n, ring_at(N) + samples * (RING_HEAD + 3 * N))), N)
+        links_end, marked = contents_at(N), np.zeros(contents_at(N))
+        marked[link_at(0, 0, N) + LINK.NUMBER] = contents is not None
+        silent = cls(np.zeros((n, ring_at(marked, N) + samples * sample_width(marked, N))), N)
+        silent.columns[:, :links_end] = marked
+        if contents is not None:
+            silent.columns[:, links_end : intent_at(N)] = contents.ravel()
         silent.columns[:, : CHANNEL.KEY] = period_s, delay_s, loss_begins, loss_ends
         silent.columns[:, CHANNEL.KEY] = key
         links, itself = silent.links, np.eye(N, dtype=np.bool_)
@@ -168,12 +257,69 @@ class Messages(NamedTuple):
     def links(self) -> Floats:
         """Columns of every link, [n, N, N, LINK.WIDTH], by world, receiver, sender and entry (``LINK``); a view."""
         N = self.vehicles
-        return self.columns[:, link_at(0, 0, N) : ring_at(N)].reshape(-1, N, N, LINK.WIDTH)
+        return self.columns[:, link_at(0, 0, N) : contents_at(N)].reshape(-1, N, N, LINK.WIDTH)
 
     @property
     def periodic(self) -> Bools:
         """Whether a world sends messages periodically, so that knowledge of others ages between them, [n]."""
         return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
+
+    @property
+    def contents(self) -> Bools:
+        """Whether messages of each vehicle contain each of ``PIECES``, [n, N, CONTENTS]."""
+        usual = np.array([piece in USUAL_PIECES for piece in PIECES])
+        n, N = len(self.columns), self.vehicles
+        contents = np.broadcast_to(usual, (n, N, CONTENTS)).copy()
+        if self.says_contents:
+            contents[:] = self.columns[:, contents_at(N) : intent_at(N)].reshape(n, N, -1) == 1.0
+        return contents
+
+    @property
+    def says_contents(self) -> bool:
+        """Whether the columns say what messages contain; in one batch all worlds do, or none."""
+        marked: bool = self.columns.shape[1] > 0 and bool((self.links[:, 0, 0, LINK.NUMBER] == 1.0).any())
+        return marked
+
+    def lacks(self, sender: int, pieces: Sequence[Piece] = USUAL_PIECES) -> tuple[Piece, ...]:
+        """Return those of ``pieces`` that the messages of ``sender`` do not contain in every world."""
+        always: Bools = np.logical_and.reduce(self.contents[:, sender])
+        return tuple(piece for piece in pieces if not always[PIECES.index(piece)])
+
+    def withhold_from(self, vehicle: int) -> Bools:
+        """Return the worlds [n] in which messages of another vehicle than ``vehicle`` lack a usual piece."""
+        others = np.delete(self.contents, vehicle, axis=1)[:, :, : len(USUAL_PIECES)]
+        return np.asarray(~others.all(axis=(1, 2)))
+
+    def seen_from_s(self, vehicle: int, other: int) -> Floats:
+        """Return when ``vehicle`` begins to measure ``other``, [n] s; infinite: never, or there are no columns."""
+        seen = self.links[:, vehicle, other, LINK.SEEN_FROM] if self.columns.shape[1] else None
+        return np.full(len(self.columns), np.inf) if seen is None else seen
+
+    def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
+        """Return which of ``PIECES`` of each other vehicle ``vehicle`` knows, [n, N, CONTENTS].
+
+        It applies to the vehicles whose message or sight has arrived by ``time_s`` [n].
+        """
+        known = np.empty((len(time_s), self.vehicles, CONTENTS), np.bool_)
+        _known_pieces(np.ascontiguousarray(self.columns), time_s, self.vehicles, vehicle, known)
+        return known
+
+    def intents(self, vehicle: int) -> Floats:
+        """Return the newest intent of each other vehicle that ``vehicle`` received, [n, N] m/s2; 0 without contents."""
+        n, N = len(self.columns), self.vehicles
+        if not self.says_contents:
+            return np.zeros((n, N))
+        at, told = intent_at(N), intent_at(N) + N + vehicle * N
+        periodic = self.periodic[:, np.newaxis]
+        return np.where(periodic, self.columns[:, told : told + N], self.columns[:, at : at + N])
+
+    def with_intents(self, intents_mps2: Floats) -> Floats:
+        """Return the columns with these present intents [n, N] of the vehicles; the same without contents."""
+        if not self.says_contents:
+            return self.columns
+        columns, at = self.columns.copy(), intent_at(self.vehicles)
+        columns[:, at : at + self.vehicles] = intents_mps2
+        return columns
 
     def newest_told(self, vehicle: int) -> Told:
         """Return the newest state of every vehicle that ``vehicle`` (index from 0) has received.
@@ -198,6 +344,31 @@ class Messages(NamedTuple):
             age[periodic] = np.where(told_s >= 0.0, time_s[:, np.newaxis, np.newaxis] - told_s, np.inf)[periodic]
             age[:, np.arange(self.vehicles), np.arange(self.vehicles)] = 0.0
         return age
+
+
+LOOK_AHEAD: tuple[Piece, ...] = ("place", "speed", "braking_capacity", "latency", "mass")  # what a simulation needs
+
+
+def refuse_untold(
+    worlds: Worlds,
+    vehicles: Sequence[int],
+    who: str,
+    needs: Sequence[Piece] = LOOK_AHEAD,
+    senders: Sequence[int] | None = None,
+) -> None:
+    """Raise ``InvalidInput`` if a message lacks a piece that ``who``, in control of ``vehicles``, needs of another one.
+
+    Several vehicles that are controlled together need the messages of each other, too. ``senders`` are the vehicles
+    whose messages are needed; None: all.
+    """
+    messages = Messages.of(worlds)
+    for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():
+        if tuple(vehicles) != (sender,) and (missing := messages.lacks(sender, needs)):
+            raise InvalidInput(
+                f"{who}: vehicle_{sender + 1} does not tell its {missing[0]} (v2x: tells), and"
+                f" {', '.join(needs)} of others are needed; let messages contain them, or take a policy alone, which"
+                " decides on what it observes"
+            )
 
 
 @compiled
@@ -248,9 +419,10 @@ def hear_rows(
     table = np.zeros((rows_for(pieces.shape[1]), N + 1))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(moving.shape[0]):
-        if params[k, head + CHANNEL.PERIOD] == 0.0:
-            continue
         told = params[k, head:]
+        if told[CHANNEL.PERIOD] == 0.0:
+            _choose(params[k], column, wanted[k], until_s[k])
+            continue
         if told[CHANNEL.TAKEN] == 0.0:
             _start(moving[k], params[k], column, wanted[k])
         while moving[k, column.time] < until_s[k]:
@@ -261,6 +433,7 @@ def hear_rows(
                 end = until_s[k]
             if not _move(moving[k], params[k], column, wanted[k], end, pieces, table, no_rows):
                 break
+            _choose(params[k], column, wanted[k], moving[k, column.time])
             _sample(moving[k], told, column)
             _receive(moving[k, column.time], told, N)
             if stops:
@@ -292,8 +465,24 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
         state[force + i] = force_now(
             state[force + i], wanted[i] if acts else 0.0, params[column.brake_rate + i], params[column.release_rate + i]
         )
+    _choose(params, column, wanted, state[column.time])
     _sample(state, told, column)
     _receive(state[column.time], told, N)
+
+
+@compiled
+def _choose(params: Floats, column: Columns, wanted: Floats, time: float) -> None:
+    """Write the present intents at ``time`` (s): the commands ``wanted`` that were chosen at the last decision.
+
+    A vehicle whose latency the channel extends does not know of the emergency before that, and has chosen nothing.
+    """
+    told, N = params[column.messages :], column.vehicles
+    if not has_contents(told, N):
+        return
+    for i in range(N):
+        latency = params[column.latency + i]
+        waits = latency > params[column.own_latency + i] and not command_acts(latency, time)
+        told[intent_at(N) + i] = 0.0 if waits else wanted[i]
 
 
 @compiled
@@ -361,7 +550,7 @@ def _sample(state: Floats, told: Floats, column: Columns) -> None:
     ``state``: state row of one world, [S]; ``told``: its columns of messages, updated; ``column``: layout of the state.
     """
     N, obstacle = column.vehicles, column.obstacle
-    width, first = RING_HEAD + 3 * N, ring_at(N)
+    width, first = sample_width(told, N), ring_at(told, N)
     at = first + width * (int(told[CHANNEL.TAKEN]) % ((told.shape[0] - first) // width))
     told[at] = state[column.time]
     told[at + 1] = state[obstacle + 1] if state.shape[0] > obstacle else 0.0
@@ -369,6 +558,8 @@ def _sample(state: Floats, told: Floats, column: Columns) -> None:
         told[at + RING_HEAD + i] = told[place_at(N) + i]
         told[at + RING_HEAD + N + i] = state[column.speed + i]
         told[at + RING_HEAD + 2 * N + i] = state[column.command + i]
+        if width > RING_HEAD + 3 * N:
+            told[at + RING_HEAD + 3 * N + i] = told[intent_at(N) + i]
     told[CHANNEL.TAKEN] += 1.0
 
 
@@ -387,7 +578,9 @@ def _receive(time: float, told: Floats, N: int) -> None:
                     bad = u >= told[CHANNEL.LOSS_ENDS] if bad else u < told[CHANNEL.LOSS_BEGINS]
                     told[link + LINK.BAD] = 1.0 if bad else 0.0
                 if not bad:
-                    _take(told, link, j, told[link + LINK.NEXT_SENT], N)
+                    at = _take(told, link, j, told[link + LINK.NEXT_SENT], N)
+                    if at > 0 and has_contents(told, N):  # a later message carries a later intent
+                        told[intent_at(N) + N + i * N + j] = told[at + RING_HEAD + 3 * N + j]
                 told[link + LINK.NUMBER] += 1.0
                 told[link + LINK.NEXT_SENT] += told[CHANNEL.PERIOD]
             if told[link + LINK.SEEN_FROM] <= time:
@@ -395,10 +588,11 @@ def _receive(time: float, told: Floats, N: int) -> None:
 
 
 @compiled
-def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
+def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> int:
     """Receive one message: copy the sender's newest sample from the ring buffer to the link.
 
     It is the newest sample taken at ``sent_s`` or earlier. Nothing changes if the receiver already has a newer one.
+    Return the first column of that sample; 0: none is left.
 
     Args:
         told: columns of messages of one world; updated.
@@ -408,8 +602,8 @@ def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
         N: number of vehicles.
 
     """
-    width, first = RING_HEAD + 3 * N, ring_at(N)
-    length = (told.shape[0] - first) // width
+    width, first = sample_width(told, N), ring_at(told, N)
+    length: int = (told.shape[0] - first) // width
     taken = int(told[CHANNEL.TAKEN])
     for back in range(min(length, taken)):
         at = first + width * ((taken - 1 - back) % length)
@@ -420,4 +614,5 @@ def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> None:
                 told[link + LINK.TOLD_PLACE] = told[at + RING_HEAD + sender]
                 told[link + LINK.TOLD_SPEED] = told[at + RING_HEAD + N + sender]
                 told[link + LINK.TOLD_COMMAND] = told[at + RING_HEAD + 2 * N + sender]
-            return
+            return at
+    return 0

@@ -1,7 +1,7 @@
 """The channel between vehicles: V2X messages on each link, losses, and on-board sensing as the fall-back.
 
-A message carries its sender's state, capacities and latency. On the link from vehicle j to vehicle i, i can use it
-from this time on:
+A message carries its sender's state, capacities and latency, or the pieces that ``tells`` names. On the link from
+vehicle j to vehicle i, i can use it from this time on:
 
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act        (T the message period)
 
@@ -32,14 +32,14 @@ from operator import not_
 from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.model import FileModel, Wording, explain, require
+from ethbrake_marl.files.model import FileModel, Wording, explain, require, suggestion
 from ethbrake_marl.files.yaml import Document
-from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES, Messages, Piece
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
 PER_LINK = 4  # uniform numbers per link: wait, burst, loss, hop; the output of one Philox counter
@@ -49,6 +49,8 @@ Hears = Literal["all", "front", "none"]
 Senses = Literal["both", "front", "none"]
 
 Persistence = Literal["first", "periodic"]
+
+Tells = tuple[Piece, ...] | Mapping[str, tuple[Piece, ...]]  # for all vehicles, or by name
 
 Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 
@@ -98,14 +100,22 @@ class Channel(NamedTuple):
     loss_begins: float = 0.0  # p, probability per message period that a burst of losses begins
     loss_ends: float = 1.0  # r, probability per message period that it ends; mean burst 1 / r periods
     lost: float = 0.0  # share of links on which no message ever arrives
-    message_period_s: float = 0.1  # T, time between two messages (s)
-    radio_s: float = 0.02  # L_radio, time on the air (s)
-    processing_s: float = 0.1  # t_proc, time until the receiver has read the message (s)
-    actuation_s: float = 0.2  # t_act, time until the brakes answer (s)
-    sensing_s: tuple[float, float] = (0.8, 1.1)  # smallest and largest delay of seeing a direct neighbour, a hop (s)
-    # what a vehicle knows of a sender after its first message: "first": the sender's present state; "periodic": the
-    # state in the newest message that has arrived
-    persistence: Persistence = "first"
+    message_period_s: float = 0.1  # T
+    radio_s: float = 0.02  # L_radio
+    processing_s: float = 0.1  # t_proc
+    actuation_s: float = 0.2  # t_act
+    sensing_s: tuple[float, float] = (0.8, 1.1)  # range from which a hop is drawn uniformly
+    persistence: Persistence = "first"  # after the first message, the present is known, or the newest message
+    tells: Tells | None = None  # pieces that a message contains; None: USUAL_PIECES
+
+    def contents(self, vehicles: int) -> Bools | None:
+        """Return whether messages of each vehicle contain each of ``PIECES``, [N, len(PIECES)]; None: as usual."""
+        if self.tells is None:
+            return None
+        each: list[tuple[Piece, ...]] = [USUAL_PIECES] * vehicles
+        for i in range(vehicles):
+            each[i] = self.tells.get(f"vehicle_{i + 1}", each[i]) if isinstance(self.tells, Mapping) else self.tells
+        return np.array([[piece in told for piece in PIECES] for told in each])
 
     @property
     def delay_s(self) -> float:
@@ -155,6 +165,33 @@ class _PresetSchema:
 Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
+def _pieces(value: Any) -> Tells | None:
+    """Check and sort what messages contain: a list of pieces for all vehicles, or one for each named vehicle."""
+    if value is None:
+        return None
+    by_name = isinstance(value, Mapping)
+    right = f"must be a list of {', '.join(PIECES)}, or such a list for each vehicle by name"
+    require(isinstance(value, list | tuple) or (by_name and len(value) > 0), (), value, right)
+    told: dict[str, tuple[Piece, ...]] = {}
+    for name, listed in value.items() if by_name else [("", value)]:
+        at = (name,) if by_name else ()
+        require(isinstance(name, str) and isinstance(listed, list | tuple), at, listed, right)
+        for k, piece in enumerate(listed):
+            hint = suggestion(piece, PIECES) if isinstance(piece, str) else ""
+            require(piece in PIECES, (*at, k), piece, f"{hint}; known: {', '.join(PIECES)}".removeprefix("; "))
+        require(len(set(listed)) == len(listed), at, listed, "names a piece twice")
+        told[name] = tuple(piece for piece in PIECES if piece in listed)
+    return told if by_name else told[""]
+
+
+class _TellsSchema:
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        listed = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True}
+        by_name = {"type": "object", "minProperties": 1, "additionalProperties": listed}
+        return {"anyOf": [listed, by_name]}
+
+
 class V2X(FileModel):
     """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/v2x.md``.
 
@@ -194,6 +231,12 @@ class V2X(FileModel):
         exclude_if=not_,
         description="whether what was once heard stays present, or grows old until the next message",
     )
+    tells: Annotated[Any, BeforeValidator(_pieces), _TellsSchema] = Field(
+        default=None,
+        exclude_if=lambda tells: tells is None,
+        description="what a message contains, for all vehicles or by name: place, speed, acceleration,"
+        " braking_capacity, latency, mass, intent; by default all but intent",
+    )
     vehicles: dict[str, Equipage] | None = Field(
         default=None,
         exclude_if=not_,
@@ -214,7 +257,9 @@ class V2X(FileModel):
         right = "nobody sends messages one by one here; give a preset that generates them, such as nominal"
         self._require(channel.persistence == "first" or sent, "persistence", right)
         if channel.hears == "none":
-            self._leave_out(("link_latency_s", "lost", "vehicles", *_OF_MESSAGES), "hears none has no messages")
+            self._leave_out(
+                ("link_latency_s", "lost", "vehicles", "tells", *_OF_MESSAGES), "hears none has no messages"
+            )
         elif channel.timing == "fixed":
             later = _OF_LATER if channel.persistence == "periodic" else ()
             parts = tuple(name for name in _OF_MESSAGES if name not in later)
@@ -263,6 +308,11 @@ class V2X(FileModel):
     def by_link(self) -> bool:
         """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency."""
         return self.channel != CHANNELS["paper"]
+
+    @property
+    def delays(self) -> bool:
+        """Whether the channel differs from the paper's rule in more than what messages contain."""
+        return self.channel._replace(tells=None) != CHANNELS["paper"]
 
     @property
     def drawn(self) -> bool:
@@ -351,14 +401,16 @@ class V2X(FileModel):
             equipped: V2X equipment, of each world or one for all.
 
         """
-        channel = self.channel
+        channel, contents = self.channel, self.channel.contents(worlds.N)
         worlds = replace(worlds, vehicles=self.with_news(worlds.vehicles, u, equipped))
-        if channel.persistence == "first":
+        if channel.persistence == "first" and contents is None:
             return worlds
+        periodic = channel.persistence == "periodic"
         heard, seen = self.heard_and_seen(u, equipped)
         messages = Messages.silent(
-            heard, seen, key * 2.0**53, channel.samples(time_step_s), period_s=channel.message_period_s,
-            delay_s=channel.delay_s, loss_begins=channel.loss_begins, loss_ends=channel.loss_ends,
+            heard, seen, key * 2.0**53, channel.samples(time_step_s),
+            period_s=channel.message_period_s if periodic else 0.0, delay_s=channel.delay_s if periodic else 0.0,
+            loss_begins=channel.loss_begins, loss_ends=channel.loss_ends, contents=contents,
         )  # fmt: skip
         return replace(worlds, messages=messages.columns)
 

@@ -5,6 +5,7 @@ Each check raises pydantic's error for the first defect, with the path inside th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from difflib import get_close_matches
 
 import numpy as np
@@ -68,13 +69,19 @@ def _check_reactions(scenario: ScenarioFields) -> None:
     for name in scenario.v2x.vehicles or ():
         right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
         require(name in scenario.vehicle_names, ("v2x", "vehicles", name), UNSHOWN, right)
+    tells = scenario.v2x.channel.tells
+    for name in tells if isinstance(tells, Mapping) else ():
+        right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
+        require(name in scenario.vehicle_names, ("v2x", "tells", name), UNSHOWN, right)
+        equipped = (scenario.v2x.vehicles or {}).get(name)
+        require(equipped is None or equipped.sends, ("v2x", "tells", name), UNSHOWN, "sends no messages (v2x.vehicles)")
     kinds = {name: kind.v2x for name, kind in (scenario.vehicle_types or {}).items() if kind.v2x is not None}
     right = f"v2x {scenario.v2x.preset} has no messages that a type could lack; give a v2x that has, such as nominal"
     for name, equipage in kinds.items():
         sent = scenario.v2x.channel.timing != "latency" and scenario.v2x.channel.hears != "none"
         require(sent, ("vehicle_types", name, "v2x"), equipage, right)
     right = "only without messages one by one (v2x: paper): what was heard before the alert is not modelled"
-    require(scenario.alert_s is None or not scenario.v2x.by_link, ("alert_s",), scenario.alert_s, right)
+    require(scenario.alert_s is None or not scenario.v2x.delays, ("alert_s",), scenario.alert_s, right)
     own = np.array([latest for _, latest in scenario.bounds("latency_s")])
     right = (
         f"with latency_s a vehicle may act as late as {own.max():g} s; it must be below horizon_s, which may be raised"

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.yaml import Document, flow_text
+from ethbrake_marl.physics.messages import USUAL_PIECES
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.member import Member
@@ -126,6 +127,13 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
             raise InvalidInput(
                 f"{where}: v2x.persistence must be the same in all, and so must the delay of periodic messages:"
                 f" {first.name} and {member.name} differ; give v2x beside mixture, and it holds for all"
+            )
+        says = [each.v2x.channel.tells is not None for each in (first, member)]
+        if says[0] != says[1]:
+            giver, silent = (first, member) if says[0] else (member, first)
+            raise InvalidInput(
+                f"{where}: {giver.name} has v2x.tells and {silent.name} has none: give it in each, if need be the usual"
+                f" [{', '.join(USUAL_PIECES)}]"
             )
 
 

@@ -114,7 +114,7 @@ def ranges(scenario: ScenarioFields) -> Ranges:
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)
         raise InvalidInput(f"scenario {scenario.name!r}: is a mixture; take one of its scenarios: {members}")
-    if scenario.v2x.by_link:
+    if scenario.v2x.delays:
         raise InvalidInput(
             f"scenario {scenario.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
             " (--set v2x=paper)"

@@ -24,6 +24,7 @@ from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.checks import check_scenario
@@ -64,6 +65,7 @@ class HybridAgent(AgentAround):
             scripts: index of each scripted vehicle -> its script.
 
         """
+        refuse_untold(alert, [vehicle], f"agent {self.name!r}")
         policy = begin_script(self.policy, alert, vehicle, scripts)
         backup = begin_script(self.backup, alert, vehicle, scripts)
         policy_harm = self._harm(alert, self.policy, vehicle)

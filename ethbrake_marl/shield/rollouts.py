@@ -20,6 +20,7 @@ from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.game.actions import action_to_command, command_to_action
 from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.motion import has_acted
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
@@ -164,7 +165,12 @@ def _later_plan(
         acts = np.where(has_acted(vehicles.latency_s, time[:, np.newaxis]), commands, 0.0)
         at_once = np.isinf(np.where(acts < force, vehicles.brake_rate_mps3, vehicles.release_rate_mps3))
         in_force = np.where(at_once, acts, force)
-        seen = replace(worlds_at(seen, episodes.states), time_s=time, command_mps2=in_force)
+        seen = replace(
+            worlds_at(seen, episodes.states),
+            time_s=time,
+            command_mps2=in_force,
+            messages=Messages.of(seen).with_intents(commands),
+        )
         with renumbered(rows):
             proposed, memories = proposed_actions(policies, memories, seen)
         action = proposed.reshape(first.shape)

@@ -48,6 +48,7 @@ from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, renumbered, unknown_name
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.episode import Decisions
+from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.certify import CONSTANTS, Backup, Decision, certify, from_now, plan_harm
@@ -193,7 +194,7 @@ class StepShield:
         """Start new episodes in some rows of the batch.
 
         To start a larger batch, pass all of its rows, 0 to k - 1, at once. Raises ``InvalidInput`` for other rows that
-        do not exist.
+        do not exist, and where messages lack a piece that certificates need.
 
         Args:
             worlds: the worlds of these rows at the alert, as the shield assumes them.
@@ -210,6 +211,7 @@ class StepShield:
                 f"shield: begin in row {rows.max()} of a batch of {running_rows}: a larger batch begins with all of its"
                 " rows at once"
             )
+        refuse_untold(worlds, self.vehicles, "shield")
         possible = self.members_of(worlds) if possible is None else possible
         self.memory = self.memory.put(rows, self._begun(worlds, rows, policy, possible))
 

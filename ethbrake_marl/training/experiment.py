@@ -25,6 +25,7 @@ from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.registry import Registry
@@ -132,6 +133,7 @@ def run_experiment(
     check_one_learner(scenario.name, names, "say which vehicle the agents drive")
     reports = [RUN_REPORTS[name] for name in RUN_REPORTS]  # one that cannot be loaded ends the run before it begins
     sample = scenario.sample(episodes, list_seed)
+    refuse_untold(sample.worlds, scenario.learners, "run, with the baseline e_v2x_bm and a shield")
     trained = train(
         recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
     )

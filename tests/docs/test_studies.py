@@ -34,8 +34,8 @@ from ethbrake_marl.training.recipe import Scheme
 from tests.docs.site import DOCS, load
 from tests.fixtures.installed import write_metadata
 
-sampling, price, equal_time, cooperative = (
-    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "cooperative")
+sampling, price, equal_time, cooperative, message_contents = (
+    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "cooperative", "message_contents")
 )
 
 
@@ -124,6 +124,20 @@ def test_cooperative__tells_how_likely_a_training_is_to_do_less_harm_than_ppos()
     assert alone[5][5:] == ["1.00", "–", "2.00", "–", "–"]
     assert cooperative.HEAD in [table.columns for table in load("results").read_tables("cooperation")]
     assert picture_bytes(cooperative.draw({level: (harms, braking)}), "learners.png").startswith(PNG)
+
+
+def test_message_contents__trains_each_content_once_and_compares_it_with_the_usual_pieces(
+    tmp_path, monkeypatch
+) -> None:
+    few = {name: message_contents.CONTENTS[name] for name in (message_contents.ALL, "with intent", "the alert alone")}
+    monkeypatch.setattr(message_contents, "CONTENTS", few)
+    effort = message_contents.Effort(seeds=1, steps=2_048, worlds=6)
+    rows = message_contents.table(tmp_path, effort)
+    assert [row[0] for row in rows] == [*few] and {len(row) for row in rows} == {len(message_contents.HEAD)}
+    assert rows[0][2::2] == ["–"] * 3 and all(cell[0] in "+-" for row in rows[1:] for cell in row[2::2])
+    assert len(list(tmp_path.iterdir())) == 9  # a training each, which are not made again
+    monkeypatch.setattr(eb, "train", None)
+    assert message_contents.table(tmp_path, effort) == rows
 
 
 # ---------------------------------------------------------------- pages

@@ -3,6 +3,7 @@
 bound         random worlds against every adversary of ``tests/shield/attacks.py``, both counts, N = 3 and 5, e to 0.3
 build-up      the same with brakes that build up, at rates from 5 to 60 m/s3; and where others brake in pieces
 joint         teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5; harm must be the last bound
+pieces        the same where messages contain some pieces alone, every selection of them: the shield refuses, or holds
 interfaces    worlds through every shielded interface, alone and with a team
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search        restarts of a search against the shield, and against twelve leaks of it, each of which must be found
@@ -13,14 +14,16 @@ horizon       what a bound is worth beyond its horizon; nothing is claimed
 
 import time
 from functools import partial
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.engine.profiles import profile_problem
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
+from ethbrake_marl.physics.messages import LOOK_AHEAD, PIECES
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.shield.certify import plan_harm
 from ethbrake_marl.shield.running import begin_running
@@ -35,6 +38,7 @@ from tests.shield.attacks import (
     Attack,
     above_later,
     attack,
+    begun,
     line,
     search,
 )
@@ -69,6 +73,7 @@ OPTIONS = {
     "--worlds": {"type": int, "default": 1_000_000, "help": "of 'bound', all cells together, about"},
     "--build-up-worlds": {"type": int, "default": 1_000_000, "help": "of 'build-up', all cells together, about"},
     "--joint-worlds": {"type": int, "default": 300_000, "help": "of 'joint', all cells together, about"},
+    "--piece-decisions": {"type": int, "default": 100_000, "help": "of 'pieces', all teams together, at least"},
     "--interface-worlds": {"type": int, "default": 2_000, "help": "through each interface"},
     "--interfered": {"type": int, "default": 1_000, "help": "episodes with failing calls on each interface"},
     "--corner-worlds": {"type": int, "default": 60_000, "help": "of 'believed'"},
@@ -99,6 +104,8 @@ def cases(given: Given) -> Cases:
         for name, way in product(lists, WAYS):
             each = max(1, worlds // (len(lists) * len(WAYS)))
             yield f"believed, {robust}: {name}, {way}", partial(believed, lists[name], way, each, seed, robust)
+    for which in TEAMS:
+        yield f"pieces: level {which[0]}, N = {which[1]}", partial(pieces, which, given.piece_decisions, seed)
     for name in PLAYS:
         yield f"interfaces: {name}", partial(interface, name, given.interface_worlds, seed)
     yield from attacks(given)
@@ -159,6 +166,39 @@ def attacked(scenario: Any, worlds: int, first: int, seed: int, case: dict[str, 
         wrong == 0,
         f"{worlds:,} worlds, {decisions:,} decisions, {accepted:,} deviations accepted, above: {wrong}, largest excess"
         f" {excess.max():.1e}",
+    )
+
+
+def pieces(which: tuple[int, int], decisions: int, seed: int) -> Told:
+    """A team whose messages contain any selection of pieces, or lack one of one vehicle: refused, or attacked."""
+    team = load_scenario(TEAMS[which])
+    channel = team.v2x.model_dump(exclude_none=True)
+    every = [list(some) for size in range(len(PIECES) + 1) for some in combinations(PIECES, size)]
+    every += [{name: [p for p in PIECES if p != one]} for name in team.vehicle_names for one in PIECES]
+    refused, wrong, taken, done, excess = 0, 0, [], 0, -np.inf
+    for tells in every:
+        scenario = team.replace(v2x={**channel, "tells": tells})
+        try:
+            begun(scenario, scenario.sample(2, seed).worlds)
+        except InvalidInput as error:
+            refused += 1
+            wrong += "(v2x: tells)" not in str(error)
+        else:
+            taken.append(scenario)
+        (told,) = tells.values() if isinstance(tells, dict) else [tells]
+        wrong += (scenario in taken[-1:]) != (set(LOOK_AHEAD) <= set(told))
+    cells, k = list(product(taken, TEAM_ADVERSARIES.values(), ("first", "total"), ("all", "one"))), 0
+    while done < decisions / len(TEAMS) or k < len(cells):
+        scenario, adversary, count, hostile = cells[k % len(cells)]
+        sample = scenario.sample(20, seed, first=20 * k).worlds
+        found = attack(scenario, sample, adversary, harm_count=count, hostile=hostile, seed=seed + k)
+        over = found.realised - found.bound
+        wrong += int((over > 0.0).sum()) + int((found.realised != found.last_bound).sum()) + found.rises
+        done, excess, k = done + found.decisions, max(excess, float(over.max())), k + 1
+    return Told(
+        wrong == 0,
+        f"{len(every)} contents, {refused} refused, {len(taken)} attacked: {done:,} decisions, above: {wrong}, largest"
+        f" excess {excess:.1e}",
     )
 
 

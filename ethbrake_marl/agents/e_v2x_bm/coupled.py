@@ -27,6 +27,7 @@ from ethbrake_marl.errors import InvalidInput, renumbered
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.jit import by_parts, compiled
+from ethbrake_marl.physics.messages import LOOK_AHEAD, refuse_untold
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
@@ -201,6 +202,7 @@ class EV2XBM:
 
         """
         if self._mode == "pairwise":
+            refuse_untold(alert, [vehicle], f"agent {self.name!r}", LOOK_AHEAD[:-1])  # masses play no part in it
             closed = optimise_pairwise(alert, vehicle)
             return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
 

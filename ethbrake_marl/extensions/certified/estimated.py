@@ -7,6 +7,8 @@ A vehicle is *known* if its message has arrived or it is in sight. The estimate 
   the time at which the vehicle is expected to react.
 * Of a vehicle that is not known: what the scenario declares. Each quantity is the median of its distribution, or any
   value of its range. Its script runs from the alert.
+* Of a known vehicle whose messages lack a piece (``v2x: tells``): the same for that piece. Place and speed count only
+  together, and a command in force only with both. An intent is not used, because the scripts say what follows.
 * Of the vehicle itself: measurements of its own state, its distance since the alert, and impacts with known neighbours.
 
 Nothing else of the line is read, so information that was not received cannot change an estimated world.
@@ -25,7 +27,7 @@ from ethbrake_marl.agents.protocol import fixed_commands
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.estimates import move_on
-from ethbrake_marl.physics.messages import Messages
+from ethbrake_marl.physics.messages import ACCELERATION, BRAKING_CAPACITY, LATENCY, MASS, PLACE, SPEED, Messages
 from ethbrake_marl.physics.motion import has_acted
 from ethbrake_marl.physics.state import Bools, Floats, Vehicles, Worlds
 from ethbrake_marl.scenario.sampling import middle_world
@@ -49,20 +51,26 @@ class Told(NamedTuple):
     A vehicle is *known* if its message has arrived or it is in sight.
     """
 
-    known: Bools  # [n, N] True for known vehicles; always True for the vehicle itself
-    at_s: Floats  # [n, N] time of the received state, s
-    place_m: Floats  # [n, N] position at that time, relative to the receiving vehicle's present position, m
-    speed_mps: Floats  # [n, N] speed at that time, m/s
-    command_mps2: Floats  # [n, N] command in force at that time, m/s2
-    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position, m; infinite: none is known
+    known: Bools  # [n, N] True where place and speed are known; always True for the vehicle itself
+    pieces: Bools  # [n, N, len(PIECES)] True for each known piece; nothing of a vehicle without news
+    at_s: Floats  # [n, N] time of the received state
+    place_m: Floats  # [n, N] position at that time, relative to the receiving vehicle's present position
+    speed_mps: Floats  # [n, N] speed at that time
+    command_mps2: Floats  # [n, N] command in force at that time
+    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position; infinite: none is known
     obstacle_hit: Bools  # [n] True if an impact with the obstacle is known
     hit: Bools  # [n, P] True for an own pair with a known neighbour that had an impact
 
     @property
     def reacts(self) -> Bools:
         """True for vehicles that are known to have a command in force, [n, N]."""
-        reacts: Bools = self.known & (self.command_mps2 != 0.0)
+        reacts: Bools = self.known & self.pieces[..., ACCELERATION] & (self.command_mps2 != 0.0)
         return reacts
+
+    @property
+    def heard(self) -> Floats:
+        """What is known of whom, [n, N]: 0 nothing, 1 pieces without place and speed, 2 these too."""
+        return self.pieces.any(axis=2).astype(np.float64) + self.known
 
     @classmethod
     def to(cls, worlds: Worlds, vehicle: int) -> Told:
@@ -72,19 +80,23 @@ class Told(NamedTuple):
         n, N = worlds.speeds_mps.shape
         known = worlds.vehicles.known_from_s[:, vehicle] <= worlds.time_s[:, np.newaxis]
         known[:, vehicle] = True
+        pieces = Messages.of(worlds).known_pieces(vehicle, worlds.time_s)
+        pieces[:, vehicle] = True
         place = _places_of(worlds, vehicle)
         hit = np.zeros((n, N - 1), np.bool_)
         at_s = np.repeat(worlds.time_s[:, np.newaxis], N, axis=1)
         told = cls(
-            known, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
+            known, pieces, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
             worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
         )  # fmt: skip
         if (periodic := Messages.of(worlds).periodic).any():
             told._hear_messages(worlds, vehicle, periodic)
+        pieces &= known[..., np.newaxis]
+        known &= pieces[..., PLACE] & pieces[..., SPEED]
         for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
             if 0 <= pair < N - 1:
                 hit[:, pair] = worlds.pair_hit[:, pair] & known[:, other]
-        unheard = ~known[:, 0]
+        unheard = ~pieces[:, 0, PLACE]
         told.obstacle_m[unheard], told.obstacle_hit[unheard] = np.inf, False
         return told
 
@@ -218,9 +230,14 @@ class Ranges:
         told, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
         given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
                  "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
-        of = {key: np.where(told.known, values, self.at(share, key)) for key, values in given.items()}
+        some, pieces = told.pieces.any(axis=2), told.pieces
+        has = {"mass_t": pieces[..., MASS], "speed_limit_mps": some}
+        of = {
+            key: np.where(has.get(key, pieces[..., BRAKING_CAPACITY]), values, self.at(share, key))
+            for key, values in given.items()
+        }
         at_s = np.where(told.known, told.at_s, 0.0)
-        own_part = np.where(told.known, v.own_latency_s, self.at(share, "latency_s"))
+        own_part = np.where(pieces[..., LATENCY], v.own_latency_s, self.at(share, "latency_s"))
         latency = np.where(told.reacts, at_s, np.maximum(np.maximum(own_part, self.at(share, "news_s")), at_s))
         past = v.latency_s[:, vehicle] <= worlds.time_s
         latency[:, vehicle] = np.where(

@@ -204,7 +204,7 @@ class BelievedShield:
         """
         shield, vehicle = self.shield, self.vehicle
         told = Told.to(worlds, vehicle)
-        heard = np.concatenate([told.known, told.reacts], axis=1).astype(np.float64)
+        heard = np.concatenate([told.heard, told.reacts], axis=1)
         fresh, begun = np.isnan(self._heard[:, 0]), shield.memory.running is not None
         keeps, anew = np.zeros_like(told.known), fresh
         if self.robust != INTERIOR:  # in interior mode, plans are certified once, at the first decision
@@ -271,7 +271,7 @@ class BelievedShield:
         pressed = np.zeros((n, whole), np.bool_)
         pressed[:, :-1], pressed[:, 1:] = touching, pressed[:, 1:] | touching
         since = (told.at_s < self._impact_s) | (pressed[:, whole - N :] & (told.at_s < time_s[:, np.newaxis]))
-        keeps: Bools = ~told.known | ((self._heard[:, :N] == 1.0) & since)
+        keeps: Bools = ~told.known | ((self._heard[:, :N] == 2.0) & since)
         keeps[:, self.vehicle] = False
         return keeps
 

@@ -12,6 +12,7 @@ from ethbrake_marl.agents.protocol import Agent, AgentAround, Knowledge, Source
 from ethbrake_marl.engine.memory import Memory, ask_script, begin_script, renew_memory
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.extensions.certified.estimated import Ranges, Told
+from ethbrake_marl.physics.messages import LATENCY
 from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
@@ -117,8 +118,9 @@ class Believing(AgentAround):
         Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
         """
         told = Told.to(worlds, vehicle)
-        unforetold = told.reacts & self.scenario.v2x.by_link  # without a channel a reaction is predicted by its latency
-        return np.concatenate([told.known, unforetold], axis=1).astype(np.float64)
+        # a latency that was told predicts the reaction, unless a channel may extend it
+        unforetold = told.reacts & (self.scenario.v2x.delays | ~told.pieces[..., LATENCY])
+        return np.concatenate([told.heard, unforetold], axis=1)
 
     def _believe(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
         if vehicle not in self._ranges:

@@ -22,6 +22,7 @@ from ethbrake_marl.extensions.cooperation.sweep import Swept
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.overrides import Override
+from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
@@ -340,7 +341,9 @@ def plan_ablation(
     if not any(level.scenario.learners for level in plan.levels):
         raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
     StudyFolder(plan.folder, "an ablation").check()
-    common_worlds(plan.levels, 5, plan.list_seed)
+    samples = common_worlds(plan.levels, 5, plan.list_seed)
+    for level, sample in zip(plan.levels, samples, strict=True) if plan.shield is not None else ():
+        refuse_untold(sample.worlds, level.scenario.learners, f"level {level.name!r} behind the shield")
     list(plan.trainings())  # raises InvalidInput for an impossible training
     return plan
 

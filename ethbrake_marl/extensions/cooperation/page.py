@@ -235,7 +235,7 @@ def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
             for count in HARM_COUNTS
         ],
         "What each step is worth": [_sheet(steps, changed)],
-        "Price of lost messages": [_sheet(channels, changed)],
+        "Price of messages that are lost or tell less": [_sheet(channels, changed)],
         "Who pays": [
             _sheet(both, [
                 (f"Change of {HARM[count]}", "change"),

@@ -19,6 +19,7 @@ from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.extensions.certified.estimated import Told
 from ethbrake_marl.files.yaml import parse_numeral
+from ethbrake_marl.physics.messages import ACCELERATION, MEASURED, Messages, refuse_untold
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.registry import Part
 
@@ -62,7 +63,8 @@ class Seen(NamedTuple):
             brakes = force < 0.0
             age = np.minimum(age, np.where(brakes, np.maximum(then, 0.0) / np.where(brakes, -force, 1.0), np.inf))
             front = np.where(age > 0.0, np.maximum(then + force * age, 0.0), then)
-            gap = np.where(told.known[:, k], told.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
+            known = told.known[:, k] & told.pieces[:, k, ACCELERATION]
+            gap = np.where(known, told.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
         return cls(np.maximum(gap, _TOUCHING_M), worlds.speeds_mps[:, vehicle], front, force, own, step_s)
 
     @property
@@ -257,7 +259,13 @@ class Controller:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Return the initial memory [n]: NaN, because no decision was made yet. The arguments only give n."""
+        """Return the initial memory [n]: NaN, because no decision was made yet.
+
+        Raises ``InvalidInput`` where messages of the vehicle ahead lack what a law reads, and no sensor measures it.
+        """
+        ahead = vehicle - 1
+        if vehicle and np.isinf(Messages.of(alert).seen_from_s(vehicle, ahead)).any():
+            refuse_untold(alert, [vehicle], f"agent {self.name!r}", MEASURED, [ahead])
         return np.full(alert.n, np.nan)
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:

@@ -623,13 +623,13 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
 
 
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
-    """Raise ``InvalidInput`` if the worlds have brakes that build up, periodic messages or an obstacle.
+    """Raise ``InvalidInput`` if the worlds have brakes that build up, columns of messages or an obstacle.
 
     A host provides gaps and speeds only, so it cannot represent these. ``vehicles``: indices of controlled vehicles.
     """
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
-        what = "periodic messages (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"
+        what = "periodic messages or tells (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"
         raise InvalidInput(f"host: scenario {scenario.name!r}: has {what}; hosts know lines of vehicles alone")
 
 
