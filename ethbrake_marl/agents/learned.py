@@ -14,6 +14,8 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 TRAINED_POLICY = "trained policy"  # name of a run's own policy in tables and figures
 
+TRAINED_TEAM = "trained team"  # likewise, of several learners
+
 
 class LearnedPolicy(Protocol):
     """Interface of a policy that an agent needs; ``ethbrake_marl.policies.policy.Policy`` implements it."""

@@ -29,6 +29,8 @@ RUNS = Path("runs")
 
 QUICKEST = ("quick", "ppo")  # what `ethbrake run` trains: the first whose algorithm is installed
 
+QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # likewise with several learners
+
 TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="the recipe's")]
 
 OutputOption = Annotated[
@@ -56,7 +58,8 @@ def run_command(
         typer.Option(
             metavar="NAME|PATH",
             help="A shipped recipe, or a path to a YAML file.",
-            show_default=f"{QUICKEST[0]}, or {QUICKEST[1]} where no extension gives its algorithm",
+            show_default=f"{QUICKEST[0]}, of several learners {QUICKEST_TEAM[0]}; where no extension gives its"
+            f" algorithm, {QUICKEST[1]} or {QUICKEST_TEAM[1]}",
         ),
     ] = None,
     settings: SettingsOption = None,
@@ -64,11 +67,12 @@ def run_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train a policy, shield it, compare with the baselines, report.
+    """Train one learner or a team, shield it, compare with the baselines, report.
 
-    Writes the run's folder: the policy, results as CSV and JSON, every world, and the installed reports: three
-    figures and report.html; for one of the three tests (paper-random, -brake-only, -obstacle) also the other two.
-    Ctrl-C ends the training early, and the policy so far is evaluated; a second Ctrl-C stops at once.
+    Writes the run's folder: policies, results as CSV and JSON, every world, and the installed reports: three figures
+    and report.html; for one of the three tests (paper-random, -brake-only, -obstacle) also the other two; of a team
+    also who bears what, and what each learner and the messages add, for which more is trained. Ctrl-C ends the
+    training early, and what was trained so far is evaluated; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         # torch takes seconds to load, here and in the other commands that learn
@@ -76,7 +80,10 @@ def run_command(
 
         plan = training.load_recipe(recipe or quickest())
         given = training.read_settings(settings, [plan])
-        chosen = evaluation.load_runnable(scenario, given.scenario, drives="one")
+        chosen = evaluation.load_runnable(scenario, given.scenario, drives="some")
+        if recipe is None and len(chosen.learners) > 1:
+            plan = training.load_recipe(quickest(several=True))
+            given = training.read_settings(settings, [plan])
         plan = given.change(plan, out.note)
         result = run_experiment(
             chosen,
@@ -92,9 +99,10 @@ def run_command(
         )
         trained = result.trained
         count = "total" if plan.reward.harm_count == "total" else "first-impact"
+        what = "policy" if len(chosen.learners) == 1 else f"team (scheme {trained.training.scheme})"
         told = (
             f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
-            f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained policy behind its shield. All minimise"
+            f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained {what} behind its shield. All minimise"
             f" {count} harm.\n"
         )
         out.result(result.results, Text(told), *result.tables)
@@ -103,10 +111,10 @@ def run_command(
         _end(out, result.trained)
 
 
-def quickest() -> str:
-    """Return the name of the recipe that `ethbrake run` trains by default."""
+def quickest(*, several: bool = False) -> str:
+    """Return the name of the recipe that `ethbrake run` trains by default; ``several``: with several learners."""
     usable = training.TrainingRecipe.usable()
-    return next(name for name in QUICKEST if name in usable)
+    return next(name for name in (QUICKEST_TEAM if several else QUICKEST) if name in usable)
 
 
 def train_command(

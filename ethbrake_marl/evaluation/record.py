@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ethbrake_marl.agents.driving import drive
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.rollout import controlled_vehicle
 from ethbrake_marl.evaluation.tape import Tape
@@ -22,6 +22,7 @@ from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
 
 SAMPLE_S = 0.02  # default time between two samples (s)
 
@@ -41,7 +42,7 @@ class EpisodeRecord:
 
     agent: str  # name of the agent
     scenario: Scenario  # scenario of the world
-    vehicle: int  # index (0 = front) of the controlled vehicle
+    vehicles: tuple[int, ...]  # indices (0 = front) of the controlled vehicles
     initial: Worlds  # the world at the alert, n = 1
     time_s: Floats  # [k] time since the alert, ascending
     gaps_m: Floats  # [k, P] gap of each pair
@@ -51,6 +52,11 @@ class EpisodeRecord:
     impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
     ledger: Ledger  # harm of all impacts of the episode, n = 1
     at_rest: bool  # whether the line came to rest before the horizon
+
+    @property
+    def vehicle(self) -> int:
+        """Index (0 = front) of the only controlled vehicle; raises ``InvalidInput`` if there are several."""
+        return Task(self.scenario, self.vehicles).vehicle
 
     def __repr__(self) -> str:
         first, total = (float(self.ledger.world_harm(harm_count)[0]) for harm_count in HARM_COUNTS)
@@ -62,16 +68,15 @@ class EpisodeRecord:
 
 
 def record_episode(
-    world: Worlds, agent: Agent, *, scenario: Scenario, vehicle: int | str | None = None, sample_s: float = SAMPLE_S
+    world: Worlds, agent: Driver, *, scenario: Scenario, vehicle: int | str | None = None, sample_s: float = SAMPLE_S
 ) -> EpisodeRecord:
     """Record one world from the alert on, exactly as ``evaluate`` runs it.
 
     Args:
         world: the world at the alert, n = 1.
-        agent: agent that drives one vehicle; it is not changed.
+        agent: agent or team; it is not changed.
         scenario: scenario of the world, whose scripts drive the other vehicles.
-        vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's only
-            learner.
+        vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         sample_s: largest time between two samples (s); every decision is a sample, too.
 
     Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
@@ -83,9 +88,10 @@ def record_episode(
         )
     if not (sample_s > 0.0 and math.isfinite(sample_s)):
         raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
-    driven = controlled_vehicle(scenario, vehicle)
+    several = vehicle is None and len(scenario.learners) > 1
+    driven = scenario.learners if several else (controlled_vehicle(scenario, vehicle),)
     tape = Tape(world)
-    episodes = drive(world, agent, scenario, driven, watched_by=[tape])
+    episodes = drive(world, Team.of(agent, driven), scenario, watched_by=[tape])
     samples = list(_samples(tape.steps, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(

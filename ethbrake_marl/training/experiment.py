@@ -1,4 +1,4 @@
-"""The main experiment: train a policy, and evaluate it, alone and behind its shield, beside the baselines."""
+"""The main experiment: train a policy or a team, and evaluate it, alone and behind its shield, beside the baselines."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.agents.learned import TRAINED_POLICY, LearnedAgent
-from ethbrake_marl.agents.protocol import Agent
-from ethbrake_marl.errors import check_one_learner
+from ethbrake_marl.agents.learned import TRAINED_POLICY, TRAINED_TEAM, LearnedAgent
+from ethbrake_marl.agents.protocol import Agent, Driver, Team
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.identity import EPISODES, LIST_SEED
-from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.evaluation.lineup import make_agents, make_lineup
 from ethbrake_marl.evaluation.per_world import results_to_json, write_per_world
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
@@ -26,10 +25,11 @@ from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.messages import refuse_untold
-from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.policies.teams import Trained
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.shield.drivers import shielded
 from ethbrake_marl.shield.paper_hybrid import HybridAgent
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run_folder import RunDirectory
@@ -37,18 +37,27 @@ from ethbrake_marl.training.session import TrainResult, train
 
 BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
 
+TEAM_BASELINES = ("full_brake", "e_v2x_bm")  # each drives every learner; the closed form is for one
+
+SHIELDED = "hybrid"  # the policy, or the team, behind its shield
+
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """A trained policy and its evaluation: the input of the functions that write reports about a run."""
+    """A trained policy or team and its evaluation: the input of the functions that write reports about a run."""
 
     trained: TrainResult  # result of the training, which may have been interrupted
-    agents: Mapping[str, Agent]  # by name: baselines, the trained policy, and ``hybrid``, the policy behind its shield
+    agents: Mapping[str, Driver]  # by name, see ``compared_agents``
     evaluation: Evaluation  # outcomes of these agents on the evaluation list
     rows: SummaryTable  # results table of the evaluation, one row per agent
     list_seed: int  # seed of the evaluation's worlds
     harm_count: HarmCount  # harm that all agents minimise
     started: float  # start of the experiment by ``time.monotonic`` (s)
+
+    @property
+    def learned(self) -> str:
+        """Name of the trained policy or team among the agents."""
+        return TRAINED_POLICY if TRAINED_POLICY in self.agents else TRAINED_TEAM
 
     @property
     def run(self) -> RunDirectory:
@@ -103,9 +112,9 @@ def run_experiment(
     settings: Sequence[str] = (),
     on_progress: OnProgress | None = None,
 ) -> ExperimentResult:
-    """Train a policy, evaluate it alone and behind its shield beside the baselines, and write the results.
+    """Train the learners, evaluate them alone and behind their shield beside the baselines, and write the results.
 
-    All agents minimise the harm that the policy is trained for (``reward.harm_count`` of the recipe). Installed
+    All agents minimise the harm that the learners are trained for (``reward.harm_count`` of the recipe). Installed
     extensions then write their reports.
 
     Ctrl-C during the training ends it after the current update, and the policy so far is evaluated. A second Ctrl-C, or
@@ -113,7 +122,7 @@ def run_experiment(
     how the run ended.
 
     Args:
-        scenario: scenario with exactly one learner.
+        scenario: scenario with at least one learner. Several are trained as a team, by the recipe's scheme.
         directory: the new folder of the run.
         recipe: recipe of the training.
         steps: overrides the recipe's number of decisions.
@@ -129,8 +138,6 @@ def run_experiment(
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)
-    names = [scenario.vehicle_names[i] for i in scenario.learners]
-    check_one_learner(scenario.name, names, "say which vehicle the agents drive")
     reports = [RUN_REPORTS[name] for name in RUN_REPORTS]  # one that cannot be loaded ends the run before it begins
     sample = scenario.sample(episodes, list_seed)
     refuse_untold(sample.worlds, scenario.learners, "run, with the baseline e_v2x_bm and a shield")
@@ -139,7 +146,7 @@ def run_experiment(
     )
     run, harm_count = RunDirectory(trained.directory), recipe.reward.harm_count
     with _status(run, trained.status):
-        agents = compared_agents(trained.policy, scenario, harm_count)
+        agents = compared_agents(trained.trained, scenario, harm_count)
         order, n = list(agents), sample.worlds.n
         total = n * len(order)
         if trained.status == "interrupted":
@@ -173,20 +180,41 @@ def run_experiment(
 
 
 def compared_agents(
-    policy: Policy, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] = BASELINES
-) -> dict[str, Agent]:
-    """Return the agents to compare, by name: the baselines, the policy alone, and ``hybrid``, the policy shielded.
+    trained: Trained, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] | None = None
+) -> dict[str, Driver]:
+    """Return the agents to compare, by name: the baselines, what was trained, and ``hybrid``, the same behind a shield.
+
+    One policy is ``trained policy``, its shield the paper's. Several learners are ``trained team``, shielded together
+    by the step shield; for each learner there is also the team in which that vehicle brakes fully.
 
     Args:
-        policy: the trained policy.
-        scenario: scenario whose only learner they drive.
+        trained: the trained policy or policies.
+        scenario: scenario whose learners they drive.
         harm_count: harm that baselines minimise and the shield bounds: ``first`` or ``total``.
-        baselines: specs of the baselines.
+        baselines: specs of the baselines; None: ``BASELINES``, or ``TEAM_BASELINES`` for several learners.
 
     """
-    alone = LearnedAgent(policy, TRAINED_POLICY)
-    learned: dict[str, Agent] = {TRAINED_POLICY: alone, "hybrid": HybridAgent(alone, scenario, harm_count=harm_count)}
-    return {**make_agents(baselines, scenario, harm_count=harm_count), **learned}
+    several = len(scenario.learners) > 1
+    specs = (TEAM_BASELINES if several else BASELINES) if baselines is None else baselines
+    found = make_lineup(specs, scenario, harm_count=harm_count)
+    if not several:
+        alone = LearnedAgent(next(iter(trained.drivers.values())), TRAINED_POLICY)
+        return {**found, TRAINED_POLICY: alone, SHIELDED: HybridAgent(alone, scenario, harm_count=harm_count)}
+    drivers: dict[int, Agent] = {
+        i: LearnedAgent(trained.drivers[scenario.vehicle_names[i]], TRAINED_TEAM) for i in scenario.learners
+    }
+    team = Team(drivers, TRAINED_TEAM)
+    found |= {TRAINED_TEAM: team, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
+    braking = make_agents(["full_brake"], scenario)["full_brake"]
+    for i in scenario.learners:
+        name = without(scenario.vehicle_names[i])
+        found[name] = Team({**drivers, i: braking}, name)
+    return found
+
+
+def without(vehicle: str) -> str:
+    """Return the name of the trained team in which this vehicle brakes fully instead."""
+    return f"{TRAINED_TEAM}, {vehicle} brakes"
 
 
 def write_results(

@@ -1,4 +1,4 @@
-"""Figure of one episode: positions of the vehicles, their impacts, and the command of the controlled vehicle."""
+"""Figure of one episode: positions of the vehicles, their impacts, and the commands of the controlled vehicles."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 
 
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
-    """Draw positions with impacts, gaps, and the command of the controlled vehicle over time.
+    """Draw positions with impacts, gaps, and the commands of the controlled vehicles over time.
 
     There is one column for each record on common scales, to compare agents in the same world. Raises ``InvalidInput``
     without records.
@@ -53,12 +53,14 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
     positions.set_xlim(0.0, 1.1 * max(ends))
     gaps.set_ylim(bottom=0.0)
     commands.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    capacity = max(float(each.initial.vehicles.braking_capacity_mps2[0, each.vehicle]) for each in records.values())
-    largest = max(float(each.command_mps2[:, each.vehicle].max()) for each in records.values())
+    driven = [(each, list(each.vehicles)) for each in records.values()]
+    capacity = max(float(each.initial.vehicles.braking_capacity_mps2[0, some].max()) for each, some in driven)
+    largest = max(float(each.command_mps2[:, some].max()) for each, some in driven)
     commands.set_ylim(-1.1 * capacity, max(largest, 0.0) + 0.4 * capacity)  # with room for a line of text
     name_axes(positions, y="Position from Vehicle 1's\nat the alert (m)")
     name_axes(gaps, y="Gap ahead (m)")
-    name_axes(commands, y=f"Command of\nVehicle {first.vehicle + 1} (m/s²)")
+    numbers = ", ".join(str(i + 1) for i in first.vehicles)
+    name_axes(commands, y=f"Command of\nVehicle{'s' * (len(first.vehicles) > 1)} {numbers} (m/s²)")
     return finish(
         figure, caption or f"{first.scenario.name}: {Conditions.of(first.initial).quantities}. {_NOTE}", positions
     )
@@ -104,15 +106,17 @@ def _gaps(axes: Axes, record: EpisodeRecord) -> None:
 
 
 def _command(axes: Axes, record: EpisodeRecord) -> None:
-    i = record.vehicle
     axes.axhline(0.0, color=GREY, linewidth=0.8)
-    axes.plot(record.time_s, record.command_mps2[:, i], drawstyle="steps-post", color=vehicle_colour(i), linewidth=1.4)
-    latency = float(record.initial.vehicles.latency_s[0, i])
-    axes.axvline(latency, color=GREY, linewidth=0.8, linestyle=":")
-    axes.annotate(
-        f"acts from {latency:g} s", (latency, 1.0), xycoords=("data", "axes fraction"), xytext=(3, -1),
-        textcoords="offset points", fontsize=8, color=GREY, va="top",
-    )  # fmt: skip
+    alone = len(record.vehicles) == 1
+    for line, i in enumerate(record.vehicles):
+        colour = vehicle_colour(i)
+        axes.plot(record.time_s, record.command_mps2[:, i], drawstyle="steps-post", color=colour, linewidth=1.4)
+        latency = float(record.initial.vehicles.latency_s[0, i])
+        axes.axvline(latency, color=GREY if alone else colour, linewidth=0.8, linestyle=":")
+        axes.annotate(
+            f"acts from {latency:g} s", (latency, 1.0), xycoords=("data", "axes fraction"), xytext=(3, -1 - 10 * line),
+            textcoords="offset points", fontsize=8, color=GREY if alone else colour, va="top",
+        )  # fmt: skip
 
 
 def _vehicle_style(i: int) -> dict[str, Any]:

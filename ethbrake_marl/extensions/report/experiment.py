@@ -1,10 +1,14 @@
-"""The report of ``ethbrake run``: three figures, an HTML page, and the policy's results on the other two tests."""
+"""The report of ``ethbrake run``: three figures, an HTML page, and the policy's results on the other two tests.
+
+Other extensions add sections to the page (``register_run_section``).
+"""
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -12,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.learned import TRAINED_POLICY
-from ethbrake_marl.agents.protocol import Agent
+from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.record import record_episode
@@ -20,27 +24,53 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.episode_figure import trajectories
-from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.report.page import Part, Section
 from ethbrake_marl.extensions.report.paper_rows import is_papers_test, with_paper_rows
 from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap, learning_curve
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests
 from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.game.rewards import RewardParams
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.experiment import Experiment, RunReport, compared_agents, write_results
+from ethbrake_marl.training.experiment import SHIELDED, Experiment, RunReport, compared_agents, write_results
 
 BESIDE = ("full_brake", "e_v2x_bm")  # agents shown with the policy in its figures and on the other two tests
 
 MOST_WORLDS = 2_000  # largest number of worlds of each of the other two tests
 
 
+@dataclass(frozen=True, slots=True)
+class RunSection:
+    """Section that an extension adds to the report of a run."""
+
+    title: str  # heading
+    body: tuple[str | Sheet, ...]  # sentences, which become paragraphs, and tables; the tables are printed, too
+
+
+MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: it has nothing to say about this run
+
+
+def register_run_section(name: str, make: MakeSection) -> None:
+    """Register a function that adds a section to the report of every ``ethbrake run``, below the results.
+
+    ``name`` is the name of the section, which no other section may have; ``make`` returns it, or None.
+
+    An installed package does the same with an entry point of the group ``ethbrake_marl.run_sections``.
+    """
+    RUN_SECTIONS.add(name, make, lambda other: other is make)
+
+
+RUN_SECTIONS: Registry[MakeSection] = Registry("section of a run's report", "run_sections", register_run_section)
+
+
 def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
-    """Evaluate the policy on the other two tests, draw the figures, and write ``report.html``; return what to print.
+    """Evaluate a policy on the other two tests, draw the figures, and write ``report.html``; return what to print.
 
     Args:
         experiment: the finished run: its folder, policy and evaluation.
@@ -48,7 +78,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
 
     """
     evaluation, folder = experiment.evaluation, experiment.run.path
-    others, done = other_tests(evaluation.scenario), count()
+    others, done = other_tests(evaluation.scenario) if len(evaluation.vehicles) == 1 else (), count()
 
     def begin(stage: str) -> None:
         """Report the progress: ``stage`` begins, or all stages have ended if it is empty."""
@@ -63,6 +93,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     if beside:
         flat = [row for table in beside.values() for row in table]
         write_results(folder, "other_tests", flat, experiment.harm_count)
+    sections = [made for name in RUN_SECTIONS if (made := RUN_SECTIONS[name](experiment, tell)) is not None]
     begin("figures")
     config = read_object(experiment.run.config)
     figures = write_figures(
@@ -72,15 +103,18 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
         course=experiment.trained.evaluations,
         course_caption=_caption(experiment, config),
         agents=experiment.agents,
+        learned=experiment.learned,
         harm_count=experiment.harm_count,
     )
     begin("the page and its episodes")
     page = folder / "report.html"
-    report = _page(experiment, rows, beside, figures, config)
+    report = _page(experiment, rows, beside, figures, sections, config)
     report.driven(experiment.agents).write(page, force=True)
     begin("")
+    printed = [part for section in sections for part in section.body if isinstance(part, Sheet)]
+    with_rows = " and the paper's rows" if is_papers else ""
     return RunReport(
-        (brief(rows, beside), *rows.tables()[1:]), f"report, with every measure and the paper's rows: {page}"
+        (brief(rows, beside), *rows.tables()[1:], *printed), f"report, with every measure{with_rows}: {page}"
     )
 
 
@@ -90,7 +124,7 @@ def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
     """
     evaluation = experiment.evaluation
     worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
-    agents = compared_agents(experiment.trained.policy, test, experiment.harm_count, BESIDE)
+    agents = compared_agents(experiment.trained.trained, test, experiment.harm_count, BESIDE)
     with warnings.catch_warnings():  # the page says that the policy was not trained for this test
         warnings.simplefilter("ignore", Unfamiliar)
         return summarise(evaluate(worlds, agents, scenario=test, seed=experiment.list_seed))
@@ -103,7 +137,8 @@ def write_figures(
     *,
     course: Sequence[Mapping[str, float]],
     course_caption: str,
-    agents: Mapping[str, Agent],
+    agents: Mapping[str, Driver],
+    learned: str = TRAINED_POLICY,
     harm_count: HarmCount = "first",
 ) -> list[Part]:
     """Draw the three figures, write them as PNG files into ``folder``, and return them as parts (pieces of HTML) of the
@@ -111,25 +146,23 @@ def write_figures(
 
     Args:
         folder: folder of the run.
-        evaluation: evaluation of the trained policy and the baselines.
+        evaluation: evaluation of the trained policy or team, and the baselines.
         rows: summary of that evaluation, one ``SummaryRow`` for each agent; baselines are drawn as level lines.
         course: evaluations during the training; each has ``steps``, both harms and ``collision_rate``.
         course_caption: caption of the learning curve.
         agents: the evaluated agents, by name.
-        harm_count: harm that the policy minimises.
+        learned: name of the trained policy or team among them.
+        harm_count: harm that it minimises.
 
     """
     references = [row for row in rows if row.agent in BESIDE]
-    shown = telling_world(evaluation, harm_count)
+    shown = telling_world(evaluation, harm_count, learned)
     world, row = int(evaluation.index[shown]), evaluation.worlds.take([shown])
-    records = {
-        name: record_episode(row, agents[name], scenario=evaluation.scenario, vehicle=evaluation.vehicle)
-        for name in (*BESIDE, TRAINED_POLICY)
-    }
+    records = {name: record_episode(row, agents[name], scenario=evaluation.scenario) for name in (*BESIDE, learned)}
     drawn = {
         "learning_curve.png": (
             "Learning curve",
-            "Harm and collisions of the policy on a fixed list of worlds while it learns; level lines: baselines.",
+            "Harm and collisions on a fixed list of worlds during the training; level lines: baselines.",
             learning_curve(course, references=references, caption=course_caption),
         ),
         "harm_against_gap.png": (
@@ -139,8 +172,8 @@ def write_figures(
         ),
         "trajectories.png": (
             "One episode",
-            f"World {world} of the list, driven by three agents: the world whose saving of harm, policy against full"
-            " braking, is the median of all worlds in which full braking collides.",
+            f"World {world} of the list, driven by three agents: the world whose saving of harm by what was trained,"
+            " against full braking, is the median of all worlds in which full braking collides.",
             trajectories(records),
         ),
     }
@@ -149,11 +182,11 @@ def write_figures(
     return [Part.drawing(figure, title, description) for title, description, figure in drawn.values()]
 
 
-def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> int:
-    """Return the index of a typical world to draw: the one with the median reduction of harm by the policy.
+def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first", learned: str = TRAINED_POLICY) -> int:
+    """Return the index of a typical world to draw: the one with the median reduction of harm by ``learned``.
 
-    The reduction is the harm of full braking minus the policy's harm. Only worlds in which full braking does harm
-    count.
+    The reduction is the harm of full braking minus that of ``learned``, the trained policy or team. Only worlds in
+    which full braking does harm count.
 
     Returns 0 if there are none. ``harm_count`` is ``first`` or ``total``.
     """
@@ -161,7 +194,7 @@ def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first") -> in
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
         return 0
-    saved = before[rows] - evaluation.outcome(TRAINED_POLICY).world_harm(harm_count)[rows]
+    saved = before[rows] - evaluation.outcome(learned).world_harm(harm_count)[rows]
     order = np.argsort(saved, kind="stable")
     return int(rows[order[(len(order) - 1) // 2]])
 
@@ -179,6 +212,7 @@ def _page(
     rows: SummaryTable,
     beside: Mapping[str, SummaryTable],
     figures: Sequence[Part],
+    sections: Sequence[RunSection],
     config: Mapping[str, Any],
 ) -> Report:
     trained, evaluation, harm_count = experiment.trained, experiment.evaluation, experiment.harm_count
@@ -193,19 +227,25 @@ def _page(
         "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
         "Settings": ", ".join(config.get("settings", ())),
     }
-    manifest, name = trained.policy.manifest, evaluation.scenario.name
+    manifest, name = next(iter(trained.policies.values())).manifest, evaluation.scenario.name
+    how = f"{manifest.algorithm}, scheme {trained.training.scheme}"
     which = (
-        f"The {TRAINED_POLICY} is by {manifest.algorithm}, after {manifest.steps:,} steps (least harm on its own list)"
+        f"The {experiment.learned} is by {manifest.algorithm if len(trained.policies) == 1 else how}, after"
+        f" {manifest.steps:,} steps (least harm on its own list)"
     )
-    summary = f"{which}; hybrid is the same behind its shield."
+    summary = f"{which}; {SHIELDED} is the same behind its shield."
     if beside:
         summary += f" {TESTS[name]} The other two tests stand below."
-    stopped = f"The training was interrupted: this is the policy after {manifest.steps:,} steps."
+    stopped = f"The training was interrupted: this is the {experiment.learned} after {manifest.steps:,} steps."
     return Report(
         f"ethbrake run: {name}",
         rows,
         evaluation,
-        focus=TRAINED_POLICY,
+        focus=experiment.learned,
+        sections=[
+            Section(each.title, [part if isinstance(part, str) else Part.table(part) for part in each.body])
+            for each in sections
+        ],
         figures=figures,
         tests=[(TESTS[name].partition(":")[0], TESTS[name], other) for name, other in beside.items()],
         harm_count=harm_count,

@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.learned import TRAINED_POLICY
+from ethbrake_marl.agents.learned import TRAINED_POLICY, TRAINED_TEAM
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.conditions import Conditions
@@ -151,6 +151,7 @@ class Report:
     played: Sequence[Played] = ()  # episodes to watch
     shield: Section | None = None  # section on the shield; None: no shield was measured
     focus: str = ""  # agent whose worst worlds are shown; empty: no such section
+    sections: Sequence[Section] = ()  # further sections, below the results
     figures: Sequence[Part] = ()  # figures to show, as parts of a page
     # other tests: title, how the test differs, summary of each agent
     tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()
@@ -201,7 +202,7 @@ class Report:
     @property
     def html(self) -> str:
         """The whole page as HTML text. It loads no other file."""
-        sections: list[Section | None] = [self._results(), self._episodes()]
+        sections: list[Section | None] = [self._results(), *self.sections, self._episodes()]
         if self.focus:
             sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
         sections += [avoidable_section(self.evaluation), self.shield, Section("Figures", self.figures)]
@@ -249,7 +250,8 @@ class Report:
         if self.about not in rows:
             return ""
         row, before = rows[self.about], rows.get(BASELINE)
-        name = {BASELINE: "Full braking", TRAINED_POLICY: f"The {TRAINED_POLICY}"}.get(self.about, self.about)
+        name = "Full braking" if self.about == BASELINE else self.about
+        name = f"The {name}" if name in (TRAINED_POLICY, TRAINED_TEAM) else name
         value, best = row[harm], row[f"best_known_{harm}"]
         known = "" if best is None else f"; best known {_words(best)}"
         impacts = "first impacts" if self.harm_count == "first" else "all impacts"

@@ -1,0 +1,205 @@
+"""Section of a run's report about several learners: who bears what, and what each learner and the messages add."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ethbrake_marl.agents.learned import TRAINED_TEAM
+from ethbrake_marl.agents.protocol import Agent, Team
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.evaluation.lineup import make_agents
+from ethbrake_marl.evaluation.outcome import Outcome
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.seeds import share_over_seeds
+from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.extensions.cooperation.levels import HARM
+from ethbrake_marl.extensions.report.experiment import RunSection
+from ethbrake_marl.extensions.search.best_harm import search_list, task_problem
+from ethbrake_marl.files.sheet import Column, Row, Sheet
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.training.experiment import Experiment, without
+from ethbrake_marl.training.session import train
+from ethbrake_marl.training.team import load_team
+
+SEARCHED = 100  # worlds of the list in which the joint optimum is searched
+
+BUDGET = 5_000  # candidates of this search, per world and count of harm
+
+Harms = Mapping[HarmCount, Floats]  # count of harm -> harm of the whole line in each world, [n] m2/s2
+
+
+def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
+    """Train each learner alone and the team without messages, search the joint optimum, and compare the team with them.
+
+    A learner has the same number of decisions in each training. Writes the trainings to ``alone/`` and
+    ``without-messages/`` in the folder of the run, and all numbers to ``cooperation.json``. After an interrupted
+    training nothing more is trained or searched.
+
+    Args:
+        experiment: the finished run: its folder, policies and evaluation.
+        tell: called with a ``Progress`` object at each stage.
+
+    Returns None for one learner.
+
+    """
+    evaluation, team = experiment.evaluation, experiment.learned
+    if team != TRAINED_TEAM:
+        return None
+    outcomes, told = dict(evaluation.outcomes), "The training was interrupted: nothing more was trained to compare."
+    compared: list[Row] = []
+    if experiment.trained.status == "finished":
+        alone = _train_alone(experiment, tell)
+        found = evaluate(evaluation.worlds, alone, scenario=evaluation.scenario, aftermath=False).complete()
+        outcomes |= found.outcomes
+        best = min(alone, key=lambda name: float(outcomes[name].world_harm(experiment.harm_count).mean()))
+        compared = [_row(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]))]
+        silent, why_silent = _without_messages(experiment, tell)
+        optimum, why_optimum = _joint_optimum(experiment, outcomes, tell)
+        compared += [row for row in (silent, optimum) if row is not None]
+        told = f"{why_silent} {why_optimum}"
+    borne = [_borne(outcomes, harm_count, evaluation.scenario) for harm_count in HARM_COUNTS]
+    sheets = [*borne, _added(experiment), *([_compared(compared)] if compared else [])]
+    content = {"compared": told} | {sheet.title: sheet.json() for sheet in sheets}
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"
+    write_output(experiment.run.path / "cooperation.json", text.encode(), force=True)
+    return RunSection("Several learners", (*sheets, told))
+
+
+def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
+    """Train each learner alone while all other vehicles brake fully; return name -> team, which brakes in the others."""
+    scenario, found = experiment.evaluation.scenario, {}
+    braking = make_agents(["full_brake"], scenario)["full_brake"]
+    for vehicle in scenario.learners:
+        name = scenario.vehicle_names[vehicle]
+        others = {scenario.vehicle_names[i]: "full_brake" for i in scenario.learners if i != vehicle}
+        own = scenario.replace(roles={**scenario.roles, **others})
+        team = _train(experiment, own, f"alone/{name}", len(scenario.learners), tell)
+        drivers: dict[int, Agent] = dict.fromkeys(scenario.learners, braking)
+        found[f"{name} alone"] = Team(drivers | team.drivers, f"{name} alone")
+    return found
+
+
+def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[Row | None, str]:
+    """Train the team with sensors instead of messages; return its row of the comparison, and a sentence about it."""
+    evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
+    if scenario.members or scenario.v2x.channel.hears == "none":
+        why = "a mixture" if scenario.members else "a scenario without messages"
+        return None, f"What messages add was not measured: this is {why}."
+    try:
+        silent = scenario.replace(v2x="sensors-only")
+        listed = silent.sample(int(evaluation.index.max()) + 1, experiment.list_seed).take(evaluation.index)
+    except InvalidInput as error:
+        return None, f"What messages add was not measured: {error}."
+    pairs = ((getattr(listed.worlds, name), getattr(evaluation.worlds, name)) for name in ("gaps_m", "speeds_mps"))
+    rows = np.flatnonzero(np.logical_and.reduce([(one == other).all(axis=1) for one, other in pairs]))
+    if not rows.size:
+        return None, "What messages add was not measured: without messages no world of the list is the same line."
+    team = _train(experiment, silent, "without-messages", 1, tell)
+    driven = evaluate(listed.take(rows), {team.name: team}, scenario=silent, aftermath=False).complete()
+    ours = _harms(evaluation.outcome(TRAINED_TEAM).take(rows))
+    return _row("team without messages", _harms(driven.outcome(team.name)), ours), (
+        "The team without messages is trained and driven with sensors only, which see the next vehicle ahead and behind,"
+        " so that a vehicle may also react later; the lines are the same."
+    )
+
+
+def _joint_optimum(experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress) -> tuple[Row | None, str]:
+    """Search the least harm of all learners together; return its row of the comparison, and a sentence about it."""
+    evaluation = experiment.evaluation
+    rows = np.arange(min(SEARCHED, evaluation.worlds.n))
+    part = Sample(evaluation.worlds.take(rows), evaluation.index[rows], 0)
+
+    def told(done: int, total: int) -> None:
+        tell(Progress("joint optimum", done, total))
+
+    try:
+        told(0, len(rows))
+        table = search_list(evaluation.scenario, part, budget=BUDGET, on_progress=told)
+    except (InvalidInput, PhysicsError) as error:
+        return None, f"The joint optimum was not searched: {error}."
+    identity = task_problem(part.worlds, evaluation.task).identity
+    best, shares = {}, []
+    for harm_count in HARM_COUNTS:
+        driven = [outcome.take(rows).world_harm(harm_count) for outcome in outcomes.values()]
+        best[harm_count] = np.fmin.reduce([table.harm(identity, harm_count), *driven])
+        reached, worst = (outcomes[name].take(rows).world_harm(harm_count) for name in (TRAINED_TEAM, "full_brake"))
+        share = share_over_seeds(reached[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis])
+        told_share = "no" if share is None else share.in_words(digits=0, scale=100.0, unit=" %")
+        shares.append(f"{told_share} of the possible reduction of {HARM[harm_count]}")
+    return _row("joint optimum", best, _harms(outcomes[TRAINED_TEAM].take(rows))), (
+        f"The joint optimum is the least harm known that these learners can do together, from a search of {BUDGET:,}"
+        f" candidates per world in the first {len(rows)} worlds; the team reaches {' and '.join(shares)}."
+    )
+
+
+def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, tell: OnProgress) -> Team:
+    """Train the learners of ``scenario`` as the run did, with its decisions divided by ``share``; return the team."""
+    recipe, path = experiment.trained.training.recipe, experiment.run.path / folder
+    path.parent.mkdir(exist_ok=True)
+
+    def told(progress: Progress) -> None:
+        tell(replace(progress, name=f"{folder}: {progress.name}"))
+
+    kept = recipe if share == 1 else recipe.replace(scheme=None)
+    result = train(kept, scenario, path, steps=max(recipe.total_steps // share, 1), on_progress=told)
+    if result.status == "interrupted":
+        raise KeyboardInterrupt
+    return load_team(path, scenario, folder)
+
+
+def _harms(outcome: Outcome) -> Harms:
+    return {harm_count: outcome.world_harm(harm_count) for harm_count in HARM_COUNTS}
+
+
+def _row(name: str, other: Harms, team: Harms) -> Row:
+    """Return a row of the comparison: for each count of harm the other's, the team's, and their difference."""
+    cells = [(mean(other[each]), mean(team[each]), paired_difference(team[each], other[each])) for each in HARM_COUNTS]
+    return (name, len(team["first"]), *(cell for each in cells for cell in each))
+
+
+def _compared(rows: list[Row]) -> Sheet:
+    columns = [Column("Compared with", text=True), Column("Worlds", digits=0)]
+    for harm_count in HARM_COUNTS:
+        kind = HARM[harm_count]
+        columns += [
+            Column(f"Its {kind}", f"{harm_count}_other", interval="hidden"),
+            Column(f"The team's {kind}", f"{harm_count}_team", interval="hidden"),
+            Column("The team's minus its", f"{harm_count}_difference", sign="+", interval="below"),
+        ]
+    return Sheet("The trained team compared, mean per world (m²/s²)", columns, rows)
+
+
+def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, scenario: Scenario) -> Sheet:
+    """Return a table of the harm that each vehicle bears, one row for each agent."""
+    names = [f"Vehicle {i + 1}" for i in range(scenario.vehicles)]
+    learn = ", ".join(names[i] for i in scenario.learners)
+    columns = [Column("Agent", text=True), *map(partial(Column, interval="hidden"), (*names, "Whole line"))]
+    rows: list[Row] = []
+    for agent, outcome in outcomes.items():
+        each = outcome.vehicle_harm(harm_count).T
+        rows.append((agent, *map(mean, each), mean(outcome.world_harm(harm_count))))
+    return Sheet(f"Who bears what: {HARM[harm_count]}, mean per world (m²/s²)", columns, rows, f"{learn} learn.")
+
+
+def _added(experiment: Experiment) -> Sheet:
+    """Return a table of what each learner adds: the team with that vehicle braking fully instead, minus the team."""
+    evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
+    columns = [Column("Learner", text=True)]
+    columns += [Column(f"More {HARM[each]} without it", f"{each}_added", sign="+") for each in HARM_COUNTS]
+    rows: list[Row] = []
+    for vehicle in scenario.learners:
+        name = scenario.vehicle_names[vehicle]
+        pair = (evaluation.outcome(without(name)), evaluation.outcome(TRAINED_TEAM))
+        rows.append((name, *(paired_difference(*(one.world_harm(each) for one in pair)) for each in HARM_COUNTS)))
+    about = "The same team, but that vehicle brakes fully; the others were not trained for that."
+    return Sheet("What each learner adds, mean per world (m²/s²)", columns, rows, about)
