@@ -119,19 +119,20 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def own_signals() -> Iterator[None]:
-    """Context manager: restore the caller's signal handlers after the block, in which Ray sets handlers of its own.
+    """Context manager: restore the caller's handlers of Ctrl-C, SIGTERM and SIGUSR1 after the block.
 
-    Ray and Ray Tune leave their handlers behind; Tune's would swallow the caller's next Ctrl-C. Does nothing outside
-    the main thread, where no handler can be set.
+    Ray and Ray Tune set handlers of their own and leave them behind; Tune's would swallow the caller's next Ctrl-C.
+    Does nothing outside the main thread, where no handler can be set.
     """
     in_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in signal.valid_signals()} if in_main else {}
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1) if in_main else ()
+    before = {number: signal.getsignal(number) for number in numbers}
     try:
         yield
     finally:
         for number, handler in before.items():
-            if handler is not None and signal.getsignal(number) != handler:  # None: not set by Python
-                signal.signal(number, handler)
+            if handler is not None:  # None: set by C code, and unknown here
+                signal.signal(number, handler)  # even if Python knows no other: Ray sets some in C
 
 
 @contextmanager
@@ -145,15 +146,15 @@ def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any]
         return
     with own_signals():
         connected = connect_ray(ray, jobs)
-    from ray.util.joblib import register_ray
+        from ray.util.joblib import register_ray
 
-    register_ray()
-    try:
-        # Ray restarts a lost worker and repeats its call.
-        again = {"num_cpus": 1, "max_restarts": _AGAIN, "max_task_retries": _AGAIN}
-        yield {"backend": "ray", "ray_remote_args": again}, jobs or int(connected.cluster_resources().get("CPU", 1))
-    finally:
-        connected.shutdown()
+        register_ray()
+        try:
+            # Ray restarts a lost worker and repeats its call.
+            again = {"num_cpus": 1, "max_restarts": _AGAIN, "max_task_retries": _AGAIN}
+            yield {"backend": "ray", "ray_remote_args": again}, jobs or int(connected.cluster_resources().get("CPU", 1))
+        finally:
+            connected.shutdown()
 
 
 def connect_ray(address: str, cores: int | None = None) -> Any:
@@ -177,9 +178,10 @@ def connect_ray(address: str, cores: int | None = None) -> Any:
     number = len(os.sched_getaffinity(0)) if cores is None else cores
     own = {"num_cpus": number, "include_dashboard": False} if address == LOCAL else {}
     try:
-        ray.init(
-            address=address, log_to_driver=False, configure_logging=False, runtime_env={"env_vars": _WORKERS}, **own
-        )
+        with own_signals():
+            ray.init(
+                address=address, log_to_driver=False, configure_logging=False, runtime_env={"env_vars": _WORKERS}, **own
+            )
     except Exception as error:  # Ray raises a plain Exception if it cannot start
         raise InvalidInput(
             f"ray {address!r}: cannot be started, or no cluster can be reached there ({error})"

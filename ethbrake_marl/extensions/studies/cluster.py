@@ -17,7 +17,7 @@ _SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # they adv
 def connected(address: str, cores: int | None) -> Iterator[None]:
     """Context manager that connects to Ray while its block runs, and disconnects afterwards, also after an error.
 
-    Inside the block the signal SIGTERM acts like Ctrl-C. Afterwards all handlers are those from before.
+    Inside the block the signal SIGTERM acts like Ctrl-C. Afterwards the handlers are those from before.
 
     Args:
         address: address of a running cluster, or ``local`` for a Ray on this machine.
