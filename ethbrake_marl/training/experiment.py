@@ -214,7 +214,7 @@ def compared_agents(
 
 def without(vehicle: str) -> str:
     """Return the name of the trained team in which this vehicle brakes fully instead."""
-    return f"{TRAINED_TEAM}, {vehicle} brakes"
+    return f"all but {vehicle}"
 
 
 def write_results(

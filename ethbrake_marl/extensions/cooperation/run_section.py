@@ -6,11 +6,12 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.agents.learned import TRAINED_TEAM
-from ethbrake_marl.agents.protocol import Agent, Team
+from ethbrake_marl.agents.protocol import Agent, Driver, Team
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.outcome import Outcome
@@ -38,6 +39,14 @@ BUDGET = 5_000  # candidates of this search, per world and count of harm
 Harms = Mapping[HarmCount, Floats]  # count of harm -> harm of the whole line in each world, [n] m2/s2
 
 
+class Compared(NamedTuple):
+    """Another agent beside the team, in the same worlds."""
+
+    name: str
+    other: Harms
+    team: Harms
+
+
 def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     """Train each learner alone and the team without messages, search the joint optimum, and compare the team with them.
 
@@ -56,19 +65,19 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     if team != TRAINED_TEAM:
         return None
     outcomes, told = dict(evaluation.outcomes), "The training was interrupted: nothing more was trained to compare."
-    compared: list[Row] = []
+    rows: list[Compared] = []
     if experiment.trained.status == "finished":
         alone = _train_alone(experiment, tell)
         found = evaluate(evaluation.worlds, alone, scenario=evaluation.scenario, aftermath=False).complete()
         outcomes |= found.outcomes
         best = min(alone, key=lambda name: float(outcomes[name].world_harm(experiment.harm_count).mean()))
-        compared = [_row(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]))]
+        rows = [Compared(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]))]
         silent, why_silent = _without_messages(experiment, tell)
         optimum, why_optimum = _joint_optimum(experiment, outcomes, tell)
-        compared += [row for row in (silent, optimum) if row is not None]
+        rows += [*silent, *optimum]
         told = f"{why_silent} {why_optimum}"
-    borne = [_borne(outcomes, harm_count, evaluation.scenario) for harm_count in HARM_COUNTS]
-    sheets = [*borne, _added(experiment), *([_compared(compared)] if compared else [])]
+    sheets = [_borne(outcomes, harm_count, evaluation.scenario) for harm_count in HARM_COUNTS]
+    sheets += [_added(experiment), *(_compared(rows, harm_count) for harm_count in HARM_COUNTS if rows)]
     content = {"compared": told} | {sheet.title: sheet.json() for sheet in sheets}
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_output(experiment.run.path / "cooperation.json", text.encode(), force=True)
@@ -76,7 +85,7 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
-    """Train each learner alone while all other vehicles brake fully; return name -> team, which brakes in the others."""
+    """Train each learner alone while all others brake fully; return name -> team, which brakes the others fully."""
     scenario, found = experiment.evaluation.scenario, {}
     braking = make_agents(["full_brake"], scenario)["full_brake"]
     for vehicle in scenario.learners:
@@ -89,31 +98,39 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
     return found
 
 
-def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[Row | None, str]:
-    """Train the team with sensors instead of messages; return its row of the comparison, and a sentence about it."""
+def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
+    """Train the team with sensors instead of messages; return its rows of the comparison, and a sentence about it."""
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
         why = "a mixture" if scenario.members else "a scenario without messages"
-        return None, f"What messages add was not measured: this is {why}."
+        return [], f"What messages add was not measured: this is {why}."
     try:
         silent = scenario.replace(v2x="sensors-only")
         listed = silent.sample(int(evaluation.index.max()) + 1, experiment.list_seed).take(evaluation.index)
     except InvalidInput as error:
-        return None, f"What messages add was not measured: {error}."
+        return [], f"What messages add was not measured: {error}."
     pairs = ((getattr(listed.worlds, name), getattr(evaluation.worlds, name)) for name in ("gaps_m", "speeds_mps"))
     rows = np.flatnonzero(np.logical_and.reduce([(one == other).all(axis=1) for one, other in pairs]))
     if not rows.size:
-        return None, "What messages add was not measured: without messages no world of the list is the same line."
-    team = _train(experiment, silent, "without-messages", 1, tell)
-    driven = evaluate(listed.take(rows), {team.name: team}, scenario=silent, aftermath=False).complete()
+        return [], "What messages add was not measured: without messages no world of the list is the same line."
+    agents: dict[str, Driver] = {
+        **make_agents(["full_brake"], silent),
+        "team": _train(experiment, silent, "without-messages", 1, tell),
+    }
+    driven = evaluate(listed.take(rows), agents, scenario=silent, aftermath=False).complete()
     ours = _harms(evaluation.outcome(TRAINED_TEAM).take(rows))
-    return _row("team without messages", _harms(driven.outcome(team.name)), ours), (
-        "The team without messages is trained and driven with sensors only, which see the next vehicle ahead and behind,"
-        " so that a vehicle may also react later; the lines are the same."
+    found = [
+        Compared(f"{name} without messages", _harms(driven.outcome(name)), ours) for name in ("team", "full_brake")
+    ]
+    return found, (
+        "The team without messages is trained and driven with sensors only, which see the next vehicle ahead and"
+        " behind, so that a vehicle may also react later; the lines are the same."
     )
 
 
-def _joint_optimum(experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress) -> tuple[Row | None, str]:
+def _joint_optimum(
+    experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress
+) -> tuple[list[Compared], str]:
     """Search the least harm of all learners together; return its row of the comparison, and a sentence about it."""
     evaluation = experiment.evaluation
     rows = np.arange(min(SEARCHED, evaluation.worlds.n))
@@ -126,17 +143,17 @@ def _joint_optimum(experiment: Experiment, outcomes: Mapping[str, Outcome], tell
         told(0, len(rows))
         table = search_list(evaluation.scenario, part, budget=BUDGET, on_progress=told)
     except (InvalidInput, PhysicsError) as error:
-        return None, f"The joint optimum was not searched: {error}."
+        return [], f"The joint optimum was not searched: {error}."
     identity = task_problem(part.worlds, evaluation.task).identity
     best, shares = {}, []
     for harm_count in HARM_COUNTS:
         driven = [outcome.take(rows).world_harm(harm_count) for outcome in outcomes.values()]
         best[harm_count] = np.fmin.reduce([table.harm(identity, harm_count), *driven])
-        reached, worst = (outcomes[name].take(rows).world_harm(harm_count) for name in (TRAINED_TEAM, "full_brake"))
-        share = share_over_seeds(reached[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis])
-        told_share = "no" if share is None else share.in_words(digits=0, scale=100.0, unit=" %")
-        shares.append(f"{told_share} of the possible reduction of {HARM[harm_count]}")
-    return _row("joint optimum", best, _harms(outcomes[TRAINED_TEAM].take(rows))), (
+        ours, worst = (outcomes[name].take(rows).world_harm(harm_count) for name in (TRAINED_TEAM, "full_brake"))
+        share = share_over_seeds(ours[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis])
+        reached = "none" if share is None else share.in_words(digits=0, scale=100.0, unit=" %")
+        shares.append(f"{reached} of the possible reduction of {HARM[harm_count]}")
+    return [Compared("joint optimum", best, _harms(outcomes[TRAINED_TEAM].take(rows)))], (
         f"The joint optimum is the least harm known that these learners can do together, from a search of {BUDGET:,}"
         f" candidates per world in the first {len(rows)} worlds; the team reaches {' and '.join(shares)}."
     )
@@ -161,22 +178,17 @@ def _harms(outcome: Outcome) -> Harms:
     return {harm_count: outcome.world_harm(harm_count) for harm_count in HARM_COUNTS}
 
 
-def _row(name: str, other: Harms, team: Harms) -> Row:
-    """Return a row of the comparison: for each count of harm the other's, the team's, and their difference."""
-    cells = [(mean(other[each]), mean(team[each]), paired_difference(team[each], other[each])) for each in HARM_COUNTS]
-    return (name, len(team["first"]), *(cell for each in cells for cell in each))
-
-
-def _compared(rows: list[Row]) -> Sheet:
-    columns = [Column("Compared with", text=True), Column("Worlds", digits=0)]
-    for harm_count in HARM_COUNTS:
-        kind = HARM[harm_count]
-        columns += [
-            Column(f"Its {kind}", f"{harm_count}_other", interval="hidden"),
-            Column(f"The team's {kind}", f"{harm_count}_team", interval="hidden"),
-            Column("The team's minus its", f"{harm_count}_difference", sign="+", interval="below"),
-        ]
-    return Sheet("The trained team compared, mean per world (m²/s²)", columns, rows)
+def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
+    """Return a table of the team's harm beside that of each other, in one count."""
+    heads = ("Its harm", "The team's", "The team's minus its")
+    columns = [Column("Compared with", text=True), Column("Worlds", digits=0), *map(Column, heads[:2])]
+    columns = [replace(column, interval="hidden") for column in columns]
+    columns.append(Column(heads[2], "difference", sign="+"))
+    cells: list[Row] = []
+    for name, other, team in rows:
+        ours, its = team[harm_count], other[harm_count]
+        cells.append((name, len(ours), mean(its), mean(ours), paired_difference(ours, its)))
+    return Sheet(f"The trained team compared: {HARM[harm_count]}, mean per world (m²/s²)", columns, cells)
 
 
 def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, scenario: Scenario) -> Sheet:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.learned import TRAINED_POLICY
+from ethbrake_marl.agents.learned import TRAINED_POLICY, TRAINED_TEAM
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.evaluation import Evaluation
@@ -163,7 +163,7 @@ def write_figures(
         "learning_curve.png": (
             "Learning curve",
             "Harm and collisions on a fixed list of worlds during the training; level lines: baselines.",
-            learning_curve(course, references=references, caption=course_caption),
+            learning_curve(course, learned=learned, references=references, caption=course_caption),
         ),
         "harm_against_gap.png": (
             "Harm against the total initial gap",
@@ -234,6 +234,8 @@ def _page(
         f" {manifest.steps:,} steps (least harm on its own list)"
     )
     summary = f"{which}; {SHIELDED} is the same behind its shield."
+    if experiment.learned == TRAINED_TEAM:
+        summary += " In “all but” a vehicle, that vehicle brakes fully instead."
     if beside:
         summary += f" {TESTS[name]} The other two tests stand below."
     stopped = f"The training was interrupted: this is the {experiment.learned} after {manifest.steps:,} steps."

@@ -27,14 +27,19 @@ _POLICY = COLOURS[_POLICY_NUMBER]
 
 
 def learning_curve(
-    points: Sequence[Mapping[str, float]], *, references: Sequence[SummaryRow] = (), caption: str = ""
+    points: Sequence[Mapping[str, float]],
+    *,
+    learned: str = "policy",
+    references: Sequence[SummaryRow] = (),
+    caption: str = "",
 ) -> Figure:
-    """Draw both harms and the collision rate of a policy on a fixed list of worlds while it learns.
+    """Draw both harms and the collision rate of a policy or team on a fixed list of worlds while it learns.
 
     Raises ``InvalidInput`` without points.
 
     Args:
         points: evaluations in order; each has ``steps``, ``first_impact_harm``, ``total_harm`` and ``collision_rate``.
+        learned: name of the policy or team in the legend.
         references: summaries of other agents, drawn as level lines.
         caption: text below the figure.
 
@@ -44,7 +49,7 @@ def learning_curve(
     figure, panels = new_panels((10.0, 3.9), columns=3)
     steps = [point["steps"] for point in points]
     for axes, (name, label) in zip(panels, _PANELS, strict=True):
-        axes.plot(steps, [point[name] for point in points], color=_POLICY, marker="o", markersize=3.5, label="policy")
+        axes.plot(steps, [point[name] for point in points], color=_POLICY, marker="o", markersize=3.5, label=learned)
         for number, row in enumerate(references):
             style = series_style(number if number < _POLICY_NUMBER else number + 1)
             axes.axhline(
