@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -76,12 +75,14 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
         optimum, why_optimum = _joint_optimum(experiment, outcomes, tell)
         rows += [*silent, *optimum]
         told = f"{why_silent} {why_optimum}"
-    sheets = [_borne(outcomes, harm_count, evaluation.scenario) for harm_count in HARM_COUNTS]
-    sheets += [_added(experiment), *(_compared(rows, harm_count) for harm_count in HARM_COUNTS if rows)]
-    content = {"compared": told} | {sheet.title: sheet.json() for sheet in sheets}
+    sheets = {f"borne_{each}": _borne(outcomes, each, evaluation.scenario) for each in HARM_COUNTS}
+    sheets["added"] = _added(experiment)
+    if rows:
+        sheets |= {f"compared_{each}": _compared(rows, each) for each in HARM_COUNTS}
+    content = {name: sheet.json() for name, sheet in sheets.items()} | {"note": told}
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_output(experiment.run.path / "cooperation.json", text.encode(), force=True)
-    return RunSection("Several learners", (*sheets, told))
+    return RunSection("Several learners", (*sheets.values(), told))
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
@@ -180,10 +181,13 @@ def _harms(outcome: Outcome) -> Harms:
 
 def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
     """Return a table of the team's harm beside that of each other, in one count."""
-    heads = ("Its harm", "The team's", "The team's minus its")
-    columns = [Column("Compared with", text=True), Column("Worlds", digits=0), *map(Column, heads[:2])]
-    columns = [replace(column, interval="hidden") for column in columns]
-    columns.append(Column(heads[2], "difference", sign="+"))
+    columns = [
+        Column("Compared with", "with", text=True),
+        Column("Worlds", "worlds"),
+        Column("Its harm", "its", interval="hidden"),
+        Column("The team's", "team", interval="hidden"),
+        Column("The team's minus its", "difference", sign="+"),
+    ]
     cells: list[Row] = []
     for name, other, team in rows:
         ours, its = team[harm_count], other[harm_count]
@@ -193,9 +197,11 @@ def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
 
 def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, scenario: Scenario) -> Sheet:
     """Return a table of the harm that each vehicle bears, one row for each agent."""
-    names = [f"Vehicle {i + 1}" for i in range(scenario.vehicles)]
+    names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     learn = ", ".join(names[i] for i in scenario.learners)
-    columns = [Column("Agent", text=True), *map(partial(Column, interval="hidden"), (*names, "Whole line"))]
+    columns = [Column("Agent", "agent", text=True)]
+    for heading, key in zip((*names, "Whole line"), (*scenario.vehicle_names, "line"), strict=True):
+        columns.append(Column(heading, key, interval="hidden"))
     rows: list[Row] = []
     for agent, outcome in outcomes.items():
         each = outcome.vehicle_harm(harm_count).T
@@ -206,7 +212,7 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, scenario: Sce
 def _added(experiment: Experiment) -> Sheet:
     """Return a table of what each learner adds: the team with that vehicle braking fully instead, minus the team."""
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
-    columns = [Column("Learner", text=True)]
+    columns = [Column("Learner", "learner", text=True)]
     columns += [Column(f"More {HARM[each]} without it", f"{each}_added", sign="+") for each in HARM_COUNTS]
     rows: list[Row] = []
     for vehicle in scenario.learners:

@@ -74,7 +74,7 @@ def test_run__the_learning_curve_has_the_lines_of_its_references(monkeypatch, fi
     course = [{"steps": 0.0, "first_impact_harm": 30.0, "total_harm": 33.0, "collision_rate": 1.0}]
     write_figures(tmp_path, result, eb.summarise(result), course=course, course_caption="", agents=agents)
     labels = [text.get_text() for text in drawn[0].legends[0].get_texts()]
-    assert labels == ["policy", "full_brake", "e_v2x_bm"]
+    assert labels == ["trained policy", "full_brake", "e_v2x_bm"]
 
 
 @pytest.mark.slow
