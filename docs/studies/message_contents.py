@@ -1,6 +1,7 @@
 """What is each piece of a message worth? A Markdown table of the harm where messages lack it.
 
     python docs/studies/message_contents.py runs/pieces --seeds 5     # trains what is missing there, prints the table
+    python docs/studies/message_contents.py runs/pieces --jobs 16     # likewise, in so many processes
     python docs/studies/message_contents.py runs/pieces --quick       # in a minute, to see it run; it says nothing yet
 
 Lines: ``paper-random``, a line of five in which four learn, and ``paper-random`` over a channel that loses half of its
@@ -13,6 +14,9 @@ way.
 from __future__ import annotations
 
 import argparse
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,8 +59,10 @@ def scenario_of(line: str, contents: str) -> eb.Scenario:
     return eb.load_scenario(name).replace(v2x={**channel, "tells": list(CONTENTS[contents])})
 
 
-def learn(folder: Path, scenario: eb.Scenario, steps: int, seed: int) -> eb.LearnedAgent:
-    """The policy of a training, which is made if the folder does not hold it."""
+def learn(runs: Path, line: str, contents: str, steps: int, seed: int) -> Path:
+    """The folder of a training, which is made if it does not hold a policy."""
+    scenario = scenario_of(line, contents)
+    folder = runs / f"{line.strip('`')}-{contents}-{steps}-{seed}".replace(" ", "-")
     several = len(scenario.learners)
     recipe = eb.load_recipe("cooperation").replace(
         observation=SEEN, total_steps=steps * several, seed=seed, reward={"harm": 1.0, "harm_count": "total"},
@@ -64,16 +70,14 @@ def learn(folder: Path, scenario: eb.Scenario, steps: int, seed: int) -> eb.Lear
     )  # fmt: skip
     if not (folder / "policy-last").exists():
         eb.train(recipe, scenario, folder, measure=None, on_progress=None, force=True)
-    return eb.LearnedAgent(eb.load_policy(folder / "policy-last"))
+    return folder
 
 
 def harms(runs: Path, line: str, contents: str, effort: Effort) -> Floats:
     """Total harm of every seed's policy, [seeds, worlds] m2/s2."""
     scenario = scenario_of(line, contents)
-    place = runs / f"{line.strip('`')}-{contents}-{effort.steps}".replace(" ", "-")
-    agents = {
-        f"{k}": learn(place.with_name(f"{place.name}-{k}"), scenario, effort.steps, k) for k in range(effort.seeds)
-    }
+    folders = [learn(runs, line, contents, effort.steps, seed) for seed in range(effort.seeds)]
+    agents = {folder.name: eb.LearnedAgent(eb.load_policy(folder / "policy-last")) for folder in folders}
     found = eb.evaluate(scenario.sample(effort.worlds, SEED), agents, scenario=scenario, seed=SEED, aftermath=False)
     return np.stack([found.outcome(name).ledger.world_harm("total") for name in agents])
 
@@ -97,9 +101,13 @@ def main() -> None:
     parser.add_argument("runs", type=Path)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=300_000, help="decisions of each learner in a training")
+    parser.add_argument("--jobs", type=int, default=1, help="so many trainings at once")
     parser.add_argument("--quick", action="store_true", help="one seed of 4,096 decisions, 50 worlds")
     given = parser.parse_args()
     effort = Effort(1, 4_096, 50) if given.quick else Effort(given.seeds, given.steps, 4_000)
+    with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
+        trainings = product([given.runs], LINES, CONTENTS, [effort.steps], range(effort.seeds))
+        list(pool.map(learn, *zip(*trainings, strict=True)))
     rows = table(given.runs, effort)
     print("\n".join(f"| {' | '.join(row)} |" for row in [HEAD, ["---"] * len(HEAD), *rows]))
 
