@@ -67,7 +67,7 @@ def run_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train one learner or a team, shield it, compare with the baselines, report.
+    """Train one learner or a team, shield it, compare, and report.
 
     Writes the run's folder: policies, results as CSV and JSON, every world, and the installed reports: three figures
     and report.html; for one of the three tests (paper-random, -brake-only, -obstacle) also the other two; of a team

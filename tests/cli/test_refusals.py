@@ -153,9 +153,9 @@ def test_role_that_cannot_drive__is_refused_before_anything_is_written(command: 
     refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 80: roles.vehicle_1 = coast:4: agent 'coast:4'")
 
 
-def test_run__drives_one_vehicle(refuse: Refuse) -> None:
-    write_scenario("vehicle_3: full_brake\n", "vehicle_3: learner\n")
-    refuse("run --output new --scenario mine.yaml", "has 2 learners (vehicle_2, vehicle_3); give the others a script")
+def test_run__needs_a_learner(refuse: Refuse) -> None:
+    write_scenario("vehicle_2: learner\n", "vehicle_2: full_brake\n")
+    refuse("run --output new --scenario mine.yaml", "has no learner to drive")
 
 
 @pytest.mark.parametrize(
