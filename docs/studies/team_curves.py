@@ -35,6 +35,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.seeds import interquartile_mean
 from ethbrake_marl.extensions.report.style import (
     GREY,
@@ -244,7 +245,7 @@ def refer(file: Path, level: str) -> str:
     return write(file, {"level": level, "harms": harms})
 
 
-def finish_jobs(pool: ProcessPoolExecutor, jobs: Mapping[Future[str], str]) -> int:
+def finish_jobs(jobs: Mapping[Future[str], str]) -> int:
     """Wait for jobs, and say what became of each; how many failed."""
     failed, begun = 0, time.monotonic()
     for number, job in enumerate(as_completed(jobs), 1):
@@ -269,14 +270,14 @@ def work(folder: Path, given: argparse.Namespace) -> int:
         for (level, algorithm), file in speeds.items():
             if not file.exists():
                 first[pool.submit(measure_speed, file, algorithm, level, given.seconds)] = file.name
-        failed = finish_jobs(pool, first)
+        failed = finish_jobs(first)
         for seed, (level, algorithm) in product(given.seeds, pairs):
             file = folder / f"curve.{algorithm}.{level}.{seed}.json"
             if speeds[level, algorithm].exists() and not file.exists():
                 rate = json.loads(speeds[level, algorithm].read_bytes())["decisions_per_s"]
                 steps = max(round(rate * given.seconds), 1)
                 later[pool.submit(train, file, algorithm, level, steps, seed)] = file.name
-        return failed + finish_jobs(pool, later)
+        return failed + finish_jobs(later)
 
 
 def check(folder: Path, given: argparse.Namespace) -> None:
@@ -376,8 +377,8 @@ def draw(found: Results) -> Figure:
         name_axes(axes, level, "Processor time of learning (s)", TITLES["first"])
     seeds = len({curve["seed"] for curve in found["curves"]})
     caption = (
-        f"Interquartile means over {seeds} seeds with 95 % intervals; {found['worlds']:,} worlds of the list of seed"
-        f" {found['seed']}, which no training uses; deterministic teams, trained for first-impact harm."
+        f"Interquartile means over {count_of(seeds, 'seed')} with 95 % intervals; {found['worlds']:,} worlds of the list"
+        f" of seed {found['seed']}, which no training uses; deterministic teams, trained for first-impact harm."
     )
     return finish(figure, caption, panels[0], columns=4)
 
