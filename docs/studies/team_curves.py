@@ -377,8 +377,8 @@ def draw(found: Results) -> Figure:
         name_axes(axes, level, "Processor time of learning (s)", TITLES["first"])
     seeds = len({curve["seed"] for curve in found["curves"]})
     caption = (
-        f"Interquartile means over {count_of(seeds, 'seed')} with 95 % intervals; {found['worlds']:,} worlds of the list"
-        f" of seed {found['seed']}, which no training uses; deterministic teams, trained for first-impact harm."
+        f"Interquartile means over {count_of(seeds, 'seed')} with 95 % intervals; {found['worlds']:,} worlds of the"
+        f" list of seed {found['seed']}, which no training uses; deterministic teams, trained for first-impact harm."
     )
     return finish(figure, caption, panels[0], columns=4)
 
