@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, get_args
 
@@ -34,8 +35,9 @@ from ethbrake_marl.training.recipe import Scheme
 from tests.docs.site import DOCS, load
 from tests.fixtures.installed import write_metadata
 
-sampling, price, equal_time, cooperative, message_contents = (
-    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "cooperative", "message_contents")
+sampling, price, equal_time, cooperative, message_contents, team_curves = (
+    load(f"../studies/{name}")
+    for name in ("sampling", "price", "equal_time", "cooperative", "message_contents", "team_curves")
 )
 
 
@@ -124,6 +126,49 @@ def test_cooperative__tells_how_likely_a_training_is_to_do_less_harm_than_ppos()
     assert alone[5][5:] == ["1.00", "–", "2.00", "–", "–"]
     assert cooperative.HEAD in [table.columns for table in load("results").read_tables("cooperation")]
     assert picture_bytes(cooperative.draw({level: (harms, braking)}), "learners.png").startswith(PNG)
+
+
+def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_with() -> None:
+    level, lasts = team_curves.LEVELS[0], (9.0, 1.0, 2.0, 6.0, 4.0)  # without the best and the worst: mean 4
+    curves = [
+        {
+            "algorithm": "ippo",
+            "level": level,
+            "seed": seed,
+            "points": [[0, 0.0, 30.0, 40.0], [8192, 2.0, last, 2 * last]],
+        }
+        for seed, last in enumerate(lasts)
+    ]
+    harms = {"full_brake": [24.0, 25.0], "e_v2x_bm": [15.0, 16.0], "joint optimum": [0.5, 0.75]}
+    found = {"seconds": 2.0, "worlds": 100, "seed": 1, "speeds": [], "references": {level: harms}, "curves": curves}
+    assert json.loads(team_curves.text_of(found)) == found
+    rows = team_curves.table(found)
+    assert [row[1] for row in rows] == ["full braking", "E-V2X-BM", "IPPO (`train/ippo.py`)", "joint optimum (search)"]
+    assert rows[2][2:4] == ["8,192", "2 s"]
+    assert [cell.split(" [")[0] for cell in rows[2][4:]] == ["4.00", "8.00"]
+    assert rows[3][4:] == ["0.50", "0.75"]
+    assert picture_bytes(team_curves.draw(found), "curves.png").startswith(PNG)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", [each for each in team_curves.ALGORITHMS if each != "benchmarl"])
+def test_team_curves__measure_before_the_first_and_after_the_last_update(algorithm) -> None:
+    first, last = team_curves.learn(algorithm, "cooperation-3-pair", 1, 0, worlds=2)
+    assert first[:2] == [0, 0.0]
+    assert last[0] > 0
+    assert last[1] > 0.0
+    assert first[2:] != last[2:]
+
+
+def test_team_curves__a_failed_job_is_counted_and_the_others_go_on(capsys) -> None:
+    good, bad = Future(), Future()
+    good.set_result("good.json")
+    bad.set_exception(ValueError("no such level"))
+    assert team_curves.finish_jobs({good: "good.json", bad: "bad.json"}) == 1
+    printed = capsys.readouterr()
+    assert "good.json\n" in printed.out
+    assert "bad.json FAILED" in printed.out
+    assert "no such level" in printed.err
 
 
 def test_message_contents__trains_each_content_once_and_compares_it_with_the_usual_pieces(
