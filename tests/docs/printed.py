@@ -191,8 +191,8 @@ PICTURES: dict[str, How] = {
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
     "regimes.png": _by(NIGHTLY, "python docs/studies/regimes.py regimes.png"),
     "cooperation-ablation": _by(TRAINING),
-    "cooperative-learners.png": _by(TRAINING),
     "learning-curves": _by(TRAINING),
+    "team-curves.png": _by(TRAINING),
 }
 
 

@@ -35,9 +35,8 @@ from ethbrake_marl.training.recipe import Scheme
 from tests.docs.site import DOCS, load
 from tests.fixtures.installed import write_metadata
 
-sampling, price, equal_time, cooperative, message_contents, team_curves = (
-    load(f"../studies/{name}")
-    for name in ("sampling", "price", "equal_time", "cooperative", "message_contents", "team_curves")
+sampling, price, equal_time, message_contents, team_curves = (
+    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "message_contents", "team_curves")
 )
 
 
@@ -115,19 +114,6 @@ def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page(
     assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
 
 
-def test_cooperative__tells_how_likely_a_training_is_to_do_less_harm_than_ppos() -> None:
-    less, more = np.array([[1.0, 2.0], [2.0, 3.0]]), np.array([[2.0, 4.0], [5.0, 6.0]])
-    harms = {name: (20.0, more if name == "ppo" else less) for name in cooperative.METHODS}
-    level, braking = "cooperation-3-pair", np.array([9.0, 10.0])
-    rows = cooperative.lines(level, harms, braking)
-    assert [row[-1] for row in rows] == ["–", "0.88", "0.88", "0.50", "0.88", "0.88"]
-    assert [rows[3][5], rows[3][7]] == ["3.50", "5.00"]
-    alone = cooperative.lines(level, harms | {"mappo": (20.0, less[:1])}, braking)
-    assert alone[5][5:] == ["1.00", "–", "2.00", "–", "–"]
-    assert cooperative.HEAD in [table.columns for table in load("results").read_tables("cooperation")]
-    assert picture_bytes(cooperative.draw({level: (harms, braking)}), "learners.png").startswith(PNG)
-
-
 def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_with() -> None:
     level, lasts = team_curves.LEVELS[0], (9.0, 1.0, 2.0, 6.0, 4.0)  # without the best and the worst: mean 4
     curves = [
@@ -148,6 +134,14 @@ def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_
     assert [cell.split(" [")[0] for cell in rows[2][4:]] == ["4.00", "8.00"]
     assert rows[3][4:] == ["0.50", "0.75"]
     assert picture_bytes(team_curves.draw(found), "curves.png").startswith(PNG)
+
+
+def test_team_curves__the_table_in_the_docs_is_made_from_the_numbers_beside_the_script() -> None:
+    (shown,) = (each for each in load("results").read_tables("cooperation") if each.id == "team-curves")
+    found = json.loads(team_curves.NUMBERS.read_bytes())
+    assert [shown.columns, shown.rows] == [team_curves.HEAD, team_curves.table(found)]
+    assert team_curves.NUMBERS.read_text("utf-8") == team_curves.text_of(found)
+    assert len(found["curves"]) == len(team_curves.LEVELS) * len(team_curves.ALGORITHMS) * 5
 
 
 @pytest.mark.slow
