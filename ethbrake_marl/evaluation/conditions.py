@@ -9,6 +9,7 @@ import numpy as np
 
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.physics.state import Worlds
+from ethbrake_marl.scenario.channel import Tells
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.task import Task
 
@@ -86,15 +87,18 @@ class Conditions(dict[str, Any]):
             scripts={name: script for name, script in scripts.items() if name not in driven},
             time_step_s=scenario.time_step_s,
             horizon_s=scenario.horizon_s,
+            **({} if scenario.v2x.channel.tells is None else {"tells": _plain(scenario.v2x.channel.tells)}),
             **because,
             **quantities,
         )
 
     @property
     def line(self) -> str:
-        """Caption in one line: scenario, number of worlds, seed, and the quantities with symbols and units."""
-        seed = "" if self["seed"] is None else f", seed {self['seed']}"
-        return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}"
+        """Caption in one line: scenario, number of worlds, seed, quantities with their units, unusual messages."""
+        seed, tells = "" if self["seed"] is None else f", seed {self['seed']}", self.get("tells", {})
+        each = tells if isinstance(tells, Mapping) else {"all": tells}
+        told = [f"; messages of {who} contain {', '.join(pieces) or 'the alert alone'}" for who, pieces in each.items()]
+        return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}{''.join(told)}"
 
     @property
     def quantities(self) -> str:
@@ -110,3 +114,8 @@ class Conditions(dict[str, Any]):
                 told = texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"
                 parts.append(f"{symbol}{_STAY}={_STAY}{told}{f'{_STAY}{unit}' if unit else ''}")
         return "; ".join(parts)
+
+
+def _plain(tells: Tells) -> Any:
+    """Return what messages contain as plain data for JSON: a list, or a list by vehicle."""
+    return {name: [*each] for name, each in tells.items()} if isinstance(tells, Mapping) else [*tells]

@@ -9,6 +9,7 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.errors import Unfamiliar
+from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.policies.manifest import Manifest
 from ethbrake_marl.scenario.fields import QUANTITY
@@ -23,7 +24,7 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
     """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds outside the range of its training.
 
     The training's worlds are drawn from the scenario in the policy's manifest. If that scenario cannot be drawn here,
-    there is no warning. Of the V2X channel, only the latencies are compared.
+    there is no warning. Of the V2X channel, only the latencies and the contents of messages are compared.
 
     Args:
         agents: agents by name; those that are not trained policies are ignored.
@@ -47,6 +48,7 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
         if not np.isclose(trained.time_step_s, scenario.time_step_s):
             found.append("time_step_s")
         found += [f"{worlds.N} vehicles"] if worlds.N != before.N else _beyond(before, worlds)
+        found += _contents(trained, scenario) if worlds.N == before.N else []
         for i, script in scenario.scripts.items():
             if str(trained.scripts.get(i, script)) != str(script):
                 found.append(f"{scenario.vehicle_names[i]} by {script}")
@@ -76,3 +78,12 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
             found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
     gone = {key: rule.of(before) < rule.high for key, rule in known.items() if key not in here}
     return found + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before
+
+
+def _contents(trained: Scenario, scenario: Scenario) -> list[str]:
+    """Return descriptions of what messages contain in one of two scenarios alone, such as ``messages without mass``."""
+    usual = np.array([piece in USUAL_PIECES for piece in PIECES])
+    told = [each.v2x.channel.contents(scenario.vehicles) for each in (trained, scenario)]
+    before, here = (np.tile(usual, (scenario.vehicles, 1)) if each is None else each for each in told)
+    lost = [f"messages without {piece}" for k, piece in enumerate(PIECES) if (before & ~here)[:, k].any()]
+    return lost + [f"messages with {piece}" for k, piece in enumerate(PIECES) if (here & ~before)[:, k].any()]

@@ -92,7 +92,8 @@ def _knowledge(rows: Sequence[SummaryRow]) -> str:
         return ""
     text = (
         f"In {100 * hidden:.1f} % of these worlds the channel hides something of the line from a driven vehicle at"
-        " its first decision: news that has not arrived, or how late another vehicle will react."
+        " its first decision: news that has not arrived, how late another vehicle will react, or what no message"
+        " contains."
     )
     through = ", ".join(row.agent for row in rows if row.sees_through)
     if through:

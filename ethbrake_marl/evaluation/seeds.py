@@ -21,6 +21,8 @@ RESAMPLES = 10_000  # bootstrap resamples of seeds
 
 _RESAMPLES = 2_000  # bootstrap resamples of seeds and worlds
 
+_LEAST_REDUCTION = 1e-3  # part of the possible reduction below which a resample has no share
+
 _CUT = 0.25  # share of values that the interquartile mean omits at either end
 
 _AT_ONCE = 1 << 20  # resampled worlds in memory at once: 8 MB
@@ -100,7 +102,8 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
     """Return the share of the possible reduction that ``values`` reaches: 0 like ``worst``, 1 like ``best``.
 
     It is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with the bootstrap interval of
-    ``mean_over_seeds``. Returns None unless ``best`` has a lower mean than ``worst``.
+    ``mean_over_seeds``. Returns None unless ``best`` has a lower mean than ``worst``, also in nearly all resamples:
+    few worlds with a reduction allow no share.
 
     Args:
         values: [seeds, worlds] harms to judge.
@@ -115,11 +118,13 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
         return None
 
     def shares(means: Floats) -> Floats:
-        means = means[means[:, 1] > means[:, 2]]
-        share: Floats = (means[:, 1] - means[:, 0]) / (means[:, 1] - means[:, 2])
-        return share
+        possible = means[:, 1] - means[:, 2]
+        there = possible > _LEAST_REDUCTION * (high - low)
+        share: Floats = (means[there, 1] - means[there, 0]) / possible[there]
+        return share if there.mean() > CONFIDENCE else np.full(1, np.nan)
 
-    return _resampled((high - reached) / (high - low), sides, shares, seed)
+    share = _resampled((high - reached) / (high - low), sides, shares, seed)
+    return None if share.interval is not None and np.isnan(share.interval).any() else share
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:

@@ -204,12 +204,12 @@ def compared_agents(
         i: LearnedAgent(trained.drivers[scenario.vehicle_names[i]], TRAINED_TEAM) for i in scenario.learners
     }
     team = Team(drivers, TRAINED_TEAM)
-    found |= {TRAINED_TEAM: team, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
+    found[TRAINED_TEAM] = team
     braking = make_agents(["full_brake"], scenario)["full_brake"]
     for i in scenario.learners:
         name = without(scenario.vehicle_names[i])
         found[name] = Team({**drivers, i: braking}, name)
-    return found
+    return {**found, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
 
 
 def without(vehicle: str) -> str:

@@ -338,6 +338,11 @@ def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
         ("ppo@shipped/ppo", PAPER.replace(latency_s=[0.0, 0.5, 1.2]), "latency_s in 100 % of the worlds"),
         ("ppo@shipped/ppo", PAPER.replace(speeds_mps={"uniform": [18.0, 30.0]}), "speeds_mps in 9. % of the worlds"),
         ("ppo@shipped/ppo", load_scenario("cooperation-4-five"), "vehicle_1, .*, vehicle_5, 5 vehicles"),
+        (
+            "ppo@shipped/ppo",
+            PAPER.replace(v2x={"tells": {"vehicle_3": ["place", "speed", "intent"]}}),
+            "messages without acceleration, .*, messages without mass, messages with intent",
+        ),
     ],
 )
 def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once(agent, scenario, beyond) -> None:

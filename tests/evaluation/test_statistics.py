@@ -232,6 +232,8 @@ def test_share_over_seeds__by_hand() -> None:
     assert found.interval == pytest.approx((0.5, 0.75), abs=0.02)
     assert share_over_seeds(seeds, worst, worst) is None
     assert share_over_seeds([[4.0]], [10.0], [0.0]) == Estimate(0.6, None)
+    one = np.array([6.0, 0.0, 0.0])  # the only world with something to reduce: 30 % of the resamples lack it
+    assert share_over_seeds([one / 2.0 + 1.0], one, [np.zeros(3) + 1e-17]) is None
 
 
 def test_mean_over_seeds__of_truths_is_a_rate_and_against_a_baseline_a_difference() -> None:

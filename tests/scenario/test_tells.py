@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -318,3 +319,17 @@ def test_run__refuses_before_it_trains_because_its_baseline_and_its_shield_would
     with pytest.raises(InvalidInput, match=where):
         run_experiment(LIGHT, tmp_path / "run", recipe=eb.load_recipe("ppo"), episodes=5)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("tells", "told"),
+    [
+        (["place", "speed"], "; messages of all contain place, speed"),
+        ({"vehicle_3": []}, "; messages of vehicle_3 contain the alert alone"),
+        (None, ""),
+    ],
+)
+def test_results__say_what_messages_contain(tells: Any, told: str) -> None:
+    scenario = eb.load_scenario("paper-random").replace(v2x={} if tells is None else {"tells": tells})
+    rows = eb.summarise(eb.evaluate(agents="full_brake", scenario=scenario, episodes=3))
+    assert rows[0].parameters.get("tells") == tells and rows[0].parameters.line.endswith(f"e\u00a0=\u00a00.1{told}")

@@ -63,7 +63,10 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
     """
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
-        raise InvalidInput(f"agent {settings.spec!r}: :believed shields one learner, not several; take +step")
+        raise InvalidInput(
+            f"agent {settings.spec!r}: :believed shields one learner. +step shields several where messages contain"
+            " every piece; without a piece several learners have no shield"
+        )
     return shielded(policy, scenario, "step", harm_count=settings.harm_count, believed=True)
 
 

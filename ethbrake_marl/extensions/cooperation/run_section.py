@@ -183,7 +183,7 @@ def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
     """Return a table of the team's harm beside that of each other, in one count."""
     columns = [
         Column("Compared with", "with", text=True),
-        Column("Worlds", "worlds"),
+        Column("Worlds", "worlds", digits=0),
         Column("Its harm", "its", interval="hidden"),
         Column("The team's", "team", interval="hidden"),
         Column("The team's minus its", "difference", sign="+"),

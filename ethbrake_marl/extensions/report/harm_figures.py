@@ -15,6 +15,7 @@ from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.style import TITLES, finish, label_text, name_axes, new_panels, plain, series_style
 from ethbrake_marl.extensions.report.svg import SLIM_IN
+from ethbrake_marl.extensions.search.limit_measures import best_known_words
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
@@ -51,7 +52,7 @@ def harm_by_agent(
         axes.barh(k, getattr(row, name).value, height=0.62, color=COLOURS[2])
         axes.hlines(k, *getattr(row, name).ends, color=COLOURS[0], linewidth=1.6)
     if (best := rows[0][f"best_known_{name}"]) is not None:
-        axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
+        axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label=best_known_words(rows[0]))
     for number, (title, others) in enumerate((elsewhere or {}).items()):
         harms = {row.agent: getattr(row, name).value for row in others}
         places = [k for k, row in enumerate(rows) if row.agent in harms]

@@ -26,6 +26,7 @@ from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_
 from ethbrake_marl.extensions.report.page import Page, Part, Section
 from ethbrake_marl.extensions.report.player import Played
 from ethbrake_marl.extensions.report.shown_worlds import BASELINE, NAMES, ROUNDING, WORDS, choose_shown, worst_rows
+from ethbrake_marl.extensions.search.limit_measures import best_known_words
 from ethbrake_marl.extensions.search.limits import Unproven
 from ethbrake_marl.extensions.search.regret import limits_of, regrets_of
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
@@ -253,7 +254,7 @@ class Report:
         name = "Full braking" if self.about == BASELINE else self.about
         name = f"The {name}" if name in (TRAINED_POLICY, TRAINED_TEAM) else name
         value, best = row[harm], row[f"best_known_{harm}"]
-        known = "" if best is None else f"; best known {_words(best)}"
+        known = "" if best is None else f"; {best_known_words(row)} {_words(best)}"
         impacts = "first impacts" if self.harm_count == "first" else "all impacts"
         if before is None or row is before:
             return f"{name} does {_words(value)} m²/s² of harm per emergency ({impacts}{known})."

@@ -93,6 +93,6 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
             else:
                 axes.vlines(at, ends[:, 0], ends[:, 1], color=str(style["color"]), linewidth=1.2)
         name_axes(axes, label, f"Total gap at the alert, {sum_of_gaps} (m)")
-        axes.set_ylim(bottom=0.0)
+    panels[0].set_ylim(bottom=0.0)  # of both, once everything is drawn
     caption = f"Mean per group of worlds; bands: 95 % intervals. {evaluation.conditions.line}."
     return finish(figure, caption, panels[0])

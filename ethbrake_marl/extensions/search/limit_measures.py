@@ -67,9 +67,9 @@ class LimitMeasures(MeasureSet):
         Measure(
             "mean_regret_first", lambda o, r: r.regret(o, "first"), "Regret, first-impact", "Regret\nfirst",
             "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best known"
-            " is 0 where contact is proven avoidable, else the result of a search over whole profiles of Vehicle 2, or"
-            " of an agent in this table that did better. With ≥: the best of some world is known from these agents"
-            " alone.",
+            " is 0 where contact is proven avoidable, else the result of an earlier search over whole profiles of the"
+            " driven vehicles, or of an agent in this table that did better. With ≥: the best of some world is known"
+            " from these agents alone.",
         ),
         Measure(
             "mean_regret_total", lambda o, r: r.regret(o, "total"),
@@ -167,6 +167,12 @@ class LimitMeasures(MeasureSet):
         below = [f"{agent} in {count_of(count, 'world')}" for agent, count in counts.items() if count]
         told += [f"Less harm than the best known before: {', '.join(below)}."] if below else []
         return [" ".join(told)]
+
+
+def best_known_words(row: SummaryRow) -> str:
+    """Return the name of the best known harm: another one where some world was not searched beforehand."""
+    share = row.more[NAME]["known_best_share"]
+    return "best known" if share is None or share == 1.0 else "best of these agents"
 
 
 def _unavoidable(row: SummaryRow) -> str:

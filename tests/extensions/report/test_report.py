@@ -211,6 +211,11 @@ def test_report__begins_with_what_the_agent_does_against_full_braking_and_where_
     )
 
 
+def test_report__calls_nothing_best_known_that_no_search_has_found() -> None:
+    mine = summed_up(eb.load_scenario("cooperation-4-all"), "full_brake", "e_v2x_bm")
+    assert re.search(r"instead of [0-9.]+; best of these agents [0-9.]+\)", mine.first_sentence)
+
+
 def test_report__names_the_tests_in_which_the_agent_does_no_less_harm_than_full_braking(
     paper_random: eb.Scenario,
 ) -> None:
