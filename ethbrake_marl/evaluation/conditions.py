@@ -11,6 +11,7 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.channel import Tells
 from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
 _SYMBOLS = {
@@ -95,10 +96,9 @@ class Conditions(dict[str, Any]):
     @property
     def line(self) -> str:
         """Caption in one line: scenario, number of worlds, seed, quantities with their units, unusual messages."""
-        seed, tells = "" if self["seed"] is None else f", seed {self['seed']}", self.get("tells", {})
-        each = tells if isinstance(tells, Mapping) else {"all": tells}
-        told = [f"; messages of {who} contain {', '.join(pieces) or 'the alert alone'}" for who, pieces in each.items()]
-        return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}{''.join(told)}"
+        seed = "" if self["seed"] is None else f", seed {self['seed']}"
+        told = f"; {_message_words(self['tells'])}" if "tells" in self else ""
+        return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}{told}"
 
     @property
     def quantities(self) -> str:
@@ -119,3 +119,14 @@ class Conditions(dict[str, Any]):
 def _plain(tells: Tells) -> Any:
     """Return what messages contain as plain data for JSON: a list, or a list by vehicle."""
     return {name: [*each] for name, each in tells.items()} if isinstance(tells, Mapping) else [*tells]
+
+
+def message_words(scenario: Scenario) -> str:
+    """Return what messages contain in words, for instance ``messages of all contain place``; empty: the usual."""
+    tells = scenario.v2x.channel.tells
+    return "" if tells is None else _message_words(tells)
+
+
+def _message_words(tells: Tells) -> str:
+    each = tells if isinstance(tells, Mapping) else {"all": tells}
+    return "; ".join(f"messages of {who} contain {', '.join(told) or 'the alert alone'}" for who, told in each.items())

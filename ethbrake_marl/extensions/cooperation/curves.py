@@ -82,7 +82,7 @@ def _who_bears(found: Json, caption: str) -> Figure:
                 borne = [Estimate(**level[harm_count]["vehicles"][i]) for level in levels]
                 name = f"Vehicle {i + 1}" + (f", {algorithm}" if several > 1 else "")
                 style = {**series_style(i), "linestyle": series_style(number)["linestyle"]}
-                _curve(axes, levels, borne, several * i + number, capsize=3, label=name, **style)
+                _curve(axes, levels, borne, several * i + number, capsize=3, label=name, clip_on=False, **style)
         _number_axis(axes, found)
         name_axes(axes, f"{TITLES[harm_count]} that each vehicle bears")
     return finish(figure, caption, panels[0], columns=4, fontsize=8.5)

@@ -86,9 +86,10 @@ def _harm_curve(found: Json, caption: str) -> Figure:
         for number, algorithm in enumerate(algorithms(found)):
             _reached(axes, found["levels"], ladder, harm_count, algorithm, number)
         axes.set_xticks(range(len(ladder)), [_short(name) for name in ladder], fontsize=8)
-        axes.set_yscale("symlog", linthresh=LINEAR)
+        if axes.dataLim.ymin < 1.0:
+            axes.set_yscale("symlog", linthresh=LINEAR)
         axes.yaxis.set_major_formatter(FuncFormatter(plain))
-        axes.set_ylim(0.0, 1.5 * axes.get_ylim()[1])
+        axes.set_ylim(0.0, (1.5 if axes.get_yscale() == "symlog" else 1.1) * axes.get_ylim()[1])
         name_axes(axes, TITLES[harm_count])
     worlds = found["levels"][0]["first"]["searched"]["worlds"]
     told = f"{caption} All of this figure: the first {count_of(worlds, 'world')}."
@@ -206,7 +207,7 @@ def _reached(
             shielded, [{harm_count: level[harm_count]["shielded"]} for level in shielded], -0.12,
             {"fmt": "x", "color": COLOURS[2], "label": f"{algorithm}, shielded"},
         ),
-        (worse, worse, 0.0, {**hollow, "label": f"{algorithm}, worse channel"}),
+        (worse, worse, 0.0, {**hollow, "label": f"{algorithm}, worse messages"}),
     ):  # fmt: skip
         x = [_place(level, ladder) + 0.06 * number + beside for level in some]
         if some:

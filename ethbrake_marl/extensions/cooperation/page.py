@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.conditions import message_words
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.curves import swept_axis
 from ethbrake_marl.extensions.cooperation.figures import ablation_figures
@@ -311,12 +312,15 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
     worlds, first = f"{count_of(plan.episodes, 'world')} of seed {plan.list_seed}", plan.levels[0]
     same = f"the same {worlds}" if first.same_lines else f"{worlds}, drawn with the same random numbers"
     swept = "" if plan.sweep is None else f"{first.scenario.name} with {plan.sweep}; "
+    told = [
+        f"{level.name}: {message_words(level.scenario)}. " for level in plan.levels if message_words(level.scenario)
+    ]
     conditions = (
         f"{swept}{recipes}; {plan.seeds} {'seeds' if plan.seeds > 1 else 'seed'}, {plan.steps_per_learner:,} decisions"
-        f" of each learner. Harms are means per world in m²/s² on {same} at every level;"
+        f" of each learner, rounded up to whole updates. Harms are means per world in m²/s² on {same} at every level;"
         f" {interval_words(plan.seeds)}. Joint optimum: the least harm known that the level's learners can do, and"
         f" everything beside it, in the first {plan.search_episodes:,} of these worlds, {plan.budget:,} candidates per"
-        f" world and count. {machine}."
+        f" world and count. {''.join(told)}{machine}."
     )
     drawn = found["steps"] or found["channels"]
     titles = FIGURES if plan.sweep is None else SWEEP_FIGURES
