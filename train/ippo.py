@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, fields
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import torch
@@ -148,7 +149,7 @@ def update(learner: Learner, own: Rollout, settings: Settings) -> None:
     for _ in range(settings.epochs):
         for rows in torch.split(torch.randperm(len(gains)), settings.minibatch):
             ratio = (learner.actions(seen[rows]).log_prob(actions[rows])[:, 0] - before[rows]).exp()
-            gain = (gains[rows] - gains[rows].mean()) / (gains[rows].std() + 1e-8)
+            gain = (gains[rows] - gains[rows].mean()) / (gains[rows].std(correction=0) + 1e-8)
             clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
             actor_loss = -torch.minimum(ratio * gain, clipped * gain).mean()
             critic_loss = nn.functional.mse_loss(learner.critic(seen[rows])[:, 0], targets[rows])
@@ -185,9 +186,11 @@ if __name__ == "__main__":
         parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
     settings = Settings(**vars(parser.parse_args()))
     try:
-        check_whole_number("steps", settings.steps, 1)
+        for name in ("steps", "copies", "rollout", "epochs", "minibatch", "hidden"):
+            check_whole_number(name, getattr(settings, name), 1)
         with new_folder(settings.output) as folder:
             train(settings, folder)
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
-    print(f"ethbrake evaluate --scenario {settings.scenario} --agents full_brake,e_v2x_bm,team@{settings.output}")
+    agents = quote(f"full_brake,e_v2x_bm,team@{settings.output}")
+    print(f"ethbrake evaluate --scenario {quote(settings.scenario)} --agents {agents}")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, fields
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import torch
@@ -156,7 +157,7 @@ class Team:
         for _ in range(settings.epochs):
             for rows in torch.split(torch.randperm(len(gains)), settings.minibatch):
                 ratio = (self.log_prob(seen, actions, rows) - before[rows]).exp()
-                gain = (gains[rows] - gains[rows].mean(0)) / (gains[rows].std(0) + 1e-8)
+                gain = (gains[rows] - gains[rows].mean(0)) / (gains[rows].std(0, correction=0) + 1e-8)
                 clipped = ratio.clamp(1.0 - settings.clip, 1.0 + settings.clip)
                 actor_loss = -torch.minimum(ratio * gain, clipped * gain).mean(0).sum()
                 critic_loss = nn.functional.mse_loss(self.critic(states[rows]), targets[rows])
@@ -164,9 +165,6 @@ class Team:
                 (actor_loss + 0.5 * critic_loss).backward()
                 nn.utils.clip_grad_norm_(self.networks.parameters(), 0.5)
                 self.optimiser.step()
-
-
-# 5. Train all learners of the scenario, and save them.
 
 
 def train(settings: Settings, folder: Path) -> None:
@@ -192,9 +190,11 @@ if __name__ == "__main__":
         parser.add_argument(f"--{field.name.replace('_', '-')}", type=type(field.default), default=field.default)
     settings = Settings(**vars(parser.parse_args()))
     try:
-        check_whole_number("steps", settings.steps, 1)
+        for name in ("steps", "copies", "rollout", "epochs", "minibatch", "hidden"):
+            check_whole_number(name, getattr(settings, name), 1)
         with new_folder(settings.output) as folder:
             train(settings, folder)
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
-    print(f"ethbrake evaluate --scenario {settings.scenario} --agents full_brake,e_v2x_bm,team@{settings.output}")
+    agents = quote(f"full_brake,e_v2x_bm,team@{settings.output}")
+    print(f"ethbrake evaluate --scenario {quote(settings.scenario)} --agents {agents}")

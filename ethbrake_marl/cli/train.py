@@ -22,7 +22,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.progress import Progress
 
 KEPT = (
-    "if the training had begun, the run's folder keeps the last good policy, and ethbrake train --resume FOLDER goes on"
+    "if the training had begun, the run's folder keeps the last good policy; ethbrake train --resume FOLDER goes on"
+    " with a training that has not finished"
 )
 
 RUNS = Path("runs")
@@ -77,6 +78,7 @@ def run_command(
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
         # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.training.experiment import run_experiment
+        from ethbrake_marl.training.progress import objective_in_words
 
         plan = training.load_recipe(recipe or quickest())
         given = training.read_settings(settings, [plan])
@@ -98,12 +100,13 @@ def run_command(
             on_progress=out.show_progress,
         )
         trained = result.trained
+        own = objective_in_words(trained.training)
         count = "total" if plan.reward.harm_count == "total" else "first-impact"
         what = "policy" if len(chosen.learners) == 1 else f"team (scheme {trained.training.scheme})"
         told = (
             f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
             f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained {what} behind its shield. All minimise"
-            f" {count} harm.\n"
+            f" {count} harm{f', but what is trained minimises {own}' if own else ''}.\n"
         )
         out.result(result.results, Text(told), *result.tables)
         for note in result.notes:

@@ -46,5 +46,5 @@ def checked_indices(indices: ArrayLike, count: int, names: str) -> Ints:
     good = (given >= 0) & (given < count) & (np.floor(given) == given)
     wrong = given[~good] if not good.all() else given[given.dtype.kind not in "iu"]
     if wrong.size:
-        raise InvalidInput(f"action of {names}: {wrong.flat[0].item()!r}; {right}")
+        raise InvalidInput(f"action of {names}: {wrong.ravel().tolist()[0]!r}; {right}")
     return given.astype(np.int64)

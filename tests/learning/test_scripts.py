@@ -116,6 +116,8 @@ def test_single_file__advantages_by_hand(script: str) -> None:
     [
         (["--scenario", "cooperation-3-pear"], "did you mean 'cooperation-3-pair'?"),
         (["--steps", "0"], "steps = 0: must be a whole number, at least 1"),
+        (["--copies", "0"], "copies = 0: must be a whole number, at least 1"),
+        (["--minibatch", "0"], "minibatch = 0: must be a whole number, at least 1"),
         (["--seed", "-1"], "seed"),
         (["--output", "there"], "there: is there already"),
         (["--harm-count", "all"], "harm_count"),
@@ -145,12 +147,14 @@ def test_single_file__ends_with_the_command_that_evaluates(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     few = [part for name, value in FEW.items() for part in (f"--{name}", str(value))]
-    monkeypatch.setattr(sys, "argv", [f"{script}.py", "--output", "mine", *few])
+    # minibatches of 32 leave a last one of one row
+    odd = ["--copies", "5", "--rollout", "13", "--minibatch", "32"]
+    monkeypatch.setattr(sys, "argv", [f"{script}.py", "--output", "my team", *few, *odd])
     runpy.run_path(str(TRAIN / f"{script}.py"), run_name="__main__")
     last = capsys.readouterr().out.splitlines()[-1]
-    assert last == "ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@mine"
-    assert (tmp_path / "mine" / "team.json").is_file()
-    eb.make_agent("ppo@mine", scenario=PAIR)
+    assert last == "ethbrake evaluate --scenario cooperation-3-pair --agents 'full_brake,e_v2x_bm,team@my team'"
+    assert (tmp_path / "my team" / "team.json").is_file()
+    eb.make_agent("ppo@my team", scenario=PAIR)
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ import numpy as np
 
 from ethbrake_marl.agents.learned import TRAINED_TEAM
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
-from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, PhysicsError, count_of
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
@@ -38,6 +38,10 @@ BUDGET = 5_000  # candidates of this search, per world and count of harm
 Harms = Mapping[HarmCount, Floats]  # count of harm -> harm of the whole line in each world, [n] m2/s2
 
 
+class Stopped(Exception):
+    """A further training did not finish; nothing more is compared."""
+
+
 class Compared(NamedTuple):
     """Another agent beside the team, in the same worlds."""
 
@@ -50,8 +54,8 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     """Train each learner alone and the team without messages, search the joint optimum, and compare the team with them.
 
     A learner has the same number of decisions in each training. Writes the trainings to ``alone/`` and
-    ``without-messages/`` in the folder of the run, and all numbers to ``cooperation.json``. After an interrupted
-    training nothing more is trained or searched.
+    ``without-messages/`` in the folder of the run, and all numbers to ``cooperation.json``. After a training that was
+    interrupted or failed, nothing more is trained or searched.
 
     Args:
         experiment: the finished run: its folder, policies and evaluation.
@@ -66,15 +70,18 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     outcomes, told = dict(evaluation.outcomes), "The training was interrupted: nothing more was trained to compare."
     rows: list[Compared] = []
     if experiment.trained.status == "finished":
-        alone = _train_alone(experiment, tell)
-        found = evaluate(evaluation.worlds, alone, scenario=evaluation.scenario, aftermath=False).complete()
-        outcomes |= found.outcomes
-        best = min(alone, key=lambda name: float(outcomes[name].world_harm(experiment.harm_count).mean()))
-        rows = [Compared(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]))]
-        silent, why_silent = _without_messages(experiment, tell)
-        optimum, why_optimum = _joint_optimum(experiment, outcomes, tell)
-        rows += [*silent, *optimum]
-        told = f"{why_silent} {why_optimum}"
+        try:
+            alone = _train_alone(experiment, tell)
+            found = evaluate(evaluation.worlds, alone, scenario=evaluation.scenario, aftermath=False).complete()
+            outcomes |= found.outcomes
+            best = min(alone, key=lambda name: float(outcomes[name].world_harm(experiment.harm_count).mean()))
+            rows = [Compared(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]))]
+            silent, why_silent = _without_messages(experiment, tell)
+            optimum, why_optimum = _joint_optimum(experiment, outcomes, tell)
+            rows += [*silent, *optimum]
+            told = f"{why_silent} {why_optimum}"
+        except Stopped as stopped:
+            told = f"{stopped}: nothing more was compared."
     sheets = {f"borne_{each}": _borne(outcomes, each, evaluation.scenario) for each in HARM_COUNTS}
     sheets["added"] = _added(experiment)
     if rows:
@@ -120,12 +127,13 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
     }
     driven = evaluate(listed.take(rows), agents, scenario=silent, aftermath=False).complete()
     ours = _harms(evaluation.outcome(TRAINED_TEAM).take(rows))
+    left_out = ", without those in which something is hit before that" if len(rows) < evaluation.worlds.n else ""
     found = [
         Compared(f"{name} without messages", _harms(driven.outcome(name)), ours) for name in ("team", "full_brake")
     ]
     return found, (
         "The team without messages is trained and driven with sensors only, which see the next vehicle ahead and"
-        " behind, so that a vehicle may also react later; the lines are the same."
+        f" behind, so that a vehicle may also react later; the lines are the same{left_out}."
     )
 
 
@@ -152,26 +160,34 @@ def _joint_optimum(
         best[harm_count] = np.fmin.reduce([table.harm(identity, harm_count), *driven])
         ours, worst = (outcomes[name].take(rows).world_harm(harm_count) for name in (TRAINED_TEAM, "full_brake"))
         share = share_over_seeds(ours[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis])
-        reached = "none" if share is None else share.in_words(digits=0, scale=100.0, unit=" %")
-        shares.append(f"{reached} of the possible reduction of {HARM[harm_count]}")
+        if share is not None and share.value >= 0.0:
+            reached = share.in_words(digits=0, scale=100.0, unit=" %")
+            shares.append(f"the team reaches {reached} of the possible reduction of {HARM[harm_count]}")
     return [Compared("joint optimum", best, _harms(outcomes[TRAINED_TEAM].take(rows)))], (
         f"The joint optimum is the least harm known that these learners can do together, from a search of {BUDGET:,}"
-        f" candidates per world in the first {len(rows)} worlds; the team reaches {' and '.join(shares)}."
+        f" candidates per world in the first {count_of(len(rows), 'world')}{''.join(f'; {each}' for each in shares)}."
     )
 
 
 def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, tell: OnProgress) -> Team:
-    """Train the learners of ``scenario`` as the run did, with its decisions divided by ``share``; return the team."""
+    """Train the learners of ``scenario`` as the run did, with its decisions divided by ``share``; return the team.
+
+    Raises ``Stopped`` if the training was interrupted or failed.
+    """
     recipe, path = experiment.trained.training.recipe, experiment.run.path / folder
     path.parent.mkdir(exist_ok=True)
 
     def told(progress: Progress) -> None:
         tell(replace(progress, name=f"{folder}: {progress.name}"))
 
-    kept = recipe if share == 1 else recipe.replace(scheme=None)
-    result = train(kept, scenario, path, steps=max(recipe.total_steps // share, 1), on_progress=told)
+    turns = {"turns": None} if getattr(recipe, "turns", None) else {}
+    kept = recipe if share == 1 else recipe.replace(scheme=None, **turns)
+    try:
+        result = train(kept, scenario, path, steps=max(recipe.total_steps // share, 1), on_progress=told)
+    except EthBrakeError as error:
+        raise Stopped(f"The training {folder} failed ({error})") from error
     if result.status == "interrupted":
-        raise KeyboardInterrupt
+        raise Stopped(f"The training {folder} was interrupted")
     return load_team(path, scenario, folder)
 
 

@@ -39,6 +39,7 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.experiment import SHIELDED, Experiment, RunReport, compared_agents, write_results
+from ethbrake_marl.training.progress import objective_in_words
 
 BESIDE = ("full_brake", "e_v2x_bm")  # agents shown with the policy in its figures and on the other two tests
 
@@ -50,7 +51,7 @@ class RunSection:
     """Section that an extension adds to the report of a run."""
 
     title: str  # heading
-    body: tuple[str | Sheet, ...]  # sentences, which become paragraphs, and tables; the tables are printed, too
+    body: tuple[str | Sheet, ...]  # sentences, which become paragraphs, and tables; all are printed, too
 
 
 MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: it has nothing to say about this run
@@ -111,7 +112,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     report = _page(experiment, rows, beside, figures, sections, config)
     report.driven(experiment.agents).write(page, force=True)
     begin("")
-    printed = [part for section in sections for part in section.body if isinstance(part, Sheet)]
+    printed = [part for section in sections for part in section.body]
     with_rows = " and the paper's rows" if is_papers else ""
     return RunReport(
         (brief(rows, beside), *rows.tables()[1:], *printed), f"report, with every measure{with_rows}: {page}"
@@ -223,6 +224,7 @@ def _page(
         "Start": trained.training.begins,
         "Seeds": f"training {config['seeds']['training']}, evaluation list {evaluation.seed}",
         "Reward": ", ".join(f"{name} {value}" for name, value in reward.items()) or "minus the first-impact harm",
+        "Objective": objective_in_words(trained.training),
         "Harm that agents minimise": "first impacts only" if harm_count == "first" else "every impact",
         "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
         "Settings": ", ".join(config.get("settings", ())),

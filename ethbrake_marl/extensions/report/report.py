@@ -283,7 +283,8 @@ class Report:
         after, before = (outcome.world_harm(self.harm_count) for outcome in outcomes)
         share = float((after > before + ROUNDING).mean())
         most = float((after - before).max())
-        return f"more in {100.0 * share:.1f} % of these worlds, by {most:.2f} at most" if share else ""
+        often, much = f"{100.0 * share:.1f}" if share >= 0.0005 else "less than 0.1", max(most, 0.01)
+        return f"more in {often} % of these worlds, by {much:.2f} at most" if share else ""
 
     def _opening(self, rows: SummaryTable) -> list[Part]:
         """Return the parts at the top of the page: important remarks, one figure and one table."""

@@ -22,6 +22,7 @@ SCENARIO = eb.load_scenario("cooperation-3-pair")
 RECIPE = TINY_PPO.replace(total_steps=512, scheme="shared")
 COUNTS = ("first", "total")
 LEARNERS = ("vehicle_2", "vehicle_3")
+FURTHER = ("alone/vehicle_2", "alone/vehicle_3", "without-messages")
 WORLDS, SEARCHED = 12, 6
 BRAKING = eb.make_agent("full_brake")
 
@@ -142,15 +143,41 @@ def test_interrupted__training_is_followed_by_no_other(tmp_path: Path) -> None:
     }
 
 
-def test_interrupted__later_it_stops_and_keeps_the_team(tmp_path: Path) -> None:
+def test_interrupted__further_training_ends_the_comparison_and_not_the_report(tmp_path: Path) -> None:
+    pressed: list[Progress] = []
+
     def press(progress: Progress) -> None:
-        if progress.name.startswith("alone/vehicle_3") and progress.done:
+        if progress.name.startswith("alone/vehicle_3") and progress.done and not pressed:
+            pressed.append(progress)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    run(tmp_path / "run", SCENARIO, on_progress=press)
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "finished"
+    told = json.loads((tmp_path / "run" / "cooperation.json").read_text())["note"]
+    assert told == "The training alone/vehicle_3 was interrupted: nothing more was compared."
+    assert told in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_interrupted__search_stops_at_once_and_keeps_the_team(tmp_path: Path) -> None:
+    def press(progress: Progress) -> None:
+        if progress.name == "joint optimum":
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "run", SCENARIO, on_progress=press)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["status"] == "interrupted"
     assert load_team(tmp_path / "run", SCENARIO).drivers.keys() == {1, 2}
+
+
+def test_turns__are_those_of_the_team_alone(tmp_path: Path) -> None:
+    run(tmp_path / "run", SCENARIO, recipe=RECIPE.replace(scheme="independent", turns=1))
+    schemes = [json.loads((tmp_path / "run" / name / "team.json").read_text())["scheme"] for name in FURTHER]
+    assert schemes == ["single", "single", "independent"]
+
+
+def test_objective__is_told_where_it_is_not_the_harm_of_all(tmp_path: Path) -> None:
+    run(tmp_path / "run", SCENARIO.replace(objective="own"), recipe=RECIPE.replace(total_steps=128))
+    assert "first-impact harm (own)" in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_one_learner__has_no_such_section(finished_run: Path) -> None:
