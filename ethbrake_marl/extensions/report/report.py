@@ -122,8 +122,10 @@ def shield_section(rows: ShieldModes, conditions: str) -> Section:
     if not rows:
         return Section("Shield", ())
     told = (
-        "Each agent alone and behind every mode of the shield. Each decision that step mode replaced was simulated"
-        " again without it: needed (harm would have been higher), harmless (the same), costly (lower)."
+        "What is shielded, alone and behind every mode of the shield. step-alert rolls the policy out at the alert"
+        " alone; step-cap, of several vehicles, lets none bear more than under the plan with which the shield begins"
+        " (the baseline plan). Each decision that step mode replaced was simulated again without it: needed (harm would"
+        " have been higher), harmless (the same), costly (lower)."
     )
     body: list[str | Part] = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
     if left_out := rows[0].left_out:
