@@ -162,10 +162,11 @@ def _joint_optimum(
         share = share_over_seeds(ours[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis])
         if share is not None and share.value >= 0.0:
             reached = share.in_words(digits=0, scale=100.0, unit=" %")
-            shares.append(f"the team reaches {reached} of the possible reduction of {HARM[harm_count]}")
+            shares.append(f"{reached} of the possible reduction of {HARM[harm_count]}")
     return [Compared("joint optimum", best, _harms(outcomes[TRAINED_TEAM].take(rows)))], (
         f"The joint optimum is the least harm known that these learners can do together, from a search of {BUDGET:,}"
-        f" candidates per world in the first {count_of(len(rows), 'world')}{''.join(f'; {each}' for each in shares)}."
+        f" candidates per world in the first {count_of(len(rows), 'world')}"
+        + (f"; the team reaches {' and '.join(shares)}." if shares else ".")
     )
 
 
