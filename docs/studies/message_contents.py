@@ -4,11 +4,11 @@
     python docs/studies/message_contents.py runs/pieces --jobs 16     # likewise, in so many processes
     python docs/studies/message_contents.py runs/pieces --quick       # in a minute, to see it run; it says nothing yet
 
-Lines: ``paper-random``, a line of five in which four learn, and ``paper-random`` over a channel that loses half of its
-messages. Contents: the usual pieces, these without one, these with the intent, and the alert alone. For each of them
-policies are trained, and driven on the same worlds; five seeds take two to three hours of one core. All observe the
-same features; what needs a missing piece reads 0. Of a training the last policy is taken: nothing is chosen on the
-way.
+Lines: ``paper-random``, a line of five in which four learn, and ``paper-random`` over a channel that loses half of
+its messages and a fifth of its links. Contents: the usual pieces, these without one, these with the intent, and the
+alert alone. For each of them policies are trained, and driven on the same worlds; five seeds take two to three hours
+of one core. All observe the same features; what needs a missing piece reads 0. Of a training the last policy is
+taken: nothing is chosen on the way.
 """
 
 from __future__ import annotations
