@@ -62,6 +62,7 @@ class Step(NamedTuple):
     outcome: Floats  # [OUTCOME_ROWS, n] raw results of the compiled step; use the properties to read them
     params: RewardParams  # settings of the reward
     further: dict[str, Floats]  # name -> unweighted reward term that the compiled step does not know, [n] or [n, N]
+    vector: Floats | None = None  # [n, N, K] vector reward of each vehicle; None unless the engine was asked for one
 
     @property
     def terminated(self) -> Bools:

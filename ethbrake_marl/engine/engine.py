@@ -34,6 +34,7 @@ from ethbrake_marl.game.harm import Ledger, empty_ledger
 from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec, Plan
 from ethbrake_marl.game.observed import common_observation, observations_of
+from ethbrake_marl.game.reward_vector import RewardVector
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import Decisions
@@ -160,6 +161,7 @@ class Engine:
             learner: there a script is the decider.
         worlds: worlds of the first episodes, at t = 0; None: the first ones of the training stream.
         guard: function that makes the guard of this engine; None: proposed actions are applied.
+        reward_vector: components of a vector reward beside the reward (``game.reward_vector``); None: there is none.
 
     >>> import ethbrake_marl as eb
     >>> engine = eb.make_engine("paper-random", 4, seed=7)
@@ -181,6 +183,7 @@ class Engine:
         deciders: Sequence[int] | None = None,
         worlds: Worlds | None = None,
         guard: Callable[[Engine], Guard] | None = None,
+        reward_vector: RewardVector | None = None,
     ) -> None:
         if not n >= 1:
             raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
@@ -196,8 +199,8 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
-        self._terms = Terms(reward, scenario, self.learners or self.deciders)
-        self.reward = self._terms.params
+        self._terms = Terms(reward, scenario, self.learners or self.deciders, reward_vector)
+        self.reward, self.components = self._terms.params, self._terms.components  # names of a vector reward's
         self.observations = observations_of(scenario, observation)  # of each vehicle
         self._plans = tuple(each.plan for each in self.observations)
         self._alike = len(set(self.observations)) == 1
@@ -371,7 +374,7 @@ class Engine:
 
     def _advance(self, columns: Floats) -> Step:
         """Advance every running episode by one time step, in place, under the learners' actions ``columns`` [n, L]."""
-        harm_before = self._terms.objective_harm(self.state) if self._terms.by_objective else None
+        harm_before = self.state.ledger if self._terms.by_objective or self._terms.components else None
         start = None if self.state.impacts is None else self.worlds
         asked = self._ask_scripts()
         step, some_failed = self._move(columns)
@@ -381,7 +384,9 @@ class Engine:
             times = self.state.motion[:, 0]
             self.roster.mark(step.failed, times, np.minimum(times + self.scenario.time_step_s, self.scenario.horizon_s))
         if self._terms.add_something:
-            self._add_terms(step, harm_before, start)
+            self._add_terms(step, harm_before if self._terms.by_objective else None, start)
+        if self._terms.components and harm_before is not None:
+            step = step._replace(vector=self._terms.vector(step, harm_before, self.state))
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
@@ -433,13 +438,12 @@ class Engine:
         self._now = self._now._replace(stops=way.stops)
         return way
 
-    def _add_terms(self, step: Step, harm_before: Floats | None, start: Worlds | None) -> None:
+    def _add_terms(self, step: Step, harm_before: Ledger | None, start: Worlds | None) -> None:
         """Add the reward terms that the compiled step does not know to the step's results.
 
         Args:
             step: the step just made; changed in place.
-            harm_before: harm that each vehicle's objective counted before the step, [n, N] m2/s2; None if the reward
-                counts the harm of the whole line.
+            harm_before: harm before the step; None if the reward counts the harm of the whole line.
             start: the worlds before the step; None unless the reward has a measure of single impacts.
 
         """

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, check_harm_count, line_sum, split
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.columns import Packed
-from ethbrake_marl.physics.episode import CLOCK, Decisions, Episode, follow_whole, harm_so_far
+from ethbrake_marl.physics.episode import CLOCK, LARGEST, WEIGHTED, WHOLE, Decisions, Episode, follow_whole
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import ROW, place_rates, rows_for
 from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s, Worlds
@@ -65,6 +65,7 @@ class ProfileProblem(NamedTuple):
     release_rate: Floats  # [n, N] rates at which brakes are released (m/s3)
     pieces: Floats  # [n, N, 2 K] braking profiles of scripts with K intervals of constant command, as in ``Vehicles``
     identity: UInt64s  # [n] hash of each world's problem, see ``identities``
+    weights: Floats  # [n, 2, N] of each pair: share of the front vehicle times the weight of its harm; of the rear one
 
     @property
     def n(self) -> int:
@@ -115,15 +116,53 @@ class ProfileProblem(NamedTuple):
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
         return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
 
+    def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
+        """Return the same problem, in which a search minimises weighted harm of the vehicles.
+
+        The harm that counts is still that of ``harm_count``. A hash in ``identity`` does not depend on the weights.
+
+        Args:
+            weights: [n, N] weight of the harm that each vehicle bears, at least 0, without a column for an obstacle.
+            largest: minimise the largest weighted harm instead of the sum.
+
+        """
+        mass, obstacle = self.mass, self.mass.shape[1] - weights.shape[1]
+        weights = np.pad(weights, ((0, 0), (obstacle, 0)))
+        pairs, clock = np.zeros((self.n, 2, mass.shape[1])), self.clock.copy()
+        front = mass[:, 1:] / (mass[:, :-1] + mass[:, 1:])  # 0 of an obstacle, whose mass is infinite
+        pairs[:, 0, :-1], pairs[:, 1, :-1] = weights[:, :-1] * front, weights[:, 1:] * (1.0 - front)
+        clock[:, CLOCK.AIM] = LARGEST if largest else WEIGHTED
+        return self._replace(weights=pairs, clock=clock)
+
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
         """Return first-impact and total harm of one profile per world, each [n] m2/s2.
 
         They equal the engine's to the bit. Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a
         capacity, ``PhysicsError`` naming the worlds in which a check of the physics failed.
         """
+        first, total = self.follow_pairs(profiles)
+        return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
+
+    def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
+        """Return the harm that each vehicle bears under one profile per world, count of harm -> [n, N] m2/s2.
+
+        There is no column for an obstacle. It equals the engine's to the bit. Raises what ``follow`` raises.
+        """
+        obstacle, found = int(np.isinf(self.mass[:, 0]).any()), {}
+        for harm_count, pairs in zip(HARM_COUNTS, self.follow_pairs(profiles), strict=True):
+            found[harm_count] = split(np.ascontiguousarray(pairs[:, obstacle:]), self.mass[:, obstacle:].copy())
+            if obstacle:
+                found[harm_count][:, 0] += pairs[:, 0]
+        return found
+
+    def follow_pairs(self, profiles: Profiles) -> tuple[Floats, Floats]:
+        """Return the harm of each pair, first-impact and total, under one profile per world, each [n, P] m2/s2.
+
+        An obstacle ahead and Vehicle 1 are a pair, the first one. Raises what ``follow`` raises.
+        """
         self.check(profiles)
-        n = self.n
-        first, total, failed = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_)
+        shape = self.n, self.mass.shape[1] - 1
+        first, total, failed = np.zeros(shape), np.zeros(shape), np.zeros(self.n, np.bool_)
         ends, commands = np.ascontiguousarray(profiles.ends, np.int64), np.ascontiguousarray(profiles.commands_mps2)
         follow_worlds(self, ends, commands, first, total, failed)
         if failed.any():
@@ -219,7 +258,7 @@ def profile_problem(
         raise InvalidInput(f"horizon_s {horizon_s:g}: must be after the first decision at {first.max():g} s")
     clock = np.empty((worlds.n, CLOCK.WIDTH))
     clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP], clock[:, CLOCK.HORIZON] = first, time_step_s, horizon_s
-    clock[:, CLOCK.LAST_STEP] = Decisions(first, time_step_s).before(horizon_s)
+    clock[:, CLOCK.LAST_STEP], clock[:, CLOCK.AIM] = Decisions(first, time_step_s).before(horizon_s), WHOLE
     clock[:, CLOCK.RESTITUTION], clock[:, CLOCK.HARM_IS_TOTAL], clock[:, CLOCK.STEPWISE] = (
         v.restitution,
         harm_count == "total",
@@ -232,7 +271,7 @@ def profile_problem(
     return ProfileProblem(
         chosen, np.concatenate(start, axis=1), clock, np.ascontiguousarray(bounds), command, v.latency_s, v.mass_t,
         v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, v.pieces,
-        identities(worlds, command, clock, chosen),
+        identities(worlds, command, clock, chosen), np.zeros((worlds.n, 2, worlds.N)),
     )  # fmt: skip
 
 
@@ -330,6 +369,7 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
     for i in range(N):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = problem.command[k, i], problem.latency[k, i]
         table[ROW.MASS, i], table[ROW.LIMIT, i] = problem.mass[k, i], problem.limit[k, i]
+        table[ROW.FRONT_WEIGHT, i], table[ROW.REAR_WEIGHT, i] = problem.weights[k, 0, i], problem.weights[k, 1, i]
     place_rates(table, problem.brake_rate[k], problem.release_rate[k], problem.pieces[k])
     return SearchWorld(Episode(table, problem.clock[k].copy(), problem.vehicles), problem.bounds[k], random[k : k + 1])
 
@@ -338,7 +378,7 @@ def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> Searc
 def follow_worlds(
     problem: ProfileProblem, ends: Ints, commands: Floats, first: Floats, total: Floats, failed: Bools
 ) -> None:
-    """Simulate one profile in each world; write the harm to ``first`` and ``total`` [n] m2/s2.
+    """Simulate one profile in each world; write the harm of each pair to ``first`` and ``total`` [n, P] m2/s2.
 
     ``ends`` [n, K] and ``commands`` [n, K, C] are the fields of ``Profiles``. ``failed`` [n] is set to True for a world
     in which a check of the physics failed.
@@ -352,4 +392,6 @@ def follow_worlds(
         if follow_whole(episode, ends[k], commands[k], states, math.inf)[1] < 0:
             failed[k] = True
             continue
-        first[k], total[k] = harm_so_far(episode.table, 0.0), harm_so_far(episode.table, 1.0)
+        for p in range(first.shape[1]):
+            first[k, p] = episode.table[ROW.SUM_FIRST_HARM, p]
+            total[k, p] = episode.table[ROW.SUM_TOTAL_HARM, p]

@@ -9,9 +9,11 @@ import numpy as np
 from ethbrake_marl.engine.compiled_step import Step
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.game.definition import Game
+from ethbrake_marl.game.harm import Ledger
 from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.measures import BUILT_IN, MEASURES
-from ethbrake_marl.game.objectives import objective_harm
+from ethbrake_marl.game.objectives import added_harm
+from ethbrake_marl.game.reward_vector import RewardVector, components_of, vector_of
 from ethbrake_marl.game.rewards import Reward, reward_params
 from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.physics.state import Floats, Worlds
@@ -27,11 +29,15 @@ class Terms:
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         scenario: scenario whose objective holds if the reward names none.
         learners: indices of the vehicles (0 = front) that learn, or that an evaluated agent controls.
+        vector: components of a vector reward (``game.reward_vector``); None: rewards are numbers.
 
     """
 
-    def __init__(self, reward: Reward, scenario: Game, learners: Sequence[int]) -> None:
+    def __init__(
+        self, reward: Reward, scenario: Game, learners: Sequence[int], vector: RewardVector | None = None
+    ) -> None:
         self.params, self._objectives = reward_params(reward).settled(scenario.objective, scenario.vehicles)
+        self.components = () if vector is None else components_of(vector, self.params, scenario.vehicles)
         self._learners, self._learner_index = tuple(learners), np.array(learners, np.int64)
         self._built_in = [
             BUILT_IN[name] for name in self.params.counted if name in BUILT_IN and BUILT_IN[name].function
@@ -50,19 +56,21 @@ class Terms:
         """Weight of the whole line's harm, which the compiled step counts; 0 if each vehicle has its own objective."""
         return 0.0 if self._objectives else self.params.harm
 
-    def objective_harm(self, state: State) -> Floats:
-        """Return the harm so far that each vehicle's objective counts, [n, N] m2/s2.
+    def vector(self, step: Step, before: Ledger, state: State) -> Floats:
+        """Return the vector reward of a step, [n, N, K]; 0 for episodes that had ended before it.
 
-        Only for a reward with objectives of vehicles (``by_objective`` is True).
+        ``before`` is the harm before the step, ``state`` the state after it.
         """
-        return objective_harm(state.ledger, self.params.harm_count, self._objectives)
+        vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
+        vector[state.ended & ~step.ended] = 0.0
+        return vector
 
     def add(
         self,
         step: Step,
         state: State,
         scenario: Game,
-        before: Floats | None,
+        before: Ledger | None,
         impacts_before: EpisodeImpacts | None,
         worlds: Worlds | None,
     ) -> State:
@@ -74,13 +82,13 @@ class Terms:
             step: results of the compiled step; ``further`` and ``reward`` are changed.
             state: state after the step.
             scenario: the scenario.
-            before: ``objective_harm`` before the step, [n, N]; None without objectives.
+            before: harm before the step; None without objectives.
             impacts_before: impacts of the episodes before the step; None if no measure needs them.
             worlds: worlds after the step if the reward is shaped; else None.
 
         """
         if before is not None and self.params.harm > 0.0:
-            step.further["harm"] = before - self.objective_harm(state)
+            step.further["harm"] = -added_harm(before, state.ledger, self.params.harm_count, self._objectives)
         standing = state.ended & ~step.ended
         if self._built_in or self._by_step:
             outcome = self._outcome(step, state, scenario.time_step_s)

@@ -22,10 +22,12 @@ from ethbrake_marl.envs.making import (
     learner_actions,
     make_engine,
     only_learner,
+    reward_box,
 )
 from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observation, Observations, ObservationSpec
+from ethbrake_marl.game.reward_vector import RewardVector
 from ethbrake_marl.game.rewards import Reward, RewardParams
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.scenario.schema import Scenario
@@ -98,6 +100,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         observation: what the learner observes; None: ``observation_for(scenario)``.
         actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
             spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        reward_vector: None: a reward is a number. ``vehicles``: it is an array with minus the harm of the step that
+            each vehicle bears; a list: with these components (docs/rewards.md).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -120,9 +124,15 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         reward: Reward = "harm",
         observation: Observation | None = None,
         actions: int | None = None,
+        reward_vector: RewardVector | None = None,
     ) -> None:
         self.action_space, self.actions = learner_action_space(actions), actions
-        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.engine = make_engine(
+            scenario, 1, learners=learners, reward=reward, observation=observation, reward_vector=reward_vector
+        )
+        if self.engine.components:  # as MO-Gymnasium has it
+            self.reward_space = reward_box(self.engine)
+            self.reward_dim = len(self.engine.components)
         self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode)
         self.metadata = {**self.metadata, **self.viewer.metadata}
         self.learner = only_learner(self.engine)
@@ -147,7 +157,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         self.viewer.began()
         return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
 
-    def step(self, action: NDArray[Any]) -> tuple[Observations, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[Any]) -> tuple[Observations, Any, bool, bool, dict[str, Any]]:
         """Advance by one time step; return observation, reward, terminated, truncated and info.
 
         ``action`` is [1] in [-1, 1]: -1 full braking capacity, 0 coasts, +1 full driving capacity.
@@ -159,7 +169,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         if self.render_mode is not None:
             self.viewer.play()
         info = Report.of(self.engine, step).plain_infos(self._column)[0]
-        reward = float(step.reward[0, self.learner])
+        each = step.vector
+        reward = float(step.reward[0, self.learner]) if each is None else each[0, self.learner].copy()
         return self._observe(), reward, bool(step.terminated[0]), bool(step.truncated[0]), info
 
     def _observe(self) -> Observations:

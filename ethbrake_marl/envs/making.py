@@ -16,6 +16,7 @@ from ethbrake_marl.errors import InvalidInput, check_one_learner, check_whole_nu
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.features import Feature
 from ethbrake_marl.game.observations import Observation, ObservationSpec
+from ethbrake_marl.game.reward_vector import RewardVector
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -34,6 +35,14 @@ def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
 def action_box() -> Box[np.float32]:
     """Return the action space, a float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
     return Box(-1.0, 1.0, (1,), dtype=np.float32)
+
+
+def reward_box(engine: Engine) -> Box[np.float64]:
+    """Return the space of vector rewards of an engine that has them: a float64 box [K].
+
+    It is float64, so that weighted sums of a vector equal the reward of the same weights to the bit.
+    """
+    return Box(-np.inf, np.inf, (len(engine.components),), dtype=np.float64)
 
 
 def learner_action_space(actions: int | None) -> Any:
@@ -55,6 +64,7 @@ def make_engine(
     reward: Reward = "harm",
     observation: Observation | None = None,
     seed: int = 0,
+    reward_vector: RewardVector | None = None,
 ) -> Engine:
     """Return an engine with ``n`` worlds and any number of learners, for a training loop of your own.
 
@@ -65,6 +75,8 @@ def make_engine(
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what every vehicle observes, or a mapping from vehicle to its observation; None: the scenario's.
         seed: seed of the stream of worlds.
+        reward_vector: components of a vector reward, which each step tells as ``vector`` beside its ``reward``; None:
+            there is none.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -92,6 +104,7 @@ def make_engine(
         reward=reward,
         observation=observation,
         seed=seed,
+        reward_vector=reward_vector,
     )
 
 

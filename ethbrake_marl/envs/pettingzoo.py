@@ -22,12 +22,14 @@ from ethbrake_marl.envs.making import (
     learner_action_space,
     learner_actions,
     make_engine,
+    reward_box,
 )
 from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.full_state import full_state, state_features
 from ethbrake_marl.game.observations import Observation, Observations
+from ethbrake_marl.game.reward_vector import RewardVector
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Ints
 
@@ -115,6 +117,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         max_cycles: truncates an episode after this many steps; None: only at the horizon.
         actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
             spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        reward_vector: None: a reward is a number. ``vehicles``: it is an array with minus the harm of the step that
+            each vehicle bears; a list: with these components (docs/rewards.md).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -138,11 +142,14 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         agents: WhoIsAgent = "all",
         max_cycles: int | None = None,
         actions: int | None = None,
+        reward_vector: RewardVector | None = None,
     ) -> None:
         if max_cycles is not None:
             check_whole_number("max_cycles", max_cycles, 1)
         self.render_mode, self.max_cycles = render_mode, max_cycles
-        self.engine = make_engine(scenario, 1, learners=learners, reward=reward, observation=observation)
+        self.engine = make_engine(
+            scenario, 1, learners=learners, reward=reward, observation=observation, reward_vector=reward_vector
+        )
         self.viewer = Viewer(self.engine, render_mode)
         self.metadata = {**self.metadata, **self.viewer.metadata}
         names = self.engine.scenario.vehicle_names
@@ -162,6 +169,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             for agent in self.possible_agents
         }
         self.state_space = feature_box(state_features(self.engine.scenario))
+        if self.engine.components:  # as MOMAland has it
+            self.reward_spaces = {agent: reward_box(self.engine) for agent in self.possible_agents}
 
     def observation_space(self, agent: str) -> Any:
         """Return the observation space of the agent with this name, a float32 box [F]; the same object on each call."""
@@ -173,6 +182,12 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         It is a float32 box [1], or for a learner with discrete actions ``Discrete(actions)``.
         """
         return self.action_spaces[agent]
+
+    def reward_space(self, agent: str) -> Any:
+        """Return the space of the vector rewards of the agent with this name, a float64 box [K]."""
+        if not self.engine.components:
+            raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
+        return self.reward_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
@@ -192,7 +207,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
     def step(
         self, actions: Mapping[str, Any]
-    ) -> tuple[dict[str, Observations], dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+    ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent name.
 
         ``actions`` maps agent names to actions [1] in [-1, 1]. Raises ``InvalidInput`` naming the learner whose action
@@ -209,7 +224,10 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             self._warn_of_ignored(actions)
         step = self.engine.step(learner_actions(self.engine, actions, self.actions))
         agents = self.possible_agents
-        (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
+        if step.vector is None:
+            (rewards,) = step.reward.take(self._vehicles, axis=1).tolist()
+        else:
+            rewards = [*step.vector[0, self._vehicles]]
         terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
         if self.max_cycles is not None and not terminated:
             truncated = truncated or int(self.engine.steps[0]) >= self.max_cycles

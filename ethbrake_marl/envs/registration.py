@@ -4,6 +4,8 @@ from __future__ import annotations
 
 GYMNASIUM_ID = "EthBrake-v0"
 
+MO_GYMNASIUM_ID = "EthBrakeMO-v0"  # with vector rewards, for MO-Gymnasium
+
 PETTINGZOO_ID = "ethbrake/ethbrake-v0"
 
 
@@ -19,6 +21,14 @@ def register_environments() -> None:
             id_,
             entry_point="ethbrake_marl.envs.gymnasium:EthBrakeEnv",
             vector_entry_point="ethbrake_marl.envs.vector:EthBrakeVectorEnv",
+        )
+    if MO_GYMNASIUM_ID not in gymnasium.registry:  # its rewards are arrays, which Gymnasium's checker warns of
+        gymnasium.register(
+            MO_GYMNASIUM_ID,
+            entry_point="ethbrake_marl.envs.gymnasium:EthBrakeEnv",
+            vector_entry_point="ethbrake_marl.envs.vector:EthBrakeVectorEnv",
+            disable_env_checker=True,
+            kwargs={"reward_vector": "vehicles"},
         )
     if PETTINGZOO_ID not in pettingzoo.parallel_registry:
         pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:parallel_env")

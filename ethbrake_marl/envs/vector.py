@@ -23,12 +23,14 @@ from ethbrake_marl.envs.making import (
     learner_action_space,
     make_engine,
     only_learner,
+    reward_box,
     warn_of_unknown,
 )
 from ethbrake_marl.envs.viewer import Viewer
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.game.actions import checked_action, own_actions
 from ethbrake_marl.game.observations import Observation, Observations
+from ethbrake_marl.game.reward_vector import RewardVector
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.physics.state import Bools, Floats
 
@@ -69,6 +71,10 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
         ``action`` is [1] in [-1, 1]. The cost is the harm that the step added to the line (m2/s2).
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
+        if isinstance(reward, np.ndarray) and reward.ndim:
+            raise InvalidInput(
+                "CostEnv: needs a reward that is a number; mo_gymnasium's LinearReward makes one of a vector"
+            )
         if "cost" not in info:
             raise InvalidInput(f"CostEnv: {self.env!r:.80} hands on no info['cost']; put CostEnv inside it")
         return observation, float(reward), info["cost"], terminated, truncated, info
@@ -95,6 +101,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         max_episode_steps: truncates an episode after this many steps; None: only at the horizon.
         actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
             spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        reward_vector: None: rewards are [n]. ``vehicles``: they are [n, K], minus the harm of the step that each
+            vehicle bears; a list: with these components (docs/rewards.md).
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -119,12 +127,18 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         max_episode_steps: int | None = None,
         actions: int | None = None,
+        reward_vector: RewardVector | None = None,
     ) -> None:
         if max_episode_steps is not None:
             check_whole_number("max_episode_steps", max_episode_steps, 1)
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = _check_mode(autoreset_mode)
-        self.engine = make_engine(scenario, num_envs, learners=learners, reward=reward, observation=observation)
+        self.engine = make_engine(
+            scenario, num_envs, learners=learners, reward=reward, observation=observation, reward_vector=reward_vector
+        )
+        if self.engine.components:  # as MO-Gymnasium has it
+            self.reward_space = reward_box(self.engine)
+            self.reward_dim = len(self.engine.components)
         self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode, batch=True)
         self.metadata = {"autoreset_mode": self.autoreset_mode, **self.viewer.metadata}
         self.learner = only_learner(self.engine)
@@ -181,7 +195,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         engine.renew(np.flatnonzero(renewed))
         every = np.ones(self.num_envs, np.bool_)
         infos |= Report.of(engine, step).batch_info(self.learner, every, ~renewed)
-        reward = step.reward[:, self.learner].copy()
+        reward = (step.reward if step.vector is None else step.vector)[:, self.learner].copy()
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
 
     def render(self) -> tuple[Any, ...]:

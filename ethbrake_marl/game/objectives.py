@@ -68,6 +68,7 @@ class Kind(NamedTuple):
     about: str  # what it means, in words
     amount: Callable[[Objective, HarmSoFar, int], Floats]  # (objective, harm, vehicle) -> amount [n]: less is better
     function: ObjectiveFunction | None = None  # the function of a registered objective
+    weights: Callable[[Objective, Floats, int], Floats] | None = None  # (objective, masses [n, N] t, vehicle) -> [n, N]
 
 
 @lru_cache(maxsize=256)
@@ -143,6 +144,47 @@ def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[O
     told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count)
     harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only views
     return np.stack([OBJECTIVES[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
+
+
+def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
+    """Return by how much a step raised what each vehicle should minimise, [n, N].
+
+    Of a weighted sum of what the vehicles bear it is the same sum of what they bear in the step; of any other
+    objective it is the difference.
+
+    Args:
+        before: harm before the step.
+        after: harm after it.
+        harm_count: impacts that count, ``first`` of each pair or ``total``.
+        objectives: objective of each vehicle, N of them.
+
+    """
+    sums = [OBJECTIVES[each.kind].weights is not None for each in objectives]
+    found = objective_harm(after.since(before), harm_count, objectives) if any(sums) else 0.0
+    if all(sums):
+        return np.asarray(found)
+    whole = objective_harm(after, harm_count, objectives) - objective_harm(before, harm_count, objectives)
+    return np.where(sums, found, whole)
+
+
+def aim_of(objective: Objective, mass_t: Floats, vehicle: int) -> tuple[Floats, bool]:
+    """Return the weights of the vehicles' harm in an objective, [n, N], and whether the largest counts, not the sum.
+
+    Args:
+        objective: the objective.
+        mass_t: [n, N] mass of each vehicle, t.
+        vehicle: index of the vehicle whose objective it is (0 = front).
+
+    Raises ``InvalidInput`` for an objective that is neither, such as ``injury``.
+
+    """
+    weights = OBJECTIVES[objective.kind].weights
+    if objective.kind == "maximin":
+        return np.ones(mass_t.shape), True
+    if weights is None:
+        known = ", ".join(kind.form for kind in _BUILT_IN.values() if kind.weights) + ", maximin"
+        raise InvalidInput(f"objective {objective.kind!r}: is no weighted sum of the vehicles' harm; known: {known}")
+    return np.broadcast_to(weights(objective, mass_t, vehicle), mass_t.shape).astype(np.float64), False
 
 
 def standard_objectives() -> tuple[str, ...]:
@@ -287,19 +329,40 @@ def _weighted(borne: Floats, weights: Floats) -> Floats:
 
 
 _BUILT_IN: dict[str, Kind] = {
-    "total": Kind("total", "everybody's harm alike", lambda _, harm, vehicle: harm.whole),
-    "own": Kind("own", "what the vehicle itself bears", lambda _, harm, vehicle: harm.borne[:, vehicle]),
-    "social": Kind("social:ANGLE", "social value orientation: own harm at 0, the others' at 90 degrees", _social),
+    "total": Kind(
+        "total",
+        "everybody's harm alike",
+        lambda _, harm, vehicle: harm.whole,
+        weights=lambda _, mass_t, vehicle: np.ones(mass_t.shape[1]),
+    ),
+    "own": Kind(
+        "own",
+        "what the vehicle itself bears",
+        lambda _, harm, vehicle: harm.borne[:, vehicle],
+        weights=lambda _, mass_t, vehicle: np.eye(mass_t.shape[1])[vehicle],
+    ),
+    "social": Kind(
+        "social:ANGLE",
+        "social value orientation: own harm at 0, the others' at 90 degrees",
+        _social,
+        weights=lambda objective, mass_t, vehicle: np.where(
+            np.eye(mass_t.shape[1])[vehicle], *_social_weights(objective.angle_deg)
+        ),
+    ),
     "maximin": Kind("maximin", "the harm of whoever bears most", lambda _, harm, vehicle: harm.borne.max(axis=1)),
     "mass-weighted": Kind(
         "mass-weighted",
         "harm in a heavy vehicle counts for more",
         lambda _, harm, vehicle: _weighted(harm.borne, harm.mass_t),
+        weights=lambda _, mass_t, vehicle: mass_t * (mass_t.shape[1] / mass_t.sum(axis=1, keepdims=True)),
     ),
     "weighted": Kind(
         "weighted:W1,W2,...",
         "one weight for each vehicle",
         lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
+        weights=lambda objective, mass_t, vehicle: (
+            np.array(objective.weights) * (mass_t.shape[1] / sum(objective.weights))
+        ),
     ),
     "injury": Kind("injury:CURVE", "injuries in 1,000 lines, by the impact that injures a vehicle more", _injured),
 }

@@ -41,10 +41,14 @@ class _Clock(NamedTuple):
     RESTITUTION: int = 4  # coefficient of restitution of every impact
     HARM_IS_TOTAL: int = 5  # 1 if total harm is to be minimised, 0 for first-impact harm
     STEPWISE: int = 6  # 1 to advance decision by decision; 0 phase by phase (intervals of constant command)
-    WIDTH: int = 7  # number of entries
+    AIM: int = 7  # what a search minimises: WHOLE, WEIGHTED or LARGEST
+    WIDTH: int = 8  # number of entries
 
 
 CLOCK = _Clock()
+
+# entries of CLOCK.AIM: the harm of the line, the weighted harm of its vehicles, or the largest weighted one
+WHOLE, WEIGHTED, LARGEST = 0.0, 1.0, 2.0
 
 OTHER_WEIGHT = 1e-8  # weight of the other harm count in the minimised value: a tie-breaker
 
@@ -218,15 +222,30 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 
 @compiled
-def value_of(table: Floats, total: float) -> float:
-    """Return the number that a search minimises (m2/s2): the chosen harm, plus ``OTHER_WEIGHT`` times the other one.
+def value_of(table: Floats, clock: Floats) -> float:
+    """Return the number that a search minimises (m2/s2), which never falls while an episode goes on.
+
+    It is the harm of the line, the weighted sum of what its vehicles bear, or the largest weighted share, plus
+    ``OTHER_WEIGHT`` times the line's harm in the other count, which only decides between equals.
 
     Args:
         table: one world in the layout of ``physics.rows``, with its rows of an episode.
-        total: 1 if total harm is chosen, 0 for first-impact harm; the other one only decides between equals.
+        clock: [CLOCK.WIDTH] settings: ``HARM_IS_TOTAL`` chooses the count, ``AIM`` whose harm.
 
     """
-    return harm_so_far(table, total) + OTHER_WEIGHT * harm_so_far(table, 1.0 - total)
+    total, aim = clock[CLOCK.HARM_IS_TOTAL], clock[CLOCK.AIM]
+    other = OTHER_WEIGHT * harm_so_far(table, 1.0 - total)
+    if aim == WHOLE:
+        return harm_so_far(table, total) + other
+    row = ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM
+    value, from_ahead = 0.0, 0.0
+    for i in range(table.shape[1]):
+        borne = from_ahead  # by vehicle i, times its weight
+        if i < table.shape[1] - 1:
+            borne += table[ROW.FRONT_WEIGHT, i] * table[row, i]
+            from_ahead = table[ROW.REAR_WEIGHT, i] * table[row, i]
+        value = max(value, borne) if aim == LARGEST else value + borne
+    return value + other
 
 
 @compiled
@@ -293,10 +312,10 @@ def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: 
 
     """
     table, clock, controlled = world.table, world.clock, world.controlled
-    grid, restitution, total = grid_of(clock), clock[CLOCK.RESTITUTION], clock[CLOCK.HARM_IS_TOTAL]
+    grid, restitution = grid_of(clock), clock[CLOCK.RESTITUTION]
     no_rows = table[:0]
     restore(table, states[phase])
-    value = value_of(table, total)
+    value = value_of(table, clock)
     for k in range(phase, ends.shape[0]):
         begin = ends[k - 1] if k > 0 else 0
         outcome = GOES_ON
@@ -310,7 +329,7 @@ def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: 
                     break
             if outcome < GOES_ON:
                 return value, -1
-            value = value_of(table, total)
+            value = value_of(table, clock)
         save(table, states[k + 1])
         if value >= bound or outcome == AT_REST:
             return value, k + 1

@@ -62,28 +62,30 @@ class _Rows(NamedTuple):
     # episode, per pair
     SUM_FIRST_HARM: int = 29  # first-impact harm since the episode began (m2/s2)
     SUM_TOTAL_HARM: int = 30  # harm of all impacts since the episode began (m2/s2)
+    FRONT_WEIGHT: int = 31  # share of the pair's harm that the front vehicle bears, times the weight of its harm
+    REAR_WEIGHT: int = 32  # the same of the rear vehicle
     # brake build-up, per vehicle
-    FORCE: int = 31  # present force; it moves towards the command (m/s2)
-    BRAKE_RATE: int = 32  # rate at which FORCE falls (m/s3); infinite: at once
-    RELEASE_RATE: int = 33  # rate at which FORCE rises (m/s3)
-    BUILDS_UP: int = 34  # of the world, in column 0: 1 if some rate is finite or some vehicle brakes in pieces
-    FORCE_RATE: int = 35  # rate of FORCE until the next event (m/s3)
-    FORCE_TIME: int = 36  # time until FORCE reaches the command or passes 0 (s)
-    FORCE_VALUE: int = 37  # FORCE at that time (m/s2)
-    JERK: int = 38  # rate of ACCELERATION until the next event (m/s3)
-    LOW_JERK: int = 39  # rate of FORCE_LOW (m/s3)
-    HIGH_JERK: int = 40  # rate of FORCE_HIGH (m/s3)
+    FORCE: int = 33  # present force; it moves towards the command (m/s2)
+    BRAKE_RATE: int = 34  # rate at which FORCE falls (m/s3); infinite: at once
+    RELEASE_RATE: int = 35  # rate at which FORCE rises (m/s3)
+    BUILDS_UP: int = 36  # of the world, in column 0: 1 if some rate is finite or some vehicle brakes in pieces
+    FORCE_RATE: int = 37  # rate of FORCE until the next event (m/s3)
+    FORCE_TIME: int = 38  # time until FORCE reaches the command or passes 0 (s)
+    FORCE_VALUE: int = 39  # FORCE at that time (m/s2)
+    JERK: int = 40  # rate of ACCELERATION until the next event (m/s3)
+    LOW_JERK: int = 41  # rate of FORCE_LOW (m/s3)
+    HIGH_JERK: int = 42  # rate of FORCE_HIGH (m/s3)
     # per pooled block
-    BLOCK_LOW_JERK: int = 41  # sum of mass times LOW_JERK
-    BLOCK_HIGH_JERK: int = 42  # sum of mass times HIGH_JERK
+    BLOCK_LOW_JERK: int = 43  # sum of mass times LOW_JERK
+    BLOCK_HIGH_JERK: int = 44  # sum of mass times HIGH_JERK
     # number of rows that a table needs
     OF_IMPACT: int = 12  # for impacts only
     OF_SEGMENT: int = 28  # for a segment
-    OF_EPISODE: int = 31  # for an episode
-    OF_BUILD_UP: int = 43  # for a segment or an episode with brake build-up
+    OF_EPISODE: int = 33  # for an episode
+    OF_BUILD_UP: int = 45  # for a segment or an episode with brake build-up
     # braking in pieces, per vehicle, in tables longer than OF_BUILD_UP
-    NEXT_PIECE: int = 43  # when the next piece begins, in seconds from the start of the segment
-    PIECES: int = 44  # K rows: start of each piece (s after the onset; infinite: none); K rows: its command
+    NEXT_PIECE: int = 45  # when the next piece begins, in seconds from the start of the segment
+    PIECES: int = 46  # K rows: start of each piece (s after the onset; infinite: none); K rows: its command
 
 
 ROW = _Rows()

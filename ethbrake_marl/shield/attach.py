@@ -127,6 +127,11 @@ class Attached:
             raise InvalidInput(
                 f"{where}: goes around {maker}, not {env}; eb.shield(env) chooses the one for an environment of ours"
             )
+        if engine.components and self.options.intervention_penalty > 0.0:
+            raise InvalidInput(
+                f"{where}: intervention_penalty = {self.options.intervention_penalty:g}: is subtracted from a number,"
+                " and rewards are vectors here; leave it out"
+            )
         self.engine, self._left = engine, Guarded(None, {})
         self.guard = guard_of(engine, policy, self.options)
         engine.protect(self.guard)

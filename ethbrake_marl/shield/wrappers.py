@@ -111,8 +111,9 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
         """
         self.attached.check_open()
         found: Told = super().step(actions)
-        for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
-            found[1][agent] -= penalty
+        if not self.attached.engine.components:
+            for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
+                found[1][agent] -= penalty
         return found
 
 
@@ -173,7 +174,9 @@ class ShieldedEnv(
         """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
-        return observation, float(reward) - self.attached.penalty().item(), *others
+        if not self.attached.engine.components:
+            reward = float(reward) - self.attached.penalty().item()
+        return observation, reward, *others
 
 
 class ShieldedVectorEnv(_Closing, VectorWrapper):
@@ -221,7 +224,9 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
         """
         self.attached.check_open()
         observation, reward, terminated, truncated, infos = self.env.step(actions)
-        return observation, reward - self.attached.penalty()[:, 0], terminated, truncated, infos
+        if not self.attached.engine.components:
+            reward = reward - self.attached.penalty()[:, 0]
+        return observation, reward, terminated, truncated, infos
 
 
 def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, **options: Any) -> Any:

@@ -165,21 +165,16 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
     """
     table, clock = world.table, world.clock
-    grid, restitution, total, last = (
-        grid_of(clock),
-        clock[CLOCK.RESTITUTION],
-        clock[CLOCK.HARM_IS_TOTAL],
-        int(clock[CLOCK.LAST_STEP]),
-    )
+    grid, restitution, last = grid_of(clock), clock[CLOCK.RESTITUTION], int(clock[CLOCK.LAST_STEP])
     no_rows = table[:0]
     restore(table, plan.states[begin])
-    value = value_of(table, total)
+    value = value_of(table, clock)
     for step in range(begin, last):
         table[ROW.COMMAND, world.controlled[0]] = plan.commands[step]
         outcome = step_again(table, restitution, grid, step, step + 1, no_rows)
         if outcome < GOES_ON:
             return value, -1
-        value = value_of(table, total)
+        value = value_of(table, clock)
         save(table, plan.states[step + 1])
         if value >= bound or outcome != GOES_ON:
             return value, step + 1
