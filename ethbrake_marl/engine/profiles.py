@@ -298,7 +298,7 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
     rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0 turns -0.0 into 0.0
     slow = worlds.vehicles.build_up  # other worlds keep the hashes of versions without build-up rates
     forces = np.concatenate(
-        [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
+        [state[:, column.command : column.previous], params[:, column.brake_rate : column.harm_weight]], 1
     )
     further = [forces[k].tobytes() if slow[k] else b"" for k in range(worlds.n)]
     for k in np.flatnonzero(worlds.vehicles.in_pieces):

@@ -113,7 +113,7 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "objective 'social:91': social needs an angle from 0 to 90 degrees": lambda: PAPER.replace(objective="social:91"),
     "objective 'social:nan': social needs an angle": lambda: PAPER.replace(objective="social:nan"),
     "objective 'social:4_5': social needs an angle": lambda: PAPER.replace(objective="social:4_5"),
-    "'weighted:1,0,1': weighted needs a weight from 1e-6 to 1e6 for each vehicle": lambda: PAPER.replace(
+    "'weighted:0,0,0': weighted needs a weight from 0 to 1e6 for each vehicle, not 0 for all": lambda: PAPER.replace(
         objective="weighted:1,0,1"
     ),
     "'weighted:1,1e-7,1': weighted needs a weight from 1e-6 to 1e6 for each vehicle": lambda: PAPER.replace(
