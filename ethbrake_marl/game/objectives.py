@@ -329,7 +329,7 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     return injured
 
 
-def _weighted(borne: Floats, weights: Floats) -> Floats:
+def weighted_harm(borne: Floats, weights: Floats) -> Floats:
     """Return ``N sum_j w_j H_j / sum_j w_j``, [n], summed front to rear: the same bits in any batch.
 
     ``borne``: harm H_j of each vehicle, [n, N] m2/s2; ``weights``: w_j, [n, N].
@@ -373,19 +373,19 @@ _BUILT_IN: dict[str, Kind] = {
     "mass-weighted": Kind(
         "mass-weighted",
         "harm in a heavy vehicle counts for more",
-        lambda _, harm, vehicle: _weighted(harm.borne, harm.mass_t),
+        lambda _, harm, vehicle: weighted_harm(harm.borne, harm.mass_t),
         weights=lambda _, line, vehicle: _shares(line.mass_t),
     ),
     "weighted": Kind(
         "weighted:W1,W2,...",
         "one weight for each vehicle",
-        lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
+        lambda objective, harm, vehicle: weighted_harm(harm.borne, np.full(harm.borne.shape, objective.weights)),
         weights=lambda objective, line, vehicle: _shares(np.array([objective.weights])),
     ),
     "preference": Kind(
         "preference",
         "the weights harm_weight of each world",
-        lambda _, harm, vehicle: _weighted(harm.borne, harm.harm_weight),
+        lambda _, harm, vehicle: weighted_harm(harm.borne, harm.harm_weight),
         weights=lambda _, line, vehicle: _shares(line.harm_weight),
     ),
     "injury": Kind("injury:CURVE", "injuries in 1,000 lines, by the impact that injures a vehicle more", _injured),

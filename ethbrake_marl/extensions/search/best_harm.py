@@ -88,7 +88,7 @@ def best_harm(
     for count in counts:
         given = [profiles for profiles, _ in found]
         if known is not None:
-            given.append(_startable(known.profiles(identity, count, problem.last_step)[0]))
+            given.append(startable(known.profiles(identity, count, problem.last_step)[0]))
         found.append(_searched(worlds, replace(task, harm_count=count), others, given, task.vehicles, effort, aimed))
     rows = np.arange(worlds.n)
     best: dict[HarmCount, BestKnown] = {}
@@ -305,6 +305,30 @@ def _searched(
 
     """
     problem = aimed(_problem(worlds, task, others, deciders))
+    starts = starting_profiles(problem, worlds, task, others, given)
+    if len(task.vehicles) > 1:
+        for c, vehicle in enumerate(task.vehicles):
+            alone, _ = _searched(worlds, replace(task, vehicles=(vehicle,)), others, (), deciders, effort, aimed)
+            least = problem.bounds[:, np.newaxis, :, 0]
+            commands = np.broadcast_to(least, (*alone.ends.shape, len(task.vehicles))).copy()
+            commands[..., c] = alone.commands_mps2[..., 0]
+            starts.append(Profiles(alone.ends, commands))
+    return search_profiles(problem, joined(starts, problem.n), **effort)
+
+
+def starting_profiles(
+    problem: ProfileProblem, worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles] = ()
+) -> list[Profiles]:
+    """Return profiles to start a search with: constants, ``given`` ones, and for one vehicle its extreme ones.
+
+    Args:
+        problem: the problem of the worlds.
+        worlds: the worlds at t = 0, [n].
+        task: scenario, controlled vehicles and harm to minimise.
+        others: [n, N] commands of the vehicles that follow scripts, m/s2.
+        given: further profiles to start with.
+
+    """
     starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
     if len(task.vehicles) == 1:
         coupled = optimise_coupled(
@@ -315,17 +339,10 @@ def _searched(
         forward = np.all(at.speeds_mps >= 0.0, axis=1)
         neighbours = (forward & there for there in (task.vehicle > 0, task.vehicle < at.N - 1))
         starts.append(extreme_profiles(problem, onset_states(at, task.vehicle, None), *neighbours))
-    else:
-        for c, vehicle in enumerate(task.vehicles):
-            alone, _ = _searched(worlds, replace(task, vehicles=(vehicle,)), others, (), deciders, effort, aimed)
-            least = problem.bounds[:, np.newaxis, :, 0]
-            commands = np.broadcast_to(least, (*alone.ends.shape, len(task.vehicles))).copy()
-            commands[..., c] = alone.commands_mps2[..., 0]
-            starts.append(Profiles(alone.ends, commands))
-    return search_profiles(problem, _joined(starts, problem.n), **effort)
+    return starts
 
 
-def _startable(profiles: Profiles) -> Profiles:
+def startable(profiles: Profiles) -> Profiles:
     """Return profiles that a search can start with.
 
     A profile with too many phases (times of constant command) is replaced by its first command, held to the end.
@@ -339,7 +356,7 @@ def _startable(profiles: Profiles) -> Profiles:
     )
 
 
-def _joined(parts: list[Profiles], n: int) -> Profiles:
+def joined(parts: list[Profiles], n: int) -> Profiles:
     """Join several sets of profiles, [n * Q_j] each, into one set [n * Q]: all profiles of world 0 first, and so on."""
     parts = Profiles.padded(parts, MOST_PHASES)
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
