@@ -156,7 +156,9 @@ def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[O
 
     """
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
-    told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count), ledger.harm_weight
+    no_sums = any(OBJECTIVES[each.kind].weights is None for each in objectives)  # only these may read changes of speed
+    changes = ledger.speed_changes(harm_count) if no_sums else 2 * (np.full(ledger.mass_t.shape, np.nan),)
+    told = *harms, ledger.mass_t, *changes, ledger.harm_weight
     harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only views
     return np.stack([OBJECTIVES[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
