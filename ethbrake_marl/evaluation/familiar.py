@@ -64,6 +64,8 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
     """
     found, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():
+        if key == "harm_weight":  # no motion depends on it, and a policy observes shares, which are from 0 to 1 anyhow
+            continue
         if key not in known:
             found.append(key)
             continue
@@ -76,7 +78,8 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
             found.append(f"no {key} in {100.0 * none:.0f} % of the worlds")
         if share > _MOST_BEYOND:
             found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
-    gone = {key: rule.of(before) < rule.high for key, rule in known.items() if key not in here}
+    absent = [key for key in known if key not in here and key != "harm_weight"]
+    gone = {key: known[key].of(before) < known[key].high for key in absent}
     return found + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before
 
 
