@@ -217,7 +217,8 @@ def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> F
     Both vehicles are indices from 0; ``neighbour`` None: the weight of ``vehicle`` itself.
     """
     weight = worlds.vehicles.harm_weight
-    return weight[:, vehicle if neighbour is None else neighbour] / weight.sum(axis=1)
+    share: Floats = weight[:, vehicle if neighbour is None else neighbour] / weight.sum(axis=1)
+    return share
 
 
 def place(worlds: Worlds, vehicle: int) -> Floats:

@@ -347,7 +347,8 @@ def weighted_harm(borne: Floats, weights: Floats) -> Floats:
 
 def _shares(weights: Floats) -> Floats:
     """Return weights [n, N] as multiples of their mean."""
-    return weights * (weights.shape[1] / weights.sum(axis=1, keepdims=True))
+    shares: Floats = weights * (weights.shape[1] / weights.sum(axis=1, keepdims=True))
+    return shares
 
 
 _BUILT_IN: dict[str, Kind] = {

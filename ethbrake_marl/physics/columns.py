@@ -175,19 +175,13 @@ class Packed(NamedTuple):
             column.braking, column.driving, column.latency, column.mass, column.limit, column.brake_rate,
             column.release_rate, column.harm_weight, column.own_latency,
         )  # fmt: skip
-        braking, driving, latency, mass, limit, *rates, weight = (
-            params[:, begin:end].copy() for begin, end in pairwise(ends)
-        )
-        restitution = params[:, column.restitution].copy()
+        parts = [params[:, begin:end].copy() for begin, end in pairwise(ends)]
+        braking, driving, latency, mass, limit, brake_rate, release_rate, weight = parts
+        restitution, none = params[:, column.restitution].copy(), np.zeros((*latency.shape, 0))
+        every = braking, driving, latency, mass, limit, restitution, brake_rate, release_rate, none, weight
         if not self.has_news:
-            return Vehicles.at_once(braking, driving, latency, mass, limit, restitution, *rates, harm_weight=weight)
-        own = params[:, column.own_latency : column.news].copy()
-        brake_rate, release_rate = rates
-        known = self.known_from_s
-        none = np.zeros((*latency.shape, 0))
-        return Vehicles(
-            braking, driving, latency, mass, limit, restitution, brake_rate, release_rate, none, weight, own, known
-        )
+            return Vehicles.at_once(*every)
+        return Vehicles(*every, params[:, column.own_latency : column.news].copy(), self.known_from_s)
 
     @property
     def known_from_s(self) -> Floats:

@@ -7,12 +7,15 @@ it is exact as far as the searches are. No bound is proven for it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
+from ethbrake_marl.errors import check_one_learner
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.fronts.hypervolume import nondominated
 from ethbrake_marl.extensions.fronts.weights import checked_weights
 from ethbrake_marl.extensions.search.best_harm import (
@@ -35,9 +38,11 @@ BUDGET = 3_000  # candidates per world and weight
 
 CONSTANTS = 101  # constant commands of which the front is never worse
 
-CHUNK = 250  # worlds that are searched together
+CHUNK = 1_000  # worlds that are searched together
 
 FIRST_SHARE = 0.6  # share of the budget for the first round; the second one starts from the best of all weights
+
+Borne = Mapping[HarmCount, Floats]
 
 Progress = Callable[[int, int], None]  # called with the number of worlds done and their total
 
@@ -47,8 +52,9 @@ class Front(NamedTuple):
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: HarmCount  # harm that is weighted: of each pair's ``first`` impact, or ``total``
-    borne: Mapping[HarmCount, Floats]  # count of harm -> [W, n, N] harm of each vehicle, m2/s2
+    borne: Borne  # count of harm -> [W, n, N] harm of each vehicle, m2/s2
     profiles: tuple[Profiles, ...]  # W times [n]: the commands of the controlled vehicles
+    agents: Mapping[str, Borne]  # agent -> harm of each vehicle where this agent drives for each set of weights
 
     @property
     def amounts(self) -> Floats:
@@ -84,7 +90,7 @@ def search_front(
     budget: int = BUDGET,
     seed: int = 0,
     threads: int = 1,
-    agents: Sequence[Driver] = (),
+    agents: Sequence[str] = (),
     on_progress: Progress | None = None,
 ) -> Front:
     """Search the least weighted harm of every world under every set of weights.
@@ -108,31 +114,58 @@ def search_front(
         budget: candidates per world and set of weights.
         seed: seed of the random search.
         threads: number of threads.
-        agents: agents of the one learner, whose episodes count as candidates for all weights.
+        agents: specs of agents of the one learner, such as ``policy@shipped``. Each drives every world once for each
+            set of weights, as the scenario's ``harm_weight`` and objective ``preference``.
         on_progress: called with the number of worlds done and their total.
 
-    Raises ``InvalidInput`` for weights that ``checked_weights`` refuses, and what ``best_harm`` raises.
+    Raises ``InvalidInput`` for weights that ``checked_weights`` refuses or agents beside several learners, and what
+    ``best_harm`` and ``make_agents`` raise.
 
     """
     weights = checked_weights(weights, scenario.vehicles)
     task = Task(scenario, scenario.learners, harm_count)
     effort = {"budget": budget, "seed": seed, "threads": threads}
+    if agents:
+        check_one_learner(scenario.name, [scenario.vehicle_names[i] for i in scenario.learners], "agents drive one")
+    preferring = [Preferring.of(scenario, row, agents, harm_count) for row in weights]
     parts = []
     for first in range(0, worlds.n, CHUNK):
         some = worlds.take(np.arange(first, min(first + CHUNK, worlds.n)))
-        parts.append(_searched(some, task, weights, effort, agents))
+        parts.append(_searched(some, task, weights, effort, preferring))
         if on_progress is not None:
             on_progress(first + some.n, worlds.n)
-    borne = {count: np.concatenate([part.borne[count] for part in parts], axis=1) for count in HARM_COUNTS}
     profiles = []
     for several in zip(*(part.profiles for part in parts), strict=True):
         padded = Profiles.padded(several, 1)
         profiles.append(Profiles(*(np.concatenate(each) for each in zip(*padded, strict=True))))
-    return Front(weights, harm_count, borne, tuple(profiles))
+    driven = {name: _joined_borne([part.agents[name] for part in parts]) for name in parts[0].agents}
+    return Front(weights, harm_count, _joined_borne([part.borne for part in parts]), tuple(profiles), driven)
+
+
+def _joined_borne(parts: Sequence[Borne]) -> Borne:
+    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in HARM_COUNTS}
+
+
+class Preferring(NamedTuple):
+    """A scenario in which the harm of the vehicles has given weights, and agents made for it."""
+
+    scenario: Scenario  # with fixed ``harm_weight`` and the objective ``preference``
+    agents: Mapping[str, Driver]  # spec -> agent
+
+    @classmethod
+    def of(cls, scenario: Scenario, weights: Floats, agents: Sequence[str], harm_count: HarmCount) -> Preferring:
+        """Return the scenario with ``weights`` [N], and the agents with these specs for it."""
+        fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
+        return cls(fixed, make_agents(agents, fixed, harm_count=harm_count))
+
+    def weighted(self, worlds: Worlds) -> Worlds:
+        """Return the worlds with the weights of this scenario."""
+        weight = np.broadcast_to(np.array(self.scenario.harm_weight, np.float64), worlds.speeds_mps.shape).copy()
+        return replace(worlds, vehicles=replace(worlds.vehicles, harm_weight=weight))
 
 
 def _searched(
-    worlds: Worlds, task: Task, weights: Floats, effort: Mapping[str, int], agents: Sequence[Driver]
+    worlds: Worlds, task: Task, weights: Floats, effort: Mapping[str, int], preferring: Sequence[Preferring]
 ) -> Front:
     """Return the front of a few worlds, from two rounds of searches, one per set of weights each.
 
@@ -141,7 +174,7 @@ def _searched(
         task: scenario, controlled vehicles and harm that is weighted.
         weights: [W, N] weights.
         effort: keywords ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        agents: agents whose episodes count too.
+        preferring: for each set of weights the agents whose episodes count too.
 
     """
     problem, pool = task_problem(worlds, task), Pool()
@@ -151,15 +184,33 @@ def _searched(
         pool.add(problem, constants.take(slice(q, None, CONSTANTS)))
     if len(task.vehicles) == 1:
         pool.add(problem, shipped_profiles(problem, task.harm_count)[0])
-    for agent in agents:
-        pool.add(problem, driven_profiles(agent, worlds, task, problem.last_step))
+    driven: dict[str, list[Borne]] = {name: [] for name in preferring[0].agents}
+    for each in preferring:
+        theirs = Task(each.scenario, task.vehicles, task.harm_count)
+        for name, agent in each.agents.items():
+            if driven[name] and not observes_weights(agent):
+                driven[name].append(driven[name][0])
+                continue
+            profiles = driven_profiles(agent, each.weighted(worlds), theirs, problem.last_step)
+            driven[name].append(pool.add(problem, profiles))
     aims = [problem.minimising(np.broadcast_to(row / row.sum(), (worlds.n, len(row)))) for row in weights]
     for k, share in enumerate((FIRST_SHARE, 1.0 - FIRST_SHARE)):
         spent = {**effort, "budget": max(int(share * effort["budget"]), 1)}
         for row, aim in zip(weights, aims, strict=True):
             given = [startable(pool.best(row, task.harm_count)), *(starts if k == 0 else ())]
             pool.add(problem, search_profiles(aim, joined(given, worlds.n), **spent)[0])
-    return pool.front(weights, task.harm_count)
+    borne, best = pool.least(weights, task.harm_count)
+    told = {
+        name: {count: np.stack([each[count] for each in parts]) for count in HARM_COUNTS}
+        for name, parts in driven.items()
+    }
+    return Front(weights, task.harm_count, borne, best, told)
+
+
+def observes_weights(agent: Driver) -> bool:
+    """Return whether an agent may heed the weights: all but trained policies that do not observe them."""
+    manifest = getattr(agent, "manifest", None)
+    return manifest is None or any("harm_weight" in name for name in manifest.observation.features)
 
 
 class Pool:
@@ -169,11 +220,13 @@ class Pool:
         self._profiles: list[Profiles] = []
         self._borne: dict[HarmCount, list[Floats]] = {count: [] for count in HARM_COUNTS}
 
-    def add(self, problem: ProfileProblem, profiles: Profiles) -> None:
-        """Add one profile for each world of ``problem``."""
+    def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
+        """Add one profile for each world of ``problem``, and return the harm of each vehicle, [n, N] by count."""
         self._profiles.append(profiles)
-        for count, borne in problem.borne(profiles).items():
+        found = problem.borne(profiles)
+        for count, borne in found.items():
             self._borne[count].append(borne)
+        return found
 
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
         """Return the number of the profile of least weighted harm in each world, [n]; of equals, of least harm in all.
@@ -193,9 +246,9 @@ class Pool:
         back = np.argsort(np.concatenate([rows for _, rows in parts]), kind="stable")
         return Profiles(*(np.concatenate(each)[back] for each in zip(*padded, strict=True)))
 
-    def front(self, weights: Floats, harm_count: HarmCount) -> Front:
-        """Return the best known front for the rows of ``weights`` [W, N]."""
+    def least(self, weights: Floats, harm_count: HarmCount) -> tuple[Borne, tuple[Profiles, ...]]:
+        """Return harm and profiles of the best choice for each row of ``weights`` [W, N]: [W, n, N] and W times [n]."""
         chosen = [self.choice(row, harm_count) for row in weights]
         at = np.arange(len(chosen[0]))
         borne = {count: np.stack([np.stack(each)[k, at] for k in chosen]) for count, each in self._borne.items()}
-        return Front(weights, harm_count, borne, tuple(self.best(row, harm_count) for row in weights))
+        return borne, tuple(self.best(row, harm_count) for row in weights)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Floats, checked_numbers
 
 STEPS = 5  # default number of steps along an edge of the grid: 21 weights of three vehicles
@@ -64,3 +65,14 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
     if not rows:
         raise InvalidInput("weights: there are none; give at least one row, as in 1,4,1")
     return np.array(rows)
+
+
+def parsed_weights(texts: Sequence[str], vehicles: int) -> Floats:
+    """Return weights that are written as ``1,4,1``, one text per row, as an array [W, N]; see ``checked_weights``."""
+    rows = []
+    for text in texts:
+        numbers = [parse_numeral(part.strip()) for part in text.split(",")]
+        if None in numbers:
+            raise InvalidInput(f"weights {text!r}: must be numbers with commas between them, as in 1,4,1")
+        rows.append([float(number) for number in numbers if number is not None])
+    return checked_weights(rows, vehicles)

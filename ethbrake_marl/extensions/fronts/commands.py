@@ -1,0 +1,85 @@
+"""The command ``study front``: whose harm counts, over many sets of weights."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from ethbrake_marl.agents.spec import split_specs
+from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example
+from ethbrake_marl.cli.evaluate import read_task
+from ethbrake_marl.extensions.studies.commands import FolderOption
+from ethbrake_marl.registry import Part
+
+
+def front_command(
+    output: FolderOption,
+    scenario: Annotated[
+        str, typer.Option(metavar="NAME|PATH", help="Scenario whose learners are searched.")
+    ] = "paper-random",
+    agents: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Agents to show beside the front.")
+    ] = "e_v2x_bm,universal@shipped",
+    weights: Annotated[
+        list[str] | None,
+        typer.Option(metavar="W1,W2,...", help="One weight per vehicle. Repeatable.", show_default="a grid"),
+    ] = None,
+    steps: Annotated[int, typer.Option(help="Steps along an edge of the grid of weights.", min=1, max=50)] = 5,
+    episodes: Annotated[int, typer.Option(help="Number of worlds.", min=2)] = 500,
+    seed: Annotated[int, typer.Option(help="Seed of the list of worlds.", min=0)] = 7,
+    budget: Annotated[int, typer.Option(help="Candidates per world and set of weights.", min=1)] = 3000,
+    settings: SettingsOption = None,
+    jobs: JobsOption = 1,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what each choice of whose harm counts costs whom.
+
+    Searches every world for the least weighted harm, for each set of weights, and drives the agents beside it. Writes
+    front.json, front.png and, for three vehicles, front-ternary.png. The corners, where one vehicle counts first and
+    the others only between equals, are part of a grid.
+    """
+    with Out(as_json=as_json, force=force) as out:
+        import numpy as np
+
+        from ethbrake_marl.extensions.fronts.figures import front_figures
+        from ethbrake_marl.extensions.fronts.front import search_front
+        from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
+        from ethbrake_marl.extensions.fronts.weights import corners, parsed_weights, weight_grid
+        from ethbrake_marl.extensions.report.style import picture_bytes
+        from ethbrake_marl.files.store import check_folder
+
+        task = read_task(scenario, settings)
+        chosen = task.scenario
+        if weights is None:
+            rows = np.concatenate([weight_grid(chosen.vehicles, steps), corners(chosen.vehicles)])
+        else:
+            rows = parsed_weights(weights, chosen.vehicles)
+        check_folder(output, ("front.json", "front.png", "front-ternary.png"), force=force)
+        output.mkdir(parents=True, exist_ok=True)
+        sample = chosen.sample(episodes, seed)
+        others = [spec for spec in split_specs(agents) if spec != "full_brake"]
+        several = len(chosen.learners) > 1
+        if several and others:
+            out.note(f"{chosen.name} has {len(chosen.learners)} learners: no agents beside its front")
+        front = search_front(
+            chosen, sample.worlds, rows, harm_count=task.harm_count, budget=budget, threads=jobs or 1,
+            agents=() if several else others, on_progress=lambda done, total: out.progress("front", done, total),
+        )  # fmt: skip
+        found = front_results(front, chosen, sample, full_braking(chosen, sample), seed)
+        found |= {"budget": budget, "settings": list(settings or ())}
+        out.write(output / "front.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
+        for name, figure in front_figures(found).items():
+            out.write(output / name, picture_bytes(figure, name), "figure")
+        out.result(found, front_sheet(found), hypervolume_sheet(found))
+
+
+FRONT = Part(
+    front_command,
+    epilog=example(
+        "study front --output runs/front",
+        "study front --weights 1,1,1 --weights 4,1,1 --agents policy@shipped --output runs/two",
+    ),
+)

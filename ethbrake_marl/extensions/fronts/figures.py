@@ -1,0 +1,116 @@
+"""Figures of a front: who bears the harm (a ternary plot), and the sum of harm against the largest share of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from ethbrake_marl.envs.rendering import COLOURS
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.extensions.report.style import (
+    GREY,
+    MARKERS,
+    finish,
+    label_text,
+    name_axes,
+    new_figure,
+    new_panels,
+    plain,
+)
+from ethbrake_marl.physics.state import Floats
+
+WIDTH_IN = 5.6  # narrow enough for a phone
+
+_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])  # of the triangle: Vehicles 1, 2 and 3
+
+Json = dict[str, Any]
+
+
+def front_figures(found: Json) -> dict[str, Figure]:
+    """Return the figures of the content of ``front.json``, by file name; the ternary one for three vehicles only."""
+    figures = {"front.png": sum_figure(found)}
+    if len(found["vehicles"]) == 3:
+        figures["front-ternary.png"] = ternary_figure(found)
+    return figures
+
+
+def sum_figure(found: Json) -> Figure:
+    """Draw the mean harm of the line against that of the vehicle that bears most, a point for each set of weights."""
+    figure, (axes,) = new_panels((WIDTH_IN, 4.6))
+    for name, harm, style in _series(found):
+        axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(FuncFormatter(plain))
+        axis.set_minor_formatter(FuncFormatter(plain))
+    axes.tick_params(which="minor", labelsize=7)
+    count = {"first": "first impacts", "total": "all impacts"}[found["harm_count"]]
+    name_axes(axes, x=f"Harm of the line, {count} (m²/s²)", y="Harm of the vehicle that bears most (m²/s²)")
+    return finish(figure, _caption(found), axes, columns=2, fontsize=8)
+
+
+def ternary_figure(found: Json) -> Figure:
+    """Draw which share of the harm each of three vehicles bears; the colour is the harm of the line."""
+    figure = new_figure(WIDTH_IN, 5.4)
+    axes = figure.add_subplot()
+    axes.set_axis_off()
+    axes.set_aspect("equal")
+    axes.plot(*_CORNERS[[0, 1, 2, 0]].T, color=GREY, linewidth=1.0)
+    for share in (0.25, 0.5, 0.75):
+        for i in range(3):
+            ends = np.full((2, 3), 0.0)
+            ends[:, i] = share
+            ends[0, (i + 1) % 3] = ends[1, (i + 2) % 3] = 1.0 - share
+            axes.plot(*(ends @ _CORNERS).T, color="#dddddd", linewidth=0.6, zorder=0)
+    for name, at, up in zip(found["vehicles"], _CORNERS, ("top", "top", "bottom"), strict=True):
+        axes.annotate(
+            f"{name} bears all",
+            at,
+            ha="center",
+            va=up,
+            fontsize=8,
+            xytext=(0, -4 if up == "top" else 4),
+            textcoords="offset points",
+        )
+    series = list(_series(found))
+    sums = np.concatenate([harm.sum(axis=1) for _, harm, _ in series])
+    for name, harm, style in series:
+        whole = harm.sum(axis=1)
+        some = whole > 0.0
+        x, y = (harm[some] / whole[some, np.newaxis] @ _CORNERS).T
+        points = axes.scatter(
+            x, y, s=34.0, c=whole[some], marker=style["marker"], cmap="viridis", edgecolors="white", linewidths=0.5,
+            vmin=sums.min(), vmax=sums.max(),
+        )  # fmt: skip
+        axes.plot([], [], label=label_text(name, 34), **{**style, "color": GREY})  # in the legend, without a sum
+    bar = figure.colorbar(points, ax=axes, shrink=0.7, location="bottom", pad=0.02)
+    bar.set_label("Harm of the line (m²/s²)", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+    return finish(figure, _caption(found), axes, columns=2, fontsize=8)
+
+
+def _series(found: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
+    """Return name, mean harm [W, N] m2/s2 and style of the front, of full braking and of each agent."""
+    count = found["harm_count"]
+
+    def harm(points: Sequence[Mapping[str, Any]]) -> Floats:
+        return np.array([[each["value"] for each in point["vehicles"][count]] for point in points])
+
+    braking = np.array([[each["value"] for each in found["full_brake"][count]]])
+    named = [("front", harm(found["points"])), ("full braking", braking)]
+    named += [(name, np.unique(harm(points), axis=0)) for name, points in found["agents"].items()]
+    styles = ({"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]} for k in range(len(named)))
+    return [
+        (name, values, {**style, "linestyle": "none", "markersize": 5.0})
+        for (name, values), style in zip(named, styles, strict=True)
+    ]
+
+
+def _caption(found: Json) -> str:
+    worlds = count_of(found["episodes"], "world")
+    return f"{found['scenario']}, {worlds}; a point for each of {len(found['points'])} choices of the weights."

@@ -1,0 +1,181 @@
+"""Results of a front: means with intervals, hypervolumes, and agents beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
+from ethbrake_marl.evaluation.rollout import evaluate
+from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.extensions.fronts.front import Borne, Front, amounts_of
+from ethbrake_marl.extensions.fronts.hypervolume import MOST_DIMENSIONS, hypervolume
+from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
+from ethbrake_marl.game.harm import HARM_COUNTS
+from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.scenario.sample import Sample
+from ethbrake_marl.scenario.schema import Scenario
+
+RESAMPLES = 200  # bootstrap samples of the worlds, for intervals of hypervolumes
+
+Json = dict[str, Any]
+
+
+def front_results(front: Front, scenario: Scenario, sample: Sample, full_brake: Borne, seed: int | None) -> Json:
+    """Return the content of ``front.json``: the front, full braking, and the agents beside it.
+
+    All means have 95 % intervals over worlds. An agent's ``ratio`` is its mean weighted harm divided by the front's;
+    null where the front's is 0. ``above`` is the mean difference of the two.
+
+    Args:
+        front: the searched front.
+        scenario: the scenario of its worlds.
+        sample: its worlds.
+        full_brake: count of harm -> [n, N] harm of each vehicle if the learners brake fully.
+        seed: seed of the list, or None.
+
+    """
+    least = front.amounts
+    agents = {}
+    for name, borne in front.agents.items():
+        points = _points(front, borne)
+        for k, (point, row) in enumerate(zip(points, front.weights, strict=True)):
+            amounts, best = amounts_of(borne[front.harm_count][k], row), float(least[k].mean())
+            point["above"] = paired_difference(amounts, least[k]).to_json()
+            point["ratio"] = float(amounts.mean()) / best if best > 0.0 else None
+        agents[name] = points
+    return {
+        "kind": "front",
+        "scenario": scenario.name,
+        "seed": seed,
+        "episodes": len(sample.index),
+        "harm_count": front.harm_count,
+        "vehicles": list(scenario.vehicle_names),
+        "full_brake": _vehicles(full_brake),
+        "points": _points(front, front.borne),
+        "agents": agents,
+        "hypervolume": hypervolumes(front, full_brake[front.harm_count]),
+        "scenario_sha256": scenario_sha256(scenario),
+        "worlds_sha256": worlds_sha256(sample.worlds, sample.index),
+        "versions": result_versions(),
+    }
+
+
+def _points(front: Front, borne: Borne) -> list[Json]:
+    return [
+        {
+            "weights": row.tolist(),
+            "vehicles": _vehicles({count: borne[count][k] for count in HARM_COUNTS}),
+            "amount": mean(amounts_of(borne[front.harm_count][k], row)).to_json(),
+            "sum": mean(borne[front.harm_count][k].sum(axis=1)).to_json(),
+        }
+        for k, row in enumerate(front.weights)
+    ]
+
+
+def _vehicles(borne: Borne) -> Mapping[str, list[Json]]:
+    return {count: [mean(each).to_json() for each in borne[count].T] for count in HARM_COUNTS}
+
+
+def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
+    """Return hypervolumes of the mean harm of the front and of each agent, for two reference points.
+
+    The first one is the mean harm of full braking: points count that are better for every vehicle. The second one is
+    the largest mean harm of each vehicle under full braking or at any point of the front, so that points count that
+    take somebody's side. ``share`` is an agent's hypervolume divided by the front's. Intervals are percentiles over
+    ``RESAMPLES`` resamples of the worlds.
+
+    Args:
+        front: the front, and the agents' harm beside it.
+        full_brake: [n, N] harm of each vehicle if the learners brake fully.
+
+    """
+    if len(full_brake.T) > MOST_DIMENSIONS:
+        return []
+    sets = {"front": front.borne[front.harm_count], **{k: each[front.harm_count] for k, each in front.agents.items()}}
+    if "front" in front.agents:
+        raise InvalidInput("agent 'front': this name stands for the front itself; give the agent another name")
+    n = len(full_brake)
+    shares = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), RESAMPLES) / n
+    shares = np.concatenate([np.full((1, n), 1.0 / n), shares])  # row 0: all worlds alike
+    points = {name: np.einsum("rn,wnv->rwv", shares, borne) for name, borne in sets.items()}
+    braking = shares @ full_brake
+    found = []
+    for words, reference in (
+        ("full braking", braking),
+        ("largest harm of each vehicle", np.maximum(braking, points["front"].max(axis=1))),
+    ):
+        volumes = {
+            name: np.array([hypervolume(each, at) for each, at in zip(rows, reference, strict=True)])
+            for name, rows in points.items()
+        }
+        told: Json = {"reference": words, "at": reference[0].tolist(), "of": {}}
+        for name, volume in volumes.items():
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = volume / volumes["front"]
+            told["of"][name] = {"volume": _interval(volume), "share": _interval(share)}
+        found.append(told)
+    return found
+
+
+def _interval(values: Floats) -> Json | None:
+    """Return the first value with percentiles of the others as JSON; None unless all are finite."""
+    if not np.isfinite(values).all():
+        return None
+    low, high = np.percentile(values[1:], [2.5, 97.5])
+    return Estimate(float(values[0]), (float(low), float(high))).to_json()
+
+
+def full_braking(scenario: Scenario, sample: Sample) -> Borne:
+    """Return the harm of each vehicle if all learners brake fully: count of harm -> [n, N] m2/s2."""
+    brakes = scenario.replace(
+        roles={**scenario.roles, **{scenario.vehicle_names[i]: "full_brake" for i in scenario.learners}}
+    )
+    outcome = evaluate(sample, {"full_brake": Team({}, "full_brake")}, scenario=brakes, aftermath=False).complete()
+    ledger = outcome.outcome("full_brake").ledger
+    return {count: ledger.vehicle_harm(count) for count in HARM_COUNTS}
+
+
+def front_sheet(found: Json) -> Sheet:
+    """Return the table of the content of ``front.json``: who bears what for each set of weights, and agents' ratios."""
+    count = found["harm_count"]
+    columns: list[Column | str] = [
+        Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(found["vehicles"]))),
+        Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
+        *(Column(name, digits=3, short=name.partition("@")[0][:12]) for name in found["agents"]),
+    ]  # fmt: skip
+    rows: list[Row] = []
+    for k, point in enumerate(found["points"]):
+        told = ",".join(f"{weight:g}" for weight in point["weights"])
+        borne = [each["value"] for each in point["vehicles"][count]]
+        sums = [sum(each["value"] for each in point["vehicles"][also]) for also in HARM_COUNTS]
+        rows.append((told, *borne, *sums, *(points[k]["ratio"] for points in found["agents"].values())))
+    braking = found["full_brake"]
+    sums = [sum(each["value"] for each in braking[also]) for also in HARM_COUNTS]
+    rows.append(("full braking", *(each["value"] for each in braking[count]), *sums))
+    words = {"first": "first-impact", "total": "total"}[count]
+    note = (
+        f"Mean {words} harm of each vehicle, and of the line by first and by all impacts, m2/s2. Agents: their weighted"
+    )
+    note += " harm divided by the front's."
+    return Sheet(f"Front of {found['scenario']}, {found['episodes']:,} worlds", columns, rows, note, gap=2)
+
+
+def hypervolume_sheet(found: Json) -> Sheet:
+    """Return the table of hypervolumes of the content of ``front.json``."""
+    columns: list[Column | str] = [
+        "Reference",
+        "Of",
+        Column("Hypervolume"),
+        Column("Share of the front", digits=1, scale=100.0, unit=" %"),
+    ]
+    rows = [
+        (each["reference"], name, *(None if value is None else Estimate(**value) for value in told.values()))
+        for each in found["hypervolume"]
+        for name, told in each["of"].items()
+    ]
+    return Sheet("Hypervolume of the mean harm (m2/s2)^N", columns, rows, gap=2)
