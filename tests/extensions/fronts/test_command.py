@@ -1,0 +1,57 @@
+"""``study front`` as a user types it."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from tests.fixtures.commands import Command, Refuse, told_json
+
+SMALL = "--episodes 20 --steps 1 --budget 100"
+
+
+def test_front__writes_json_and_two_figures_and_prints_both_counts(ethbrake: Command, empty_folder: Path) -> None:
+    answer = ethbrake(*f"study front {SMALL} --agents e_v2x_bm --output out".split())
+    assert answer.status == 0, answer.err
+    found = json.loads(Path("out/front.json").read_text())
+    assert [point["weights"] for point in found["points"][:3]] == [[0, 0, 1], [0, 1, 0], [1, 0, 0]]
+    assert len(found["points"]) == len(found["agents"]["e_v2x_bm"]) == 6  # three corners, and three that break ties
+    assert found["agents"]["e_v2x_bm"][1]["ratio"] >= 1.0
+    assert {each["reference"] for each in found["hypervolume"]} == {"full braking", "largest harm of each vehicle"}
+    for name in ("front.png", "front-ternary.png"):
+        with Image.open(Path("out") / name) as picture:
+            assert picture.width > 700
+    for words in ("0,1,0", "full braking", "First", "All", "e_v2x_bm", "Hypervolume"):
+        assert words in answer.out
+
+
+def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, empty_folder: Path) -> None:
+    line = "study front --scenario cooperation-4-all --weights 1,1,1 --weights 0,0,3 --episodes 2 --budget 50 --json"
+    answer = ethbrake(*line.split(), "--set", "harm_count=total", "--output", "out")
+    found = told_json(answer)
+    assert (found["harm_count"], found["agents"]) == ("total", {}) and len(found["points"]) == 2
+    assert "has 3 learners: no agents beside its front" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("--weights 1,1", ("weights[0] = 1,1", "must be 3 finite numbers", "1,4,1")),
+        ("--weights 1,-1,1", ("weights[0] = 1,-1,1", "at least 0")),
+        ("--weights 0,0,0", ("not all 0",)),
+        ("--weights 1,x,1", ("'1,x,1'", "numbers with commas")),
+        ("--weights 1,inf,1", ("numbers with commas",)),
+        ("--agents nobody", ("unknown agent 'nobody'",)),
+        ("--set roles.vehicle_2=full_brake", ("learner",)),
+    ],
+)
+def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple[str, ...]) -> None:
+    refuse(f"study front {given} --output out", *words)
+
+
+def test_front__does_not_replace_results(ethbrake: Command, empty_folder: Path) -> None:
+    Path("out").mkdir()
+    Path("out/front.json").write_text("mine")
+    answer = ethbrake(*f"study front {SMALL} --output out".split())
+    assert answer.status == 2 and "front.json" in answer.err and Path("out/front.json").read_text() == "mine"

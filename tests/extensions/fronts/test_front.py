@@ -1,0 +1,84 @@
+"""The front of a list: no constant, agent or point of other weights is better; one answer for any batch."""
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.fronts.front import Front, amounts_of, search_front
+from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
+from ethbrake_marl.extensions.search.best_harm import task_problem
+from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.scenario.task import Task
+
+PAPER = eb.load_scenario("paper-random")
+WORLDS = PAPER.sample(40, 7).worlds
+WEIGHTS = np.concatenate([weight_grid(3, 2), np.ones((1, 3)), corners(3)])
+AGENTS = ["full_brake", "e_v2x_bm", "universal@shipped", "ppo@shipped"]
+
+
+@pytest.fixture(scope="module")
+def front() -> Front:
+    return search_front(PAPER, WORLDS, WEIGHTS, budget=300, agents=AGENTS)
+
+
+def test_point__is_never_beaten_under_its_weights_by_another_point_a_constant_or_an_agent(front: Front) -> None:
+    problem = task_problem(WORLDS, Task(PAPER, (1,)))
+    constants = [problem.borne(problem.constant(problem.even_grid(101)[:, [q]]))["first"] for q in range(101)]
+    others = [*front.borne["first"], *constants, *(each for borne in front.agents.values() for each in borne["first"])]
+    for row, least in zip(front.weights, front.amounts, strict=True):
+        for borne in others:
+            assert (least <= amounts_of(borne, row)).all()
+
+
+def test_agents__beside_the_front_bear_what_an_evaluation_says(front: Front) -> None:
+    fixed = PAPER.replace(harm_weight=WEIGHTS[4].tolist(), objective="preference")
+    for spec in AGENTS:
+        agent = eb.make_agent(spec, scenario=fixed)
+        outcome = eb.evaluate(WORLDS, {"it": agent}, scenario=PAPER, aftermath=False).outcome("it")
+        for count in ("first", "total"):
+            assert front.agents[spec][count][4].tolist() == outcome.vehicle_harm(count).tolist()
+
+
+def test_profiles__cause_the_harm_that_is_told(front: Front) -> None:
+    problem = task_problem(WORLDS, Task(PAPER, (1,)))
+    for k, profiles in enumerate(front.profiles):
+        for count, borne in problem.borne(profiles).items():
+            assert borne.tolist() == front.borne[count][k].tolist()
+
+
+def test_equal_weights__are_at_least_as_good_as_the_tables(front: Front) -> None:
+    known = best_known(WORLDS, Task(PAPER, (1,)))["first"]
+    assert (front.borne["first"][6].sum(axis=1) <= known + 1e-9).all()
+
+
+def test_corner__decides_between_equals_by_the_others(front: Front) -> None:
+    alone, first = front.borne["first"][0], front.borne["first"][-1]  # Vehicle 3's harm alone, and first
+    assert alone[:, 2].mean() == pytest.approx(first[:, 2].mean(), abs=0.01)
+    assert first.sum() <= alone.sum() + 1e-9
+
+
+def test_front__does_not_depend_on_the_other_worlds_or_threads(front: Front) -> None:
+    some = np.array([3, 17, 30])
+    again = search_front(PAPER, WORLDS.take(some), WEIGHTS, budget=300, agents=AGENTS, threads=3)
+    for count in ("first", "total"):
+        assert again.borne[count].tolist() == front.borne[count][:, some].tolist()
+
+
+def test_nondominated__keeps_the_sum_of_each_world(front: Front) -> None:
+    kept = front.nondominated()
+    assert kept.shape == front.amounts.shape and kept[6].all()
+
+
+def test_team__has_a_front_but_no_agents() -> None:
+    pair = eb.load_scenario("cooperation-3-pair")
+    worlds = pair.sample(2, 3).worlds
+    found = search_front(pair, worlds, [[1, 1, 1], [1, 0, 0]], budget=200, harm_count="total")
+    assert (found.borne["total"][1, :, 0] <= found.borne["total"][0, :, 0]).all()
+    with pytest.raises(InvalidInput, match="agents drive one"):
+        search_front(pair, worlds, [[1, 1, 1]], agents=["full_brake"])
+
+
+def test_weights__of_another_number_are_refused() -> None:
+    with pytest.raises(InvalidInput, match="must be 3 finite numbers"):
+        search_front(PAPER, WORLDS, [[1.0, 1.0]])

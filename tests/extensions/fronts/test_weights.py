@@ -1,0 +1,43 @@
+"""Weights of the vehicles' harm: the grid, and what is refused."""
+
+import math
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.fronts.weights import checked_weights, corners, parsed_weights, weight_grid
+
+
+@pytest.mark.parametrize(("vehicles", "steps"), [(2, 1), (3, 5), (4, 3), (2, 7)])
+def test_grid__has_every_weight_once_and_neighbours_one_step_apart(vehicles: int, steps: int) -> None:
+    rows = np.rint(weight_grid(vehicles, steps) * steps).astype(int)
+    assert len(rows) == math.comb(steps + vehicles - 1, vehicles - 1) == len({tuple(row) for row in rows.tolist()})
+    assert (rows.sum(axis=1) == steps).all() and (rows >= 0).all()
+    assert (np.abs(np.diff(rows, axis=0)).sum(axis=1) == 2).all()
+
+
+def test_corners__put_one_vehicle_first() -> None:
+    assert corners(2).tolist() == [[1.0, 1e-4], [1e-4, 1.0]]
+
+
+@pytest.mark.parametrize(
+    "row",
+    [[1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 0.0, 0.0], [math.nan, 1.0, 1.0], [math.inf, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0]],
+)
+def test_weights__that_are_none_are_refused_by_row(row: list[float]) -> None:
+    with pytest.raises(
+        InvalidInput, match=r"weights\[1\] = .*: must be 3 finite numbers of at least 0, one per vehicle"
+    ):
+        checked_weights([[1.0, 0.0, 0.0], row], 3)
+
+
+@pytest.mark.parametrize("text", ["1,a,1", "1;1;1", "", "1,,1"])
+def test_text__that_is_no_list_of_numbers_is_refused(text: str) -> None:
+    with pytest.raises(InvalidInput, match="must be numbers with commas between them, as in 1,4,1"):
+        parsed_weights([text], 3)
+
+
+def test_weights__none_at_all_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="there are none"):
+        checked_weights([], 3)
