@@ -27,10 +27,11 @@ def test_preference__is_the_weighted_objective_with_the_weights_of_the_world_to_
     rewards = []
     for scenario in (PAPER.replace(harm_weight=weights, objective="preference"), PAPER.replace(objective=text)):
         env = eb.parallel_env(scenario, reward={"harm": 1.0, "harm_count": count})
-        env.reset(seed=5)
         told = []
-        while env.agents:
-            told.append(env.step({"vehicle_2": np.array([-0.7], np.float32)})[1])
+        for seed in range(5):
+            env.reset(seed=seed)
+            while env.agents:
+                told.append(env.step({"vehicle_2": np.array([-1.0], np.float32)})[1])
         rewards.append(told)
     assert rewards[0] == rewards[1] and any(sum(each.values()) < 0.0 for each in rewards[0])
 
