@@ -30,6 +30,8 @@ HARMLESS = {
         "aec_to_parallel_wrapper", "parallel_to_aec_wrapper",
     ),
     "supersuit": ("SB3VecEnvWrapper", "ConcatVecEnv", "MarkovVectorEnv", "gym_reward_lambda", "aec_reward_lambda"),
+    "mo_gymnasium": ("LinearReward", "MONormalizeReward", "MORecordEpisodeStatistics"),
+    "momaland": ("LinearizeReward", "NormalizeReward", "RecordEpisodeStatistics"),
 }  # fmt: skip
 
 _METHODS = ("step", "reset", "step_async", "step_wait", "observe", "last")  # methods that pass observations or actions

@@ -92,6 +92,31 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
             checked_action(action, (1,), agent, count)  # behind a shield, an action may be omitted
         super().step(action)
 
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Start an episode; ``seed`` and ``options`` are as in ``EthBrakeParallelEnv.reset``."""
+        super().reset(seed, options)
+        self._clear_rewards()
+        self._cumulative_rewards = {agent: self._no_reward() for agent in self.agents}
+
+    def reward_space(self, agent: str) -> Any:
+        """Return the space of the vector rewards of the agent with this name, as ``EthBrakeParallelEnv`` does."""
+        return self.unwrapped.reward_space(agent)
+
+    @property
+    def reward_spaces(self) -> dict[str, Any]:
+        """Spaces of the vector rewards, by agent name, for MOMAland."""
+        spaces: dict[str, Any] = self.unwrapped.reward_spaces
+        return spaces
+
+    def _clear_rewards(self) -> None:
+        for agent in self.rewards:
+            self.rewards[agent] = self._no_reward()
+
+    def _no_reward(self) -> Any:
+        """Return a reward of zero: a number, or where rewards are vectors a new array [K]."""
+        components = self.env.unwrapped.engine.components
+        return np.zeros(len(components)) if components else 0
+
 
 Infos = dict[str, dict[str, Any]]
 

@@ -76,6 +76,16 @@ class OwnRewardAndStep(OwnReward):
         return super().step(-action)
 
 
+class LinearReward(gymnasium.Wrapper):
+    """As MO-Gymnasium's: makes a number of a vector."""
+
+    __module__ = "mo_gymnasium.wrappers.wrappers"
+
+    def step(self, action):
+        observation, reward, *others = self.env.step(action)
+        return observation, np.sum(reward), *others
+
+
 class Titled(gymnasium.Wrapper):
     title = "says nothing of actions or observations"
 
@@ -163,6 +173,7 @@ HARMLESS = {
     "NormalizeReward": wrappers.NormalizeReward,
     "OwnReward": OwnReward,
     "Titled": Titled,
+    "LinearReward": LinearReward,
     "Monitor": Monitor,
     "ShieldedEnv": eb.ShieldedEnv,
 }
@@ -252,10 +263,20 @@ class Same(BaseParallelWrapper):
     """Changes nothing."""
 
 
+class LinearizeReward(BaseParallelWrapper):
+    """As MOMAland's: changes rewards alone."""
+
+    __module__ = "momaland.utils.parallel_wrappers"
+
+    def step(self, actions):
+        return self.env.step(actions)
+
+
 @pytest.mark.parametrize(
     "wrap",
     [
         Same,
+        LinearizeReward,
         lambda env: aec_to_parallel(OrderEnforcingWrapper(AssertOutOfBoundsWrapper(InTurns.around(env)))),
         eb.HybridShield,
     ],

@@ -27,6 +27,7 @@ from ethbrake_marl.extensions.reproduction.making import choose_items
 from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
 from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES
 from ethbrake_marl.extensions.search.shipped import best_known
+from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.game.objectives import OBJECTIVES, scored
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
@@ -163,6 +164,30 @@ def test_team_curves__a_failed_job_is_counted_and_the_others_go_on(capsys) -> No
     assert "good.json\n" in printed.out
     assert "bad.json FAILED" in printed.out
     assert "no such level" in printed.err
+
+
+def volume_below(reference: np.ndarray, points: np.ndarray) -> float:
+    """The volume that points [n, 3] dominate below a reference point, cell by cell of the grid of their coordinates."""
+    edges = [np.unique(np.clip([*points[:, k], reference[k]], None, reference[k])) for k in range(3)]
+    corners = np.stack(np.meshgrid(*(edge[:-1] for edge in edges), indexing="ij"), axis=-1)
+    dominated = (points[:, None, None, None] <= corners).all(axis=-1).any(axis=0)
+    return float(np.einsum("ijk,i,j,k", dominated, *map(np.diff, edges)))
+
+
+def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -> None:
+    found = json.loads((DOCS / "studies" / "morl_front.json").read_bytes())
+    weights, scenario = np.array(found["weights"]), load_scenario(found["scenario"])
+    assert weights.shape == (21, 3) and np.allclose(weights.sum(axis=1), 1.0)
+    worlds = scenario.sample(found["worlds"], found["seed"])
+    braking = eb.evaluate(worlds, make_lineup(["full_brake"], scenario), scenario=scenario).outcome("full_brake")
+    for training in found["trainings"]:
+        for count in HARM_COUNTS:
+            measured = training[count]
+            points, full = np.array(measured["harm"]), braking.vehicle_harm(count).mean(axis=0)
+            assert points.shape == (21, 3) and points.max() < found["roof"]
+            assert measured["full_braking"] == full.round(4).tolist()
+            assert measured["hypervolume"] == pytest.approx(volume_below(full.round(4), points))
+            assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
 
 
 def test_message_contents__trains_each_content_once_and_compares_it_with_the_usual_pieces(

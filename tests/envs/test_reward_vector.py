@@ -130,3 +130,30 @@ def test_weights__of_an_objective_give_its_amount(text: str) -> None:
         kind = OBJECTIVES[objective.kind]
         weights = kind.weights(objective, line, vehicle)
         assert (weights * borne).sum() == pytest.approx(kind.amount(objective, harm, vehicle)[0])
+
+
+def test_turns__before_the_first_step_and_between_steps_give_vectors_of_zeros() -> None:
+    turns = eb.env(COASTING, reward_vector="vehicles")
+    turns.reset(options={"initial_state": LINE})
+    assert (
+        turns.reward_space("vehicle_1")
+        == turns.reward_spaces["vehicle_3"]
+        == turns.unwrapped.reward_spaces["vehicle_2"]
+    )
+    collected: dict[str, Any] = dict.fromkeys(turns.agents, 0.0)
+    for agent in turns.agent_iter():
+        reward, over = turns.last()[1], any(turns.last()[2:4])
+        collected[agent] += reward
+        for given in (reward, *turns.rewards.values()):
+            assert given.dtype == np.float64 and turns.reward_space(agent).contains(given)
+        turns.step(np.zeros(1) if agent == "vehicle_2" and not over else None)
+    assert [each.tolist() for each in collected.values()] == [collected["vehicle_1"].tolist()] * 3
+    assert collected["vehicle_1"][:2] == pytest.approx([-8.8, -7.2])
+
+
+def test_turns__with_numbers_have_no_space_of_vectors() -> None:
+    turns = eb.env()
+    turns.reset(seed=1)
+    assert turns.rewards["vehicle_1"] == 0 and not hasattr(turns, "reward_spaces")
+    with pytest.raises(InvalidInput, match="reward_space: rewards are numbers here"):
+        turns.reward_space("vehicle_1")

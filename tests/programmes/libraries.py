@@ -193,6 +193,9 @@ LIBRARIES = {  # by the heading of their section
     ),
     "Minari": Library(("minari[create,hdf5]==0.5.4",), in_ci=True, finish=of_minari),
     "SuperSuit": Library(("supersuit==3.11.0", "stable-baselines3==2.9.2"), in_ci=True),
+    "MO-Gymnasium": Library(("mo-gymnasium==1.3.2", "stable-baselines3==2.9.2"), in_ci=True),
+    "MOMAland": Library(("momaland==0.2.0", "supersuit==3.11.0", "stable-baselines3==2.9.2")),
+    "morl-baselines": Library(("morl-baselines==1.3.0",)),
 }
 BRIEF = ("Tianshou", "AgileRL")  # run two iterations: too little to learn, so need not beat full braking
 
