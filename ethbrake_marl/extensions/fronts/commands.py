@@ -39,13 +39,14 @@ def front_command(
 
     Searches every world for the least weighted harm, for each set of weights, and drives the agents beside it. Writes
     front.json, front.png and, for three vehicles, front-ternary.png. The corners, where one vehicle counts first and
-    the others only between equals, are part of a grid.
+    the others only between equals, are part of a grid. Beside the front stand full braking, and maximin: the least harm
+    of whoever bears most.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
 
         from ethbrake_marl.extensions.fronts.figures import front_figures
-        from ethbrake_marl.extensions.fronts.front import search_front
+        from ethbrake_marl.extensions.fronts.front import least_largest, search_front
         from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
         from ethbrake_marl.extensions.fronts.weights import corners, parsed_weights, weight_grid
         from ethbrake_marl.extensions.report.style import picture_bytes
@@ -68,7 +69,9 @@ def front_command(
             chosen, sample.worlds, rows, harm_count=task.harm_count, budget=budget, threads=jobs or 1,
             agents=() if several else others, on_progress=lambda done, total: out.progress("front", done, total),
         )  # fmt: skip
-        found = front_results(front, chosen, sample, full_braking(chosen, sample), seed)
+        largest = least_largest(chosen, sample.worlds, front, budget=budget, threads=jobs or 1)
+        beside = {"full_brake": full_braking(chosen, sample), "maximin": largest}
+        found = front_results(front, chosen, sample, beside, seed)
         found |= {"budget": budget, "settings": list(settings or ())}
         out.write(output / "front.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
         for name, figure in front_figures(found).items():

@@ -95,14 +95,14 @@ def ternary_figure(found: Json) -> Figure:
 
 
 def _series(found: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
-    """Return name, mean harm [W, N] m2/s2 and style of the front, of full braking and of each agent."""
+    """Return name, mean harm [W, N] m2/s2 and style of the front, of what is shown beside it and of each agent."""
     count = found["harm_count"]
 
     def harm(points: Sequence[Mapping[str, Any]]) -> Floats:
         return np.array([[each["value"] for each in point["vehicles"][count]] for point in points])
 
-    braking = np.array([[each["value"] for each in found["full_brake"][count]]])
-    named = [("front", harm(found["points"])), ("full braking", braking)]
+    named = [("front", harm(found["points"]))]
+    named += [(name, harm([{"vehicles": vehicles}])) for name, vehicles in found["beside"].items()]
     named += [(name, np.unique(harm(points), axis=0)) for name, points in found["agents"].items()]
     styles = ({"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]} for k in range(len(named)))
     return [

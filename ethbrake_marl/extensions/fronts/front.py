@@ -19,6 +19,7 @@ from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.fronts.hypervolume import nondominated
 from ethbrake_marl.extensions.fronts.weights import checked_weights
 from ethbrake_marl.extensions.search.best_harm import (
+    best_harm,
     driven_profiles,
     joined,
     scripted_commands,
@@ -140,6 +141,31 @@ def search_front(
         profiles.append(Profiles(*(np.concatenate(each) for each in zip(*padded, strict=True))))
     driven = {name: _joined_borne([part.agents[name] for part in parts]) for name in parts[0].agents}
     return Front(weights, harm_count, _joined_borne([part.borne for part in parts]), tuple(profiles), driven)
+
+
+def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
+    """Return the harm of each vehicle where the harm of the one that bears most is least: count of harm -> [n, N] m2/s2.
+
+    It is searched like ``best_harm`` under the objective ``maximin``, and never worse by it than a point of the front.
+
+    Args:
+        scenario: the scenario of the worlds.
+        worlds: the worlds at t = 0, [n].
+        front: their front.
+        budget: candidates per world.
+        threads: number of threads.
+
+    """
+    count, task = front.harm_count, Task(scenario, scenario.learners, front.harm_count)
+    parts = []
+    for first in range(0, worlds.n, CHUNK):
+        some = worlds.take(np.arange(first, min(first + CHUNK, worlds.n)))
+        table = best_harm(scenario, some, counts=(count,), budget=budget, threads=threads, objective="maximin")
+        parts.append(task_problem(some, task).borne(table.best[count].profiles))
+    searched = {each: np.concatenate([part[each] for part in parts])[np.newaxis] for each in HARM_COUNTS}
+    every = {each: np.concatenate([searched[each], front.borne[each]]) for each in HARM_COUNTS}
+    chosen = every[count].max(axis=2).argmin(axis=0)
+    return {each: borne[chosen, np.arange(worlds.n)] for each, borne in every.items()}
 
 
 def _joined_borne(parts: Sequence[Borne]) -> Borne:

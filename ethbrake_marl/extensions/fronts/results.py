@@ -25,7 +25,9 @@ RESAMPLES = 200  # bootstrap samples of the worlds, for intervals of hypervolume
 Json = dict[str, Any]
 
 
-def front_results(front: Front, scenario: Scenario, sample: Sample, full_brake: Borne, seed: int | None) -> Json:
+def front_results(
+    front: Front, scenario: Scenario, sample: Sample, beside: Mapping[str, Borne], seed: int | None
+) -> Json:
     """Return the content of ``front.json``: the front, full braking, and the agents beside it.
 
     All means have 95 % intervals over worlds. An agent's ``ratio`` is its mean weighted harm divided by the front's;
@@ -35,7 +37,7 @@ def front_results(front: Front, scenario: Scenario, sample: Sample, full_brake: 
         front: the searched front.
         scenario: the scenario of its worlds.
         sample: its worlds.
-        full_brake: count of harm -> [n, N] harm of each vehicle if the learners brake fully.
+        beside: name -> harm of each vehicle, [n, N] by count of harm: ``full_brake``, and further ones to show.
         seed: seed of the list, or None.
 
     """
@@ -55,10 +57,10 @@ def front_results(front: Front, scenario: Scenario, sample: Sample, full_brake: 
         "episodes": len(sample.index),
         "harm_count": front.harm_count,
         "vehicles": list(scenario.vehicle_names),
-        "full_brake": _vehicles(full_brake),
+        "beside": {name: _vehicles(borne) for name, borne in beside.items()},
         "points": _points(front, front.borne),
         "agents": agents,
-        "hypervolume": hypervolumes(front, full_brake[front.harm_count]),
+        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count]),
         "scenario_sha256": scenario_sha256(scenario),
         "worlds_sha256": worlds_sha256(sample.worlds, sample.index),
         "versions": result_versions(),
@@ -154,9 +156,9 @@ def front_sheet(found: Json) -> Sheet:
         borne = [each["value"] for each in point["vehicles"][count]]
         sums = [sum(each["value"] for each in point["vehicles"][also]) for also in HARM_COUNTS]
         rows.append((told, *borne, *sums, *(points[k]["ratio"] for points in found["agents"].values())))
-    braking = found["full_brake"]
-    sums = [sum(each["value"] for each in braking[also]) for also in HARM_COUNTS]
-    rows.append(("full braking", *(each["value"] for each in braking[count]), *sums))
+    for name, braking in found["beside"].items():
+        sums = [sum(each["value"] for each in braking[also]) for also in HARM_COUNTS]
+        rows.append((name, *(each["value"] for each in braking[count]), *sums))
     words = {"first": "first-impact", "total": "total"}[count]
     note = (
         f"Mean {words} harm of each vehicle, and of the line by first and by all impacts, m2/s2. Agents: their weighted"

@@ -22,7 +22,7 @@ def test_front__writes_json_and_two_figures_and_prints_both_counts(ethbrake: Com
     for name in ("front.png", "front-ternary.png"):
         with Image.open(Path("out") / name) as picture:
             assert picture.width > 700
-    for words in ("0,1,0", "full braking", "First", "All", "e_v2x_bm", "Hypervolume"):
+    for words in ("0,1,0", "full_brake", "maximin", "First", "All", "e_v2x_bm", "Hypervolume"):
         assert words in answer.out
 
 

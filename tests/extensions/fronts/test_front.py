@@ -5,7 +5,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.fronts.front import Front, amounts_of, search_front
+from ethbrake_marl.extensions.fronts.front import Front, amounts_of, least_largest, search_front
 from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.shipped import best_known
@@ -68,6 +68,11 @@ def test_front__does_not_depend_on_the_other_worlds_or_threads(front: Front) -> 
 def test_nondominated__keeps_the_sum_of_each_world(front: Front) -> None:
     kept = front.nondominated()
     assert kept.shape == front.amounts.shape and kept[6].all()
+
+
+def test_maximin__is_at_least_as_good_for_whoever_bears_most_as_every_point(front: Front) -> None:
+    found = least_largest(PAPER, WORLDS, front, budget=300)["first"].max(axis=1)
+    assert (found <= front.borne["first"].max(axis=2).min(axis=0)).all()
 
 
 def test_team__has_a_front_but_no_agents() -> None:
