@@ -144,7 +144,7 @@ def search_front(
 
 
 def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
-    """Return the harm of each vehicle where the harm of the one that bears most is least: count of harm -> [n, N] m2/s2.
+    """Return the harm of each vehicle where whoever bears most bears least: count of harm -> [n, N] m2/s2.
 
     It is searched like ``best_harm`` under the objective ``maximin``, and never worse by it than a point of the front.
 
