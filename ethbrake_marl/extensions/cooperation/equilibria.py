@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.evaluation.statistics import relative_decrease
 from ethbrake_marl.extensions.search.best_harm import (
     CONSTANTS,
@@ -149,7 +149,8 @@ def find_equilibria(
         threads: number of threads.
 
     Raises ``InvalidInput`` for a scenario without learners, a script whose command is not fixed at the alert, an
-    objective that is no weighted sum of the vehicles' harm nor ``maximin``, and numbers out of range.
+    objective that is no weighted sum of the vehicles' harm nor ``maximin``, and numbers out of range; ``PhysicsError``
+    with the worlds in which a check of the physics failed.
 
     """
     check_whole_number("rounds", rounds, 1)
@@ -178,13 +179,16 @@ def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, eff
     for turn in range(rounds):
         part, mine = game.take(active), [each.take(active) for each in own]
         moved = np.zeros(len(active), np.bool_)
-        for c in range(len(mine)):
-            problem = part.alone(c, mine)
-            given = _beside(problem.constant(problem.even_grid(CONSTANTS)), mine[c])
-            new = search_profiles(problem, given, **{**effort, "seed": effort["seed"] + turn})[0]  # not the same draws
-            better = part.amount(c, [*mine[:c], new, *mine[c + 1 :]]) < part.amount(c, mine) - tolerance
-            mine[c].ends[better], mine[c].commands_mps2[better] = new.ends[better], new.commands_mps2[better]
-            moved |= better
+        with renumbered(active):
+            for c in range(len(mine)):
+                problem = part.alone(c, mine)
+                given = _beside(problem.constant(problem.even_grid(CONSTANTS)), mine[c])
+                new = search_profiles(problem, given, **{**effort, "seed": effort["seed"] + turn})[
+                    0
+                ]  # not the same draws
+                better = part.amount(c, [*mine[:c], new, *mine[c + 1 :]]) < part.amount(c, mine) - tolerance
+                mine[c].ends[better], mine[c].commands_mps2[better] = new.ends[better], new.commands_mps2[better]
+                moved |= better
         for each, now in zip(own, mine, strict=True):
             each.ends[active], each.commands_mps2[active] = now.ends, now.commands_mps2
         taken[active] += 1

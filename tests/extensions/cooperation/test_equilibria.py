@@ -6,16 +6,18 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.engine.profiles import ProfileProblem
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.cooperation import (
     Equilibrium,
     best_joint_harm,
     compare_starts,
+    equilibria,
     find_equilibria,
     price_of_anarchy,
 )
 from ethbrake_marl.extensions.search.best_harm import CONSTANTS, task_problem
-from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.extensions.search.problem import Found, search_profiles
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.game.objectives import aim_of, parse_objective
 from ethbrake_marl.physics.episode import CLOCK, Decisions
@@ -140,6 +142,24 @@ def test_selfish_ends__never_beat_the_joint_optimum_and_do_not_depend_on_other_w
     for end in ends.values():
         assert (end.borne["first"].sum(axis=1) >= joint.sum(axis=1)).all()
         assert (end.borne["first"].sum(axis=1) >= alone.sum(axis=1) - 0.02).all()
+
+
+def test_world_that_fails_in_a_later_round__is_named_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = eb.load_scenario("cooperation-4-all")
+    worlds = scenario.sample(12, 9).worlds
+    rounds = find_equilibria(scenario, worlds, budget=100, rounds=2)["braking"].rounds
+    worlds, first = worlds.take(np.argsort(rounds, kind="stable")), int((rounds == 1).sum())
+    assert 0 < first < 12  # of the worlds that are left in the second round
+
+    def failing(problem: ProfileProblem, *given: object, **options: object) -> Found:
+        if problem.n < 12:
+            raise PhysicsError({0: "planted"})
+        return search_profiles(problem, *given, **options)
+
+    monkeypatch.setattr(equilibria, "search_profiles", failing)
+    with pytest.raises(PhysicsError) as caught:
+        find_equilibria(scenario, worlds, budget=100, rounds=2)
+    assert caught.value.worlds == {first: "planted"}
 
 
 def ends_of(*borne: list[list[float]], converged: list[list[bool]]) -> dict[str, Equilibrium]:
