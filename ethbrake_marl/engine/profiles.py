@@ -20,7 +20,7 @@ from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.episode import CLOCK, LARGEST, WEIGHTED, WHOLE, Decisions, Episode, follow_whole
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import ROW, place_rates, rows_for
-from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s, Worlds
+from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s, Worlds, sum_rows
 
 MOST_PHASES = 12
 
@@ -142,6 +142,23 @@ class ProfileProblem(NamedTuple):
         """
         first, total = self.follow_pairs(profiles)
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
+
+    def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
+        """Return what a search minimises, for one profile per world, count of harm -> [n] m2/s2.
+
+        It is the harm of the line, the weighted sum of what its vehicles bear, or the largest weighted share. Raises
+        what ``follow`` raises.
+        """
+        if (self.clock[:, CLOCK.AIM] == WHOLE).all():
+            return dict(zip(HARM_COUNTS, self.follow(profiles), strict=True))
+        found: dict[HarmCount, Floats] = {}
+        for harm_count, pairs in zip(HARM_COUNTS, self.follow_pairs(profiles), strict=True):
+            shares = np.zeros(self.mass.shape)
+            shares[:, :-1] = self.weights[:, 0, :-1] * pairs
+            shares[:, 1:] += self.weights[:, 1, :-1] * pairs
+            largest = self.clock[:, CLOCK.AIM] == LARGEST
+            found[harm_count] = np.where(largest, shares.max(axis=1), sum_rows(shares))
+        return found
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
         """Return the harm that each vehicle bears under one profile per world, count of harm -> [n, N] m2/s2.
@@ -298,7 +315,7 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
     rows = np.ascontiguousarray(np.concatenate(parts, axis=1) + 0.0, "<f8")  # + 0.0 turns -0.0 into 0.0
     slow = worlds.vehicles.build_up  # other worlds keep the hashes of versions without build-up rates
     forces = np.concatenate(
-        [state[:, column.command : column.previous], params[:, column.brake_rate : column.own_latency]], 1
+        [state[:, column.command : column.previous], params[:, column.brake_rate : column.harm_weight]], 1
     )
     further = [forces[k].tobytes() if slow[k] else b"" for k in range(worlds.n)]
     for k in np.flatnonzero(worlds.vehicles.in_pieces):

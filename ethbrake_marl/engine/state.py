@@ -51,7 +51,9 @@ class State(NamedTuple):
     def ledger(self) -> Ledger:
         """Harm and number of impacts of the episodes so far, by pair of vehicles, as a copy."""
         packed, column = self.packed, self.packed.column
-        of_worlds = packed.params[:, column.mass : column.limit], packed.params[:, column.restitution]
+        params = packed.params
+        weight = params[:, column.harm_weight : column.own_latency]
+        of_worlds = params[:, column.mass : column.limit], params[:, column.restitution], weight
         return Ledger(*packed.ledger(), *(each.copy() for each in of_worlds))
 
     def copy(self) -> State:

@@ -26,6 +26,7 @@ _SYMBOLS = {
     "friction": ("friction", ""),
     "brake_rate_mps3": ("brake rate", "m/s³"),
     "release_rate_mps3": ("release rate", "m/s³"),
+    "harm_weight": ("weight of harm", ""),
 }
 
 _STAY = "\u00a0"  # a non-breaking space

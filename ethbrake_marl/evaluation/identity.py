@@ -82,15 +82,16 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 def _arrays(value: Any) -> dict[str, np.ndarray]:
     """Return the arrays of the dataclass ``value`` and of the dataclasses inside it, by name.
 
-    Arrays that say nothing are omitted: those of messages and braking profiles if the worlds have none, and build-up
-    rates of brakes that are all infinite.
+    Arrays that say nothing are omitted: those of messages and braking profiles if the worlds have none, build-up rates
+    of brakes that are all infinite, and weights of harm that are all 1.
     """
     found: dict[str, np.ndarray] = {}
+    usual = {"brake_rate_mps3": np.inf, "release_rate_mps3": np.inf, "harm_weight": 1.0}
     for field in fields(value):
         part = getattr(value, field.name)
         if is_dataclass(part):
             found |= _arrays(part)
-        elif 0 not in part.shape[1:] and not (field.name.endswith("_rate_mps3") and np.isinf(part).all()):
+        elif 0 not in part.shape[1:] and not (field.name in usual and (part == usual[field.name]).all()):
             found[field.name] = part
     return found
 

@@ -211,6 +211,15 @@ def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> 
     return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
 
 
+def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
+    """Return the weight of the neighbour's harm in the objective ``preference``, as a share of the line's, [n].
+
+    Both vehicles are indices from 0; ``neighbour`` None: the weight of ``vehicle`` itself.
+    """
+    weight = worlds.vehicles.harm_weight
+    return weight[:, vehicle if neighbour is None else neighbour] / weight.sum(axis=1)
+
+
 def place(worlds: Worlds, vehicle: int) -> Floats:
     """Return the number of vehicles ahead of ``vehicle`` (index from 0) in the line, [n].
 
@@ -272,6 +281,21 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
     ),
     "own_release_time": _single(
         "own_release_time", 4.0, release_time, "own", "time in which own full brakes are released; 0: at once"
+    ),
+    "harm_weight": RegisteredFeature(
+        Feature("harm_weight", "1", 1.0, 0.0, 1.0, "weight of its harm in objective: preference, share of all weights"),
+        harm_weight,
+        "neighbour",
+        0.0,
+        (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0),
+        (),
+    ),
+    "own_harm_weight": RegisteredFeature(
+        Feature("own_harm_weight", "1", 1.0, 0.0, 1.0, "weight of own harm there, share of all weights"),
+        harm_weight,
+        "own",
+        0.0,
+        (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0),
     ),
     "place": RegisteredFeature(
         Feature("place", "1", 1.0, 0.0, 63.0, "how many vehicles are ahead in the line"),

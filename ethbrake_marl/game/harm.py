@@ -46,6 +46,7 @@ class Ledger:
     obstacle_count: Ints  # [n] number of impacts with the obstacle
     mass_t: Floats  # [n, N] mass of each vehicle (t)
     restitution: Floats  # [n] coefficient of restitution
+    harm_weight: Floats  # [n, N] weight of each vehicle's harm in the objective ``preference``
 
     def __repr__(self) -> str:
         return (
@@ -63,6 +64,7 @@ class Ledger:
             self.obstacle_count + impacts.obstacle_count,
             self.mass_t,
             self.restitution,
+            self.harm_weight,
         )
 
     def since(self, before: Ledger) -> Ledger:
@@ -71,7 +73,7 @@ class Ledger:
         The difference is exact to the last rounding. Raises ``InvalidInput`` if ``before`` has another shape or more
         impacts, for example because a row holds a new episode.
         """
-        names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution")]
+        names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution", "harm_weight")]
         if before.count.shape != self.count.shape or (before.count > self.count).any():
             raise InvalidInput("since: these are not the same worlds; ask before a row is renewed")
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
@@ -161,7 +163,7 @@ def empty_ledger(worlds: Worlds) -> Ledger:
     """Return the ledger of ``worlds`` at the alert (time 0), without harm."""
     shape = worlds.gaps_m.shape
     pairs = np.zeros(shape), np.zeros(shape), np.zeros(shape, np.int64)
-    of_worlds = worlds.vehicles.mass_t, worlds.vehicles.restitution
+    of_worlds = worlds.vehicles.mass_t, worlds.vehicles.restitution, worlds.vehicles.harm_weight
     return Ledger(*pairs, *Impacts.no_obstacle(worlds.n), *of_worlds)
 
 

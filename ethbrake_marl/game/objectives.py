@@ -10,7 +10,8 @@ social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientat
                     over 45 (prosocial) to 90 degrees (the others' only)
 maximin             ``max_j H_j``: the harm of the vehicle that bears most
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
-weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (1e-6 to 1e6) per vehicle, for example its occupants
+weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (at most 1e6) per vehicle, for example its occupants
+preference          the same, with the weights ``harm_weight`` that the scenario gives or draws for each world
 injury:curve        injuries in 1,000 lines, by the pair that injures a vehicle more (``Ledger.speed_changes``)
 ==================  ================================================================================================
 """
@@ -22,7 +23,7 @@ import re
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -56,6 +57,19 @@ class HarmSoFar(NamedTuple):
     mass_t: Floats  # [n, N] mass of each vehicle, t
     front_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts in front, m/s; 0: not hit there
     rear_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts at the rear, m/s; 0: not hit there
+    harm_weight: Floats  # [n, N] weight of each vehicle's harm in the objective ``preference``
+
+
+class Weighed(Protocol):
+    """What an objective may weigh the vehicles of n lines by; a ``Ledger`` and ``Vehicles`` have it."""
+
+    @property
+    def mass_t(self) -> Floats:
+        """Mass of each vehicle, [n, N] t."""
+
+    @property
+    def harm_weight(self) -> Floats:
+        """Weight of each vehicle's harm in the objective ``preference``, [n, N]."""
 
 
 ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
@@ -68,15 +82,15 @@ class Kind(NamedTuple):
     about: str  # what it means, in words
     amount: Callable[[Objective, HarmSoFar, int], Floats]  # (objective, harm, vehicle) -> amount [n]: less is better
     function: ObjectiveFunction | None = None  # the function of a registered objective
-    weights: Callable[[Objective, Floats, int], Floats] | None = None  # (objective, masses [n, N] t, vehicle) -> [n, N]
+    weights: Callable[[Objective, Weighed, int], Floats] | None = None  # (objective, line, vehicle) -> [n, N]
 
 
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
     """Parse the text of an objective: ``total``, ``own``, ``social:45``, ``weighted:1,4,1``, ``injury:lr4s``, ...
 
-    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [1e-6, 1e6], or an
-    unknown curve.
+    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [0, 1e6], weights
+    that are all 0, or an unknown curve.
     """
     kind, colon, argument = text.partition(":")
     if ":" not in OBJECTIVES[kind].form:
@@ -93,9 +107,10 @@ def parse_objective(text: str) -> Objective:
         if len(numbers) != 1 or not 0.0 <= numbers[0] <= 90.0:
             raise InvalidInput(f"objective {text!r}: social needs an angle from 0 to 90 degrees, as in social:45")
         return Objective(kind, angle_deg=numbers[0])
-    if not numbers or not all(1e-6 <= weight <= 1e6 for weight in numbers):
+    if not (any(numbers) and all(0.0 <= weight <= 1e6 for weight in numbers)):
         raise InvalidInput(
-            f"objective {text!r}: weighted needs a weight from 1e-6 to 1e6 for each vehicle, as in weighted:1,4,1"
+            f"objective {text!r}: weighted needs a weight from 0 to 1e6 for each vehicle, not 0 for all, as in"
+            " weighted:1,4,1"
         )
     return Objective(kind, weights=numbers)
 
@@ -141,7 +156,9 @@ def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[O
 
     """
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
-    told = *harms, ledger.mass_t, *ledger.speed_changes(harm_count)
+    no_sums = any(OBJECTIVES[each.kind].weights is None for each in objectives)  # only these may read changes of speed
+    changes = ledger.speed_changes(harm_count) if no_sums else 2 * (np.full(ledger.mass_t.shape, np.nan),)
+    told = *harms, ledger.mass_t, *changes, ledger.harm_weight
     harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only views
     return np.stack([OBJECTIVES[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
@@ -167,12 +184,12 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
     return np.where(sums, found, whole)
 
 
-def aim_of(objective: Objective, mass_t: Floats, vehicle: int) -> tuple[Floats, bool]:
+def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, bool]:
     """Return the weights of the vehicles' harm in an objective, [n, N], and whether the largest counts, not the sum.
 
     Args:
         objective: the objective.
-        mass_t: [n, N] mass of each vehicle, t.
+        line: ``Vehicles`` or ledger of n lines of N vehicles.
         vehicle: index of the vehicle whose objective it is (0 = front).
 
     Raises ``InvalidInput`` for an objective that is neither, such as ``injury``.
@@ -180,11 +197,11 @@ def aim_of(objective: Objective, mass_t: Floats, vehicle: int) -> tuple[Floats, 
     """
     weights = OBJECTIVES[objective.kind].weights
     if objective.kind == "maximin":
-        return np.ones(mass_t.shape), True
+        return np.ones(line.mass_t.shape), True
     if weights is None:
         known = ", ".join(kind.form for kind in _BUILT_IN.values() if kind.weights) + ", maximin"
         raise InvalidInput(f"objective {objective.kind!r}: is no weighted sum of the vehicles' harm; known: {known}")
-    return np.broadcast_to(weights(objective, mass_t, vehicle), mass_t.shape).astype(np.float64), False
+    return np.broadcast_to(weights(objective, line, vehicle), line.mass_t.shape).astype(np.float64), False
 
 
 def standard_objectives() -> tuple[str, ...]:
@@ -314,7 +331,7 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     return injured
 
 
-def _weighted(borne: Floats, weights: Floats) -> Floats:
+def weighted_harm(borne: Floats, weights: Floats) -> Floats:
     """Return ``N sum_j w_j H_j / sum_j w_j``, [n], summed front to rear: the same bits in any batch.
 
     ``borne``: harm H_j of each vehicle, [n, N] m2/s2; ``weights``: w_j, [n, N].
@@ -328,41 +345,50 @@ def _weighted(borne: Floats, weights: Floats) -> Floats:
     return mean
 
 
+def _shares(weights: Floats) -> Floats:
+    """Return weights [n, N] as multiples of their mean."""
+    return weights * (weights.shape[1] / weights.sum(axis=1, keepdims=True))
+
+
 _BUILT_IN: dict[str, Kind] = {
     "total": Kind(
         "total",
         "everybody's harm alike",
         lambda _, harm, vehicle: harm.whole,
-        weights=lambda _, mass_t, vehicle: np.ones(mass_t.shape[1]),
+        weights=lambda _, line, vehicle: np.ones(line.mass_t.shape[1]),
     ),
     "own": Kind(
         "own",
         "what the vehicle itself bears",
         lambda _, harm, vehicle: harm.borne[:, vehicle],
-        weights=lambda _, mass_t, vehicle: np.eye(mass_t.shape[1])[vehicle],
+        weights=lambda _, line, vehicle: np.eye(line.mass_t.shape[1])[vehicle],
     ),
     "social": Kind(
         "social:ANGLE",
         "social value orientation: own harm at 0, the others' at 90 degrees",
         _social,
-        weights=lambda objective, mass_t, vehicle: np.where(
-            np.eye(mass_t.shape[1])[vehicle], *_social_weights(objective.angle_deg)
+        weights=lambda objective, line, vehicle: np.where(
+            np.eye(line.mass_t.shape[1])[vehicle], *_social_weights(objective.angle_deg)
         ),
     ),
     "maximin": Kind("maximin", "the harm of whoever bears most", lambda _, harm, vehicle: harm.borne.max(axis=1)),
     "mass-weighted": Kind(
         "mass-weighted",
         "harm in a heavy vehicle counts for more",
-        lambda _, harm, vehicle: _weighted(harm.borne, harm.mass_t),
-        weights=lambda _, mass_t, vehicle: mass_t * (mass_t.shape[1] / mass_t.sum(axis=1, keepdims=True)),
+        lambda _, harm, vehicle: weighted_harm(harm.borne, harm.mass_t),
+        weights=lambda _, line, vehicle: _shares(line.mass_t),
     ),
     "weighted": Kind(
         "weighted:W1,W2,...",
         "one weight for each vehicle",
-        lambda objective, harm, vehicle: _weighted(harm.borne, np.full(harm.borne.shape, objective.weights)),
-        weights=lambda objective, mass_t, vehicle: (
-            np.array(objective.weights) * (mass_t.shape[1] / sum(objective.weights))
-        ),
+        lambda objective, harm, vehicle: weighted_harm(harm.borne, np.full(harm.borne.shape, objective.weights)),
+        weights=lambda objective, line, vehicle: _shares(np.array([objective.weights])),
+    ),
+    "preference": Kind(
+        "preference",
+        "the weights harm_weight of each world",
+        lambda _, harm, vehicle: weighted_harm(harm.borne, harm.harm_weight),
+        weights=lambda _, line, vehicle: _shares(line.harm_weight),
     ),
     "injury": Kind("injury:CURVE", "injuries in 1,000 lines, by the impact that injures a vehicle more", _injured),
 }

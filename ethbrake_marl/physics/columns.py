@@ -44,6 +44,7 @@ class Columns(NamedTuple):
     limit: int  # N columns, speed up to which a vehicle drives (m/s)
     brake_rate: int  # N columns, rate at which the acceleration in force falls (m/s3)
     release_rate: int  # N columns, rate at which it rises (m/s3)
+    harm_weight: int  # N columns, weight of the vehicle's harm in the objective ``preference``
     own_latency: int  # N columns, part of the latency without the channel (s); if absent, the row's width
     news: int  # N * N columns, time from which vehicle i acts on news of vehicle j (s)
     messages: int  # M columns, ``physics.messages``; if absent, the row's width
@@ -54,10 +55,11 @@ OBSTACLE_WIDTH = 5
 
 def _columns_of(vehicles: int) -> Columns:
     N, P = vehicles, vehicles - 1
-    gap, news = 1 + 3 * N, 1 + 8 * N
+    gap, news = 1 + 3 * N, 1 + 9 * N
     return Columns(
         N, 0, 1, 1 + N, 1 + 2 * N, gap, gap + P, gap + 2 * P, gap + 5 * P,
-        0, 1, 1 + N, 1 + 2 * N, 1 + 3 * N, 1 + 4 * N, 1 + 5 * N, 1 + 6 * N, 1 + 7 * N, news, news + N * N,
+        0, 1, 1 + N, 1 + 2 * N, 1 + 3 * N, 1 + 4 * N, 1 + 5 * N, 1 + 6 * N, 1 + 7 * N, 1 + 8 * N, news,
+        news + N * N,
     )  # fmt: skip
 
 
@@ -77,7 +79,7 @@ class Packed(NamedTuple):
 
     state: Floats  # [n, S] what changes during an episode; columns ``time`` to ``obstacle`` of ``Columns``
     # parameters of the vehicles and state of the messages; columns ``restitution`` to ``messages`` of ``Columns``:
-    # [n, 1 + 7 N]; with news by link [n, 1 + 8 N + N * N]; with M columns of messages [n, 1 + 8 N + N * N + M]
+    # [n, 1 + 8 N]; with news by link [n, 1 + 9 N + N * N]; with M columns of messages [n, 1 + 9 N + N * N + M]
     params: Floats
 
     @classmethod
@@ -95,7 +97,7 @@ class Packed(NamedTuple):
         ]  # fmt: skip
         params = [
             v.restitution[:, np.newaxis], v.braking_capacity_mps2, v.driving_capacity_mps2, v.latency_s, v.mass_t,
-            v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3,
+            v.speed_limit_mps, v.brake_rate_mps3, v.release_rate_mps3, v.harm_weight,
         ]  # fmt: skip
         if not v.is_known_at_once or worlds.messages.shape[1] > 0:
             params += [v.own_latency_s, v.known_from_s.reshape(n, N * N), worlds.messages]
@@ -127,7 +129,7 @@ class Packed(NamedTuple):
     def builds_up(self) -> bool:
         """Whether the brakes of some vehicle build up, that is, at a finite rate."""
         column = self.column
-        return bool(np.isfinite(self.params[:, column.brake_rate : column.own_latency]).any())
+        return bool(np.isfinite(self.params[:, column.brake_rate : column.harm_weight]).any())
 
     def widened(self, obstacle: bool, news: bool) -> Packed:
         """Return the rows with columns for an obstacle, and for news by link, if requested and not there yet.
@@ -171,17 +173,21 @@ class Packed(NamedTuple):
         params, column = self.params, self.column
         ends = (
             column.braking, column.driving, column.latency, column.mass, column.limit, column.brake_rate,
-            column.release_rate, column.own_latency,
+            column.release_rate, column.harm_weight, column.own_latency,
         )  # fmt: skip
-        braking, driving, latency, mass, limit, *rates = (params[:, begin:end].copy() for begin, end in pairwise(ends))
+        braking, driving, latency, mass, limit, *rates, weight = (
+            params[:, begin:end].copy() for begin, end in pairwise(ends)
+        )
         restitution = params[:, column.restitution].copy()
         if not self.has_news:
-            return Vehicles.at_once(braking, driving, latency, mass, limit, restitution, *rates)
+            return Vehicles.at_once(braking, driving, latency, mass, limit, restitution, *rates, harm_weight=weight)
         own = params[:, column.own_latency : column.news].copy()
         brake_rate, release_rate = rates
         known = self.known_from_s
         none = np.zeros((*latency.shape, 0))
-        return Vehicles(braking, driving, latency, mass, limit, restitution, brake_rate, release_rate, none, own, known)
+        return Vehicles(
+            braking, driving, latency, mass, limit, restitution, brake_rate, release_rate, none, weight, own, known
+        )
 
     @property
     def known_from_s(self) -> Floats:

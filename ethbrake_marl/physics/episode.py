@@ -222,19 +222,20 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 
 @compiled
-def value_of(table: Floats, clock: Floats) -> float:
+def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -> float:
     """Return the number that a search minimises (m2/s2), which never falls while an episode goes on.
 
     It is the harm of the line, the weighted sum of what its vehicles bear, or the largest weighted share, plus
-    ``OTHER_WEIGHT`` times the line's harm in the other count, which only decides between equals.
+    ``other_weight`` times the line's harm in the other count, which only decides between equals.
 
     Args:
         table: one world in the layout of ``physics.rows``, with its rows of an episode.
         clock: [CLOCK.WIDTH] settings: ``HARM_IS_TOTAL`` chooses the count, ``AIM`` whose harm.
+        other_weight: weight of the line's harm in the other count.
 
     """
     total, aim = clock[CLOCK.HARM_IS_TOTAL], clock[CLOCK.AIM]
-    other = OTHER_WEIGHT * harm_so_far(table, 1.0 - total)
+    other = other_weight * harm_so_far(table, 1.0 - total)
     if aim == WHOLE:
         return harm_so_far(table, total) + other
     row = ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM

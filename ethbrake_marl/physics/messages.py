@@ -520,7 +520,7 @@ def _move(
         table[ROW.ONSET, i + 1] = onset_s(params[latency + i], time)
     place_forces(
         table, state[command : command + N], params[column.brake_rate : column.release_rate],
-        params[column.release_rate : column.own_latency], pieces,
+        params[column.release_rate : column.harm_weight], pieces,
     )  # fmt: skip
     for p in range(N - 1):
         table[ROW.GAP, p + 1] = state[gap + p]

@@ -65,6 +65,7 @@ class Vehicles:
     # [n, N, 2 K] braking in pieces: start of each of K pieces (s after the latency; infinite: none), then their
     # commands (m/s2), which replace every other command; [n, N, 0]: no vehicle brakes in pieces
     pieces: Floats
+    harm_weight: Floats  # [n, N] >= 0, weight of the harm that a vehicle bears in the objective ``preference``
     own_latency_s: Floats  # [n, N] part of the latency without the channel; messages report this part
     # [n, N, N] time from which vehicle i acts on news of vehicle j; infinite: never. At least latency_s of vehicle i,
     # and equal to it for i = j. Without a channel this and own_latency_s share the memory of latency_s
@@ -91,12 +92,13 @@ class Vehicles:
         brake_rate_mps3: Floats | None = None,
         release_rate_mps3: Floats | None = None,
         pieces: Floats | None = None,
+        harm_weight: Floats | None = None,
     ) -> Vehicles:
         """Return vehicles without a channel: each has only its own latency and knows everything from then on.
 
         Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
         ``restitution`` is [n], rates are [n, N]. Rates None: a command takes full effect at once. ``pieces`` None: no
-        vehicle follows a fixed sequence of commands.
+        vehicle follows a fixed sequence of commands. ``harm_weight`` None: everybody's harm weighs 1.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
@@ -104,7 +106,8 @@ class Vehicles:
             braking_mps2, driving_mps2, latency_s, mass_t, limit_mps, restitution,
             at_once if brake_rate_mps3 is None else brake_rate_mps3,
             at_once if release_rate_mps3 is None else release_rate_mps3,
-            np.zeros((*mass_t.shape, 0)) if pieces is None else pieces, latency_s, known,
+            np.zeros((*mass_t.shape, 0)) if pieces is None else pieces,
+            np.ones(mass_t.shape) if harm_weight is None else harm_weight, latency_s, known,
         )  # fmt: skip
 
     @staticmethod
@@ -542,6 +545,7 @@ def make_worlds(
     release_rate_mps3: ArrayLike = np.inf,
     obstacle_gap_m: ArrayLike | None = None,
     friction: ArrayLike | None = None,
+    harm_weight: ArrayLike = 1.0,
 ) -> Worlds:
     """Build and check worlds at ``t = 0``; every parameter broadcasts to its full shape.
 
@@ -560,6 +564,8 @@ def make_worlds(
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
         friction: friction of the road, broadcast to [n]; it limits capacities to ``friction * GRAVITY_MPS2``. None: no
             limit.
+        harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0 and not 0 for all
+            vehicles of a world, broadcast to [n, N].
 
     Raises ``InvalidInput`` with the field, the first invalid entry and the valid range.
 
@@ -580,7 +586,11 @@ def make_worlds(
         restitution_,
         _full("brake_rate_mps3", brake_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
         _full("release_rate_mps3", release_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
+        harm_weight=_full("harm_weight", harm_weight, (n, N), 0.0, np.inf),
     )
+    nobody = ~(vehicles.harm_weight > 0.0).any(axis=1)
+    if nobody.any():
+        raise InvalidInput(f"harm_weight[{int(np.argmax(nobody))}]: is 0 for all vehicles; must be above 0 for one")
     speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
     if not np.all(speeds <= vehicles.speed_limit_mps):
         world, vehicle = np.argwhere(~(speeds <= vehicles.speed_limit_mps))[0]

@@ -93,6 +93,7 @@ class ScenarioFields(FileModel):
     release_rate_mps3: PerVehicle | None = Field(
         default=None, exclude_if=not_, description=MEANING["release_rate_mps3"]
     )
+    harm_weight: PerVehicle | None = Field(default=None, exclude_if=not_, description=MEANING["harm_weight"])
     alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=MEANING["alert_s"])
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"

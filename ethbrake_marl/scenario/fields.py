@@ -25,7 +25,7 @@ LATER_LOSSES = (5,)  # stream of each world's key, the seed of its later message
 
 SURROUNDINGS = (6,)  # stream of friction, the row of the table, and the time before the alert
 
-BRAKES = (7,)  # stream of brake and release rates, BLOCK numbers per vehicle
+BRAKES = (7,)  # stream of brake and release rates and of weights of harm, BLOCK numbers per vehicle
 
 OF_WORLD = 4  # numbers per world in the streams OBSTACLE, MIXTURE, LATER_LOSSES and SURROUNDINGS
 
@@ -128,9 +128,11 @@ class Quantities(NamedTuple):
     def of(self, worlds: Worlds) -> dict[str, QuantityRule]:
         """Return key -> rule of the quantities that ``worlds`` have; friction only if all worlds have it.
 
-        The distance to an obstacle and the brake rates are included if some world has them.
+        The distance to an obstacle and the brake rates are included if some world has them, and the weights of harm if
+        one of them is not 1.
         """
         there = {"obstacle_gap_m": worlds.obstacle_ahead.any(), "friction": np.isfinite(worlds.friction).all()}
+        there["harm_weight"] = (worlds.vehicles.harm_weight != 1.0).any()
         there |= {key: np.isfinite(getattr(worlds.vehicles, key)).any() for key in self.optional if key not in there}
         return self.usual | {key: rule for key, rule in self.optional.items() if there[key]}
 
@@ -230,6 +232,11 @@ _OPTIONAL = _by_name(
         "how fast it falls again, and driving builds up; without it at once", "25",
         stream=BRAKES,
     ),
+    QuantityRule(
+        "harm_weight", "", "vehicle", 1e6, False, 2, "harm_weight_{}",
+        "weight of the harm that each vehicle bears, for objective: preference; without it 1", "[1, 4, 1]",
+        stream=BRAKES,
+    ),
 )  # fmt: skip
 
 QUANTITY = Quantities(
@@ -243,7 +250,12 @@ QUANTITY = Quantities(
     declared={**_USUAL, **_OTHERWISE, **_OPTIONAL},
 )  # fmt: skip
 
-ALSO = ("friction", "brake_rate_mps3", "release_rate_mps3")  # optional quantities that are independent of all others
+ALSO = (
+    "friction",
+    "brake_rate_mps3",
+    "release_rate_mps3",
+    "harm_weight",
+)  # optional quantities that are independent of all others
 
 MEANING = {key: rule.meaning for key, rule in QUANTITY.declared.items()}
 

@@ -113,15 +113,13 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "objective 'social:91': social needs an angle from 0 to 90 degrees": lambda: PAPER.replace(objective="social:91"),
     "objective 'social:nan': social needs an angle": lambda: PAPER.replace(objective="social:nan"),
     "objective 'social:4_5': social needs an angle": lambda: PAPER.replace(objective="social:4_5"),
-    "'weighted:1,0,1': weighted needs a weight from 1e-6 to 1e6 for each vehicle": lambda: PAPER.replace(
-        objective="weighted:1,0,1"
+    "'weighted:0,0,0': weighted needs a weight from 0 to 1e6 for each vehicle, not 0 for all": lambda: PAPER.replace(
+        objective="weighted:0,0,0"
     ),
-    "'weighted:1,1e-7,1': weighted needs a weight from 1e-6 to 1e6 for each vehicle": lambda: PAPER.replace(
-        objective="weighted:1,1e-7,1"
+    "'weighted:1,-1,1': weighted needs a weight from 0 to 1e6 for each vehicle": lambda: PAPER.replace(
+        objective="weighted:1,-1,1"
     ),
-    "'weighted': weighted needs a weight from 1e-6 to 1e6 for each vehicle": lambda: PAPER.replace(
-        objective="weighted"
-    ),
+    "'weighted': weighted needs a weight from 0 to 1e6 for each vehicle": lambda: PAPER.replace(objective="weighted"),
     "scenario 'paper-random': objective = \"weighted:1,2\": objective 'weighted:1,2': 2 weights; 3": lambda: (
         PAPER.replace(objective="weighted:1,2")
     ),
@@ -205,8 +203,8 @@ def test_branch__has_an_end_and_no_shaping() -> None:
 
 def test_snapshot__of_another_engine_is_refused() -> None:
     kept = make_engine(PAPER, 6).snapshot()
-    with refused("engine snapshot: params is (6, 22); (6, 34) is needed"):
+    with refused("engine snapshot: params is (6, 25); (6, 37) is needed"):
         make_engine(load_scenario("cooperation-2-blocked"), 6).restore(kept)
     del kept["params"]
-    with refused("engine snapshot: params is nothing; (6, 22) is needed"):
+    with refused("engine snapshot: params is nothing; (6, 25) is needed"):
         make_engine(PAPER, 6).restore(kept)

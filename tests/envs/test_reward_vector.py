@@ -120,12 +120,13 @@ def test_number__where_a_vector_is_asked_for() -> None:
         env.step(np.zeros(1))
 
 
-@pytest.mark.parametrize("text", ["total", "own", "social:30", "mass-weighted", "weighted:1,4,2"])
+@pytest.mark.parametrize("text", ["total", "own", "social:30", "mass-weighted", "weighted:1,4,0", "preference"])
 def test_weights__of_an_objective_give_its_amount(text: str) -> None:
-    borne, mass = np.array([[3.0, 5.0, 7.0]]), np.array([[4.5, 5.5, 5.9]])
-    harm = HarmSoFar(borne, borne.sum(axis=1), mass, borne, borne)
+    line = eb.load_scenario("paper-random").replace(harm_weight=[1, 0, 3]).sample(1, 0).worlds.vehicles
+    borne = np.array([[3.0, 5.0, 7.0]])
+    harm = HarmSoFar(borne, borne.sum(axis=1), line.mass_t, borne, borne, line.harm_weight)
     objective = parse_objective(text)
     for vehicle in range(3):
         kind = OBJECTIVES[objective.kind]
-        weights = kind.weights(objective, mass, vehicle)
+        weights = kind.weights(objective, line, vehicle)
         assert (weights * borne).sum() == pytest.approx(kind.amount(objective, harm, vehicle)[0])

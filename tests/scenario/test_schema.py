@@ -89,7 +89,7 @@ def not_used(scenario: eb.Scenario) -> set[str]:
     speeds |= {"speed_deviations_mps"} if scenario.line_speed_mps is None else set()
     obstacle = {key for key in ("obstacle_gap_m", "obstacle_margin_m") if getattr(scenario, key) is None}
     chosen = ("observation", "vehicle_types", "types", "mixture", "table", "friction", "alert_s", *QUANTITY.needed)
-    chosen = (*chosen, "brake_rate_mps3", "release_rate_mps3")
+    chosen = (*chosen, "brake_rate_mps3", "release_rate_mps3", "harm_weight")
     return {*gaps, *speeds, *obstacle, *(key for key in chosen if getattr(scenario, key) is None)}
 
 

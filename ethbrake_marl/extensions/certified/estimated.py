@@ -245,7 +245,7 @@ class Ranges:
         )
         vehicles = Vehicles.at_once(
             of["braking_capacity_mps2"], of["driving_capacity_mps2"], latency, of["mass_t"], of["speed_limit_mps"],
-            v.restitution,
+            v.restitution, harm_weight=v.harm_weight,
         )  # fmt: skip
         place = np.where(told.known, told.place_m, self.at(share, "place") - way_m[:, np.newaxis])
         speed = np.maximum(np.where(told.known, told.speed_mps, self.at(share, "speeds_mps")), 0.0)

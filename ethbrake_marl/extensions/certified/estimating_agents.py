@@ -150,7 +150,7 @@ class BelievingHybrid(Believing):
         latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
         vehicles = Vehicles.at_once(
             v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution,
-            v.brake_rate_mps3, v.release_rate_mps3,
+            v.brake_rate_mps3, v.release_rate_mps3, harm_weight=v.harm_weight,
         )  # fmt: skip
         return replace(
             believed, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(believed.pair_hit),

@@ -14,6 +14,7 @@ import numpy as np
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.game.harm import HarmCount
+from ethbrake_marl.game.objectives import objective_harm, objectives_of
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.columns import columns
 from ethbrake_marl.physics.jit import compiled
@@ -162,6 +163,18 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
                 known = column.latency <= c < column.mass or (by_link and c >= column.news)
                 same = same and (not known or params[k, c] < before[m, column.time] or np.isinf(params[k, c]))
         stands[m] = same
+
+
+def counted_harm(engine: Engine, count: HarmCount) -> Floats:
+    """Return the harm so far that each learner of an engine minimises, [n, L] m2/s2: its objective, if it has one.
+
+    ``count``: each pair's ``first`` impact, or ``total``.
+    """
+    declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
+    if declared is None:
+        return np.broadcast_to(engine.ledger.world_harm(count)[:, np.newaxis], shape)
+    found = objective_harm(engine.ledger, count, objectives_of(declared, engine.scenario.vehicles))
+    return found[:, list(engine.learners)]
 
 
 def other_count(count: HarmCount) -> HarmCount:

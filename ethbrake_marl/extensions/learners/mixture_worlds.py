@@ -14,8 +14,9 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.extensions.learners.branches import Act, Offsets, play_on, play_to_the_end
+from ethbrake_marl.extensions.learners.branches import Act, Offsets, counted_harm, play_on, play_to_the_end
 from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.search.problem import minimising
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HarmCount
@@ -72,13 +73,14 @@ def drive_from(
         gamma: discount of one time step.
         count: impacts that the harm counts; None: as the reward does.
 
-    Returns the first learner's return [n] (NaN for a row that could not be advanced), and the harm [n] (m2/s2).
+    Returns the first learner's return [n] (NaN for a row that could not be advanced), and the harm [n] (m2/s2) by its
+    objective.
 
     """
     rows = engine.branch(start)
     nowhere = np.zeros(rows.n, np.int64)
     gained, _ = play_to_the_end(rows, act, Offsets(nowhere, np.zeros(rows.n), nowhere), gamma)
-    return gained, rows.ledger.world_harm(engine.reward.harm_count if count is None else count)
+    return gained, counted_harm(rows, engine.reward.harm_count if count is None else count)[:, 0]
 
 
 def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
@@ -103,6 +105,7 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
         time_step_s=engine.scenario.time_step_s,
         others_mps2=found.start.wanted,
     )
+    problem = minimising(problem, found.alert, engine.reward.objective or "total", [vehicle])
     commands, steps = best_templates(problem, found.harm, number=plan.templates, seed=seed)
     rows = np.flatnonzero(steps > 0)
     worlds = found.alert.take(rows).vehicles

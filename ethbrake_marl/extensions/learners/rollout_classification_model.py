@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, play_on
+from ethbrake_marl.extensions.learners.branches import counted_harm, moving_rows, other_count, play_on
 from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.rollout_classification_actor import ChoosingActor
 from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
@@ -127,11 +127,11 @@ class OptionsModel(CounterfactualModel):
 
         engine = self.engine.branch(moments.take(rows[row] // learners))
         other = other_count(engine.reward.harm_count)
-        before = engine.ledger.world_harm(other)
+        before = counted_harm(engine, other)
         gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
         found = -gained[np.arange(len(row)), learner]
         if recipe.tie_break:
-            found += recipe.tie_break * (engine.ledger.world_harm(other) - before)
+            found += recipe.tie_break * (counted_harm(engine, other) - before)[np.arange(len(row)), learner]
         costs = found[back].reshape(tried.shape)
         if recipe.caution:
             done = 1.0 - self._current_progress_remaining

@@ -22,9 +22,10 @@ from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles,
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, PhysicsError, check_one_learner
 from ethbrake_marl.extensions.proofs.ramped_meetings import onset_states
 from ethbrake_marl.extensions.search.extreme_profiles import extreme_profiles
-from ethbrake_marl.extensions.search.problem import Found, search_profiles
-from ethbrake_marl.extensions.search.tables import COUNTS, LEFT_OUT, LOWERED, BestHarmTable, BestKnown
+from ethbrake_marl.extensions.search.problem import Found, minimising, search_profiles
+from ethbrake_marl.extensions.search.tables import COUNTS, LEFT_OUT, LOWERED, OBJECTIVE, BestHarmTable, BestKnown
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.game.objectives import Declared
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.left_out import leaving_out_failed
@@ -52,6 +53,7 @@ def best_harm(
     seed: int = 0,
     threads: int | None = None,
     known: BestHarmTable | None = None,
+    objective: Declared = "total",
 ) -> BestHarmTable:
     """Search every world for the command profiles of least harm, once per harm count; return them as a table.
 
@@ -70,13 +72,15 @@ def best_harm(
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
         known: a table for these vehicles, whose profiles the search starts with; None: no table.
+        objective: whose harm the search minimises, as a scenario declares it. The table then holds the amounts of this
+            objective, not the harm of the line, and its header says so; no bound is known for them.
 
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
         raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
     task = Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
     others, problem = scripted_commands(worlds, task), task_problem(worlds, task)
-    identity = problem.identity
+    identity, aimed = problem.identity, partial(minimising, worlds=worlds, declared=objective, vehicles=task.vehicles)
     if known is not None:
         known.check_fits(problem)
     effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
@@ -84,8 +88,8 @@ def best_harm(
     for count in counts:
         given = [profiles for profiles, _ in found]
         if known is not None:
-            given.append(_startable(known.profiles(identity, count, problem.last_step)[0]))
-        found.append(_searched(worlds, replace(task, harm_count=count), others, given, task.vehicles, effort))
+            given.append(startable(known.profiles(identity, count, problem.last_step)[0]))
+        found.append(_searched(worlds, replace(task, harm_count=count), others, given, task.vehicles, effort, aimed))
     rows = np.arange(worlds.n)
     best: dict[HarmCount, BestKnown] = {}
     for count in counts:
@@ -96,10 +100,15 @@ def best_harm(
         best[count] = BestKnown(harms[pick, rows], Profiles(ends, commands))
     names = [scenario.vehicle_names[i] for i in task.vehicles]
     header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
+    header |= {} if objective == "total" else {OBJECTIVE: objective}
     table = BestHarmTable(identity, best, header)
     if known is None:
         return table
     for count in [count for count in counts if count in known.best]:
+        if known.header.get(OBJECTIVE, "total") != objective:
+            kept, _ = known.profiles(identity, count, problem.last_step)
+            table, _ = table.improved(identity, count, aimed(problem).values(kept)[count], kept)
+            continue
         kept, has_profile = known.profiles(identity, count, np.ones(worlds.n, np.int64))
         kept.ends[~has_profile] = 0
         table, _ = table.improved(identity, count, known.harm(identity, count), kept)
@@ -118,6 +127,7 @@ def search_list(
     known: BestHarmTable | None = None,
     chunks: Path | None = None,
     on_progress: Progress | None = None,
+    objective: Declared = "total",
 ) -> BestHarmTable:
     """Run ``best_harm`` on a long list, ``CHUNK`` worlds at a time; it can be interrupted and continued.
 
@@ -137,6 +147,7 @@ def search_list(
         chunks: folder in which each finished chunk is stored as a file. A later call with the same arguments reads it;
             a file of other arguments is computed again and replaced. None: nothing is stored.
         on_progress: called with the number of worlds done and their total.
+        objective: whose harm the search minimises, see ``best_harm``.
 
     """
     parts: list[BestHarmTable] = []
@@ -147,6 +158,7 @@ def search_list(
         if every is not None:
             known.check_holds_any(every)
     options = {"counts": counts, "budget": budget, "seed": seed, "threads": threads, "known": known}
+    options["objective"] = objective
     for first in range(0, n, CHUNK):
         rows = np.arange(first, min(first + CHUNK, n))
         file = None if chunks is None else chunk_file(chunks, first)
@@ -188,6 +200,7 @@ def _kept_or_searched(
     known = options["known"]
     question = {"counts": list(options["counts"]), "budget": options["budget"], "search_seed": options["seed"]}
     question |= {} if known is None else {"after": dict(known.header)}
+    question[OBJECTIVE] = options["objective"]
     if file is not None:
         with suppress(CorruptBundle):
             part = kept_chunk(file, task_problem(worlds, task).identity, question)
@@ -243,8 +256,9 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
     if not file.is_file():
         return None
     table = BestHarmTable.load(file)
-    asked = {"counts": list(table.best), **{key: table.header[key] for key in question if key in table.header}}
-    return table if asked == question and np.array_equal(table.identity, identity) else None
+    asked = {"counts": list(table.best), OBJECTIVE: "total"}
+    asked |= {key: table.header[key] for key in question if key in table.header}
+    return table if asked == {OBJECTIVE: "total", **question} and np.array_equal(table.identity, identity) else None
 
 
 def scripted_commands(worlds: Worlds, task: Task) -> Floats:
@@ -276,7 +290,7 @@ def _problem(worlds: Worlds, task: Task, others: Floats, deciders: Sequence[int]
 
 def _searched(
     worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
-    effort: dict[str, int],
+    effort: dict[str, int], aimed: Callable[[ProfileProblem], ProfileProblem],
 ) -> Found:  # fmt: skip
     """Return the best profiles of a search in each world, and their harm under each count.
 
@@ -287,9 +301,34 @@ def _searched(
         given: profiles to start with, besides constants and each vehicle's own best.
         deciders: indices of the vehicles whose latency decides when decisions fall.
         effort: keywords ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
+        aimed: returns a problem in which a search minimises the objective of all controlled vehicles.
 
     """
-    problem = _problem(worlds, task, others, deciders)
+    problem = aimed(_problem(worlds, task, others, deciders))
+    starts = starting_profiles(problem, worlds, task, others, given)
+    if len(task.vehicles) > 1:
+        for c, vehicle in enumerate(task.vehicles):
+            alone, _ = _searched(worlds, replace(task, vehicles=(vehicle,)), others, (), deciders, effort, aimed)
+            least = problem.bounds[:, np.newaxis, :, 0]
+            commands = np.broadcast_to(least, (*alone.ends.shape, len(task.vehicles))).copy()
+            commands[..., c] = alone.commands_mps2[..., 0]
+            starts.append(Profiles(alone.ends, commands))
+    return search_profiles(problem, joined(starts, problem.n), **effort)
+
+
+def starting_profiles(
+    problem: ProfileProblem, worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles] = ()
+) -> list[Profiles]:
+    """Return profiles to start a search with: constants, ``given`` ones, and for one vehicle its extreme ones.
+
+    Args:
+        problem: the problem of the worlds.
+        worlds: the worlds at t = 0, [n].
+        task: scenario, controlled vehicles and harm to minimise.
+        others: [n, N] commands of the vehicles that follow scripts, m/s2.
+        given: further profiles to start with.
+
+    """
     starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
     if len(task.vehicles) == 1:
         coupled = optimise_coupled(
@@ -300,17 +339,10 @@ def _searched(
         forward = np.all(at.speeds_mps >= 0.0, axis=1)
         neighbours = (forward & there for there in (task.vehicle > 0, task.vehicle < at.N - 1))
         starts.append(extreme_profiles(problem, onset_states(at, task.vehicle, None), *neighbours))
-    else:
-        for c, vehicle in enumerate(task.vehicles):
-            alone, _ = _searched(worlds, replace(task, vehicles=(vehicle,)), others, (), deciders, effort)
-            least = problem.bounds[:, np.newaxis, :, 0]
-            commands = np.broadcast_to(least, (*alone.ends.shape, len(task.vehicles))).copy()
-            commands[..., c] = alone.commands_mps2[..., 0]
-            starts.append(Profiles(alone.ends, commands))
-    return search_profiles(problem, _joined(starts, problem.n), **effort)
+    return starts
 
 
-def _startable(profiles: Profiles) -> Profiles:
+def startable(profiles: Profiles) -> Profiles:
     """Return profiles that a search can start with.
 
     A profile with too many phases (times of constant command) is replaced by its first command, held to the end.
@@ -324,7 +356,7 @@ def _startable(profiles: Profiles) -> Profiles:
     )
 
 
-def _joined(parts: list[Profiles], n: int) -> Profiles:
+def joined(parts: list[Profiles], n: int) -> Profiles:
     """Join several sets of profiles, [n * Q_j] each, into one set [n * Q]: all profiles of world 0 first, and so on."""
     parts = Profiles.padded(parts, MOST_PHASES)
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
@@ -373,6 +405,8 @@ def fold_episodes(
             counts.
 
     """
+    if OBJECTIVE in table.header:
+        raise InvalidInput(f"table of the objective {table.header[OBJECTIVE]!r}: give one of the line's harm")
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
     check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
     task = Task(scenario, scenario.learners)

@@ -16,8 +16,9 @@ from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles,
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimating_agents import Believing
-from ethbrake_marl.extensions.search.problem import search_profiles
+from ethbrake_marl.extensions.search.problem import minimising, search_profiles
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
+from ethbrake_marl.game.objectives import Declared
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.registry import Part
@@ -31,6 +32,7 @@ class Outlook(NamedTuple):
     harm_count: HarmCount  # harm to minimise: ``first`` or ``total``
     horizon_s: float  # time up to which it looks ahead, s
     time_step_s: float  # time between two decisions, s
+    objective: Declared = "total"  # whose harm it minimises, as a scenario declares it
 
     @property
     def decisions(self) -> int:
@@ -42,10 +44,11 @@ class Outlook(NamedTuple):
 
         ``others_mps2`` [n, N] are the commands of the other vehicles.
         """
-        return profile_problem(
+        problem = profile_problem(
             worlds, [vehicle], harm_count=self.harm_count, horizon_s=self.horizon_s, time_step_s=self.time_step_s,
             others_mps2=others_mps2,
         )  # fmt: skip
+        return minimising(problem, worlds, self.objective, [vehicle])
 
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
         """Return the indices of worlds that need a new plan: something moves, and a decision was due since the last
@@ -93,6 +96,7 @@ class Planner:
         horizon_s: time up to which it looks ahead, s.
         most_candidates: upper limit of the number of candidates, whatever ``argument`` says; None: no limit.
         time_step_s: time between two decisions, s.
+        objective: whose harm it minimises; ``predicted_harm`` is then the amount of this objective.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -113,6 +117,7 @@ class Planner:
         horizon_s: float = 8.0,
         most_candidates: int | None = None,
         time_step_s: float = TIME_STEP_S,
+        objective: Declared = "total",
     ) -> None:
         check_harm_count(harm_count)
         budget = CANDIDATES if argument is None else budget_of(argument)
@@ -123,7 +128,7 @@ class Planner:
             )
         self.name = "planner" if argument is None else f"planner:{argument}"
         self._candidates = budget if most_candidates is None else min(budget, most_candidates)
-        self._outlook = Outlook(harm_count, horizon_s, time_step_s)
+        self._outlook = Outlook(harm_count, horizon_s, time_step_s, objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """Make the first plan of these episodes, and return the memory.
@@ -193,6 +198,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
+        objective="total" if settings.scenario is None else settings.scenario.objective,
     )  # fmt: skip
 
 

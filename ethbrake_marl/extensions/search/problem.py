@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, make_search_world
-from ethbrake_marl.errors import PhysicsError, check_whole_number
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.profiles import search_world
 from ethbrake_marl.game.harm import HarmCount
-from ethbrake_marl.physics.state import Floats, UInt64s
+from ethbrake_marl.game.objectives import Declared, aim_of, objectives_of
+from ethbrake_marl.physics.state import Floats, UInt64s, Worlds
 
 _MIX = 0xD1342543DE82EF95  # odd multiplier that spreads seeds over 64 bits
 
@@ -24,11 +26,38 @@ def seeded(identity: UInt64s, seed: int) -> UInt64s:
         return np.asarray(z ^ (z >> np.uint64(31)), np.uint64)
 
 
+def minimising(problem: ProfileProblem, worlds: Worlds, declared: Declared, vehicles: Sequence[int]) -> ProfileProblem:
+    """Return the problem in which a search minimises the objective of the controlled vehicles.
+
+    Args:
+        problem: n worlds, in which a search minimises the harm of the line.
+        worlds: the worlds of the problem, [n].
+        declared: one objective for all vehicles, or one per vehicle, as a scenario declares it.
+        vehicles: indices of the controlled vehicles, from 0.
+
+    Raises ``InvalidInput`` for an objective that is neither a weighted sum of the vehicles' harm nor ``maximin``, or if
+    the controlled vehicles do not minimise the same amount.
+
+    """
+    objectives = objectives_of(declared, worlds.N)
+    if all(objectives[vehicle].kind == "total" for vehicle in vehicles):
+        return problem
+    aims = [aim_of(objectives[vehicle], worlds.vehicles, vehicle) for vehicle in vehicles]
+    weights, largest = aims[0]
+    if any(also != largest or not np.array_equal(other, weights) for other, also in aims[1:]):
+        raise InvalidInput(
+            f"search under the objective {declared!r}: its {len(vehicles)} vehicles minimise different amounts; give"
+            " an objective that they share, for instance weighted:1,4,1"
+        )
+    return problem.minimising(weights, largest=largest)
+
+
 Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
 def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
-    """Return the best command profile of each world that the search finds, and its harm [n] (m2/s2) under each count.
+    """Return the best command profile of each world that the search finds, and its harm [n] (m2/s2) under each count,
+    as the problem weighs it.
 
     A profile has at most ``MOST_PHASES`` phases of constant command. The result is never worse than any profile of
     ``given``. Raises ``InvalidInput`` for a budget below 1, and ``PhysicsError`` with the worlds in which no profile
@@ -61,5 +90,4 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
             used = list(pool.map(work, range(n)))
     if 0 in used:
         raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
-    first, total = problem.follow(best)
-    return best, {"first": first, "total": total}
+    return best, problem.values(best)

@@ -42,7 +42,7 @@ class BestHarm:
 
     Args:
         recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
-        scenario: scenario of the worlds; None: unknown, without the second search.
+        scenario: scenario of the worlds, whose objective it minimises; None: unknown, without the second search.
         harm_count: harm to minimise, ``first`` or ``total``.
         horizon_s: end of the episode, s.
         budget: candidates in a world without a stored profile.
@@ -67,7 +67,7 @@ class BestHarm:
             raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
         check_harm_count(harm_count)
         self._recall, self._budget, self._scenario = recall, budget, scenario
-        self._outlook = Outlook(harm_count, horizon_s, time_step_s)
+        self._outlook = Outlook(harm_count, horizon_s, time_step_s, "total" if scenario is None else scenario.objective)
 
     @classmethod
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
@@ -103,8 +103,9 @@ class BestHarm:
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
         profiles, known = self._recall(problem, outlook.harm_count)
-        first, total = problem.follow(profiles)
-        harm, commands = (first if outlook.harm_count == "first" else total), self._stepwise(profiles)
+        if outlook.objective != "total":  # profiles are kept for the harm of the line alone
+            known = np.zeros(alert.n, np.bool_)
+        harm, commands = problem.values(profiles)[outlook.harm_count], self._stepwise(profiles)
         unknown = np.flatnonzero(~known)
         if unknown.size:
             with renumbered(unknown):

@@ -17,17 +17,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.problem import seeded
 from ethbrake_marl.extensions.search.profiles import allowed, draw, draw_below, draw_command
 from ethbrake_marl.physics.elementary import exp
-from ethbrake_marl.physics.episode import (
-    CLOCK,
-    GOES_ON,
-    Episode,
-    grid_of,
-    harm_so_far,
-    restore,
-    save,
-    step_again,
-    value_of,
-)
+from ethbrake_marl.physics.episode import CLOCK, GOES_ON, Episode, grid_of, restore, save, step_again, value_of
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import ROW
 from ethbrake_marl.physics.state import Bools, Floats, UInt64s
@@ -64,7 +54,8 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     """Search around given commands of the one controlled vehicle. Return the best commands [n, T] (m/s2) and their harm
     [n].
 
-    The result is never worse than the given commands. Harm (m2/s2) is counted as the engine counts it. Worlds are
+    The result is never worse than the given commands. Harm (m2/s2) is counted as the engine counts it, and weighed
+    as the problem says. Worlds are
     independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or beyond a
     capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which the given commands cannot be played.
 
@@ -82,19 +73,17 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
         raise InvalidInput(f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed")
     if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
         raise InvalidInput("refine: a command is beyond the vehicle's capacity")
-    best, first, total = commands_mps2.copy(), np.zeros(n), np.zeros(n)
-    failed = np.zeros(n, np.bool_)
-    _refine_worlds(problem, seeded(problem.identity, seed), budget, best, first, total, failed)
+    best, value, failed = commands_mps2.copy(), np.zeros(n), np.zeros(n, np.bool_)
+    _refine_worlds(problem, seeded(problem.identity, seed), budget, best, value, failed)
     if failed.any():
         raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
-    return best, np.where(problem.clock[:, CLOCK.HARM_IS_TOTAL] == 1.0, total, first)
+    return best, value
 
 
 @compiled
 def _refine_worlds(
-    problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, first: Floats, total: Floats,
-    failed: Bools,
-) -> None:  # fmt: skip
+    problem: ProfileProblem, random: UInt64s, budget: int, commands: Floats, value: Floats, failed: Bools
+) -> None:
     """Improve the commands of each world, in place.
 
     Args:
@@ -102,8 +91,7 @@ def _refine_worlds(
         random: [n] initial state of each world's random stream.
         budget: candidates per world.
         commands: [n, T] commands of each step, m/s2; changed in place.
-        first: [n] receives the first-impact harm, m2/s2.
-        total: [n] receives the total harm, m2/s2.
+        value: [n] receives the harm as the problem weighs it, m2/s2.
         failed: [n] receives True for worlds in which the commands cannot be played.
 
     """
@@ -120,7 +108,7 @@ def _refine_worlds(
             continue
         copy_steps(mine.commands, commands[k], 0)
         follow_steps(world.episode, mine, 0, math.inf)
-        first[k], total[k] = harm_so_far(world.episode.table, 0.0), harm_so_far(world.episode.table, 1.0)
+        value[k] = value_of(world.episode.table, world.episode.clock, 0.0)
 
 
 @compiled(apart=True)

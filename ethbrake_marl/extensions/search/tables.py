@@ -37,6 +37,8 @@ _ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the hea
 
 LEFT_OUT = "left_out"  # key of a table's header: number in the list -> why the world is not in the table
 
+OBJECTIVE = "objective"  # key of a table's header: whose harm its amounts are; missing: the harm of the line
+
 LOWERED = "lowered_by"  # key of a table's header: agent -> count -> number of worlds in which it did less harm
 
 COUNTS: tuple[HarmCount, ...] = ("first", "total")

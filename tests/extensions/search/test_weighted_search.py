@@ -38,17 +38,17 @@ def test_borne__is_what_the_engine_says_each_vehicle_bears(name: str) -> None:
 def test_search__of_an_objective_does_no_worse_by_it_than_what_it_starts_with(text: str, count: str) -> None:
     scenario = eb.load_scenario("paper-random")
     worlds = scenario.sample(25, 8).worlds
-    objective, mass = parse_objective(text), worlds.vehicles.mass_t
+    objective, line = parse_objective(text), worlds.vehicles
     found = {}
     for aim in (text, "total", "weighted:4,1,1", "weighted:1,1,4"):
-        weights, largest = aim_of(parse_objective(aim), mass, 1)
+        weights, largest = aim_of(parse_objective(aim), line, 1)
         problem = problem_of(scenario, worlds, count).minimising(weights, largest=largest)
         found[aim] = search_profiles(problem, problem.constant(problem.even_grid(29)), budget=3_000)[0]
     problem = problem_of(scenario, worlds, count)
     start = [profiles for aim, profiles in found.items() if aim != text]
     ends = np.stack([each.ends for each in start], axis=1).reshape(-1, start[0].ends.shape[1])
     commands = np.stack([each.commands_mps2 for each in start], axis=1).reshape(len(ends), -1, 1)
-    weights, largest = aim_of(objective, mass, 1)
+    weights, largest = aim_of(objective, line, 1)
     again, _ = search_profiles(problem.minimising(weights, largest=largest), Profiles(ends, commands), budget=1_000)
 
     def amounts(profiles: Profiles) -> np.ndarray:
@@ -61,4 +61,4 @@ def test_search__of_an_objective_does_no_worse_by_it_than_what_it_starts_with(te
 
 def test_aim__of_what_is_no_weighted_sum_is_refused() -> None:
     with pytest.raises(InvalidInput, match=r"objective 'injury': is no weighted sum of the vehicles' harm; known: "):
-        aim_of(parse_objective("injury:lr4s"), np.ones((1, 3)), 1)
+        aim_of(parse_objective("injury:lr4s"), eb.load_scenario("paper-random").sample(1, 0).worlds.vehicles, 1)

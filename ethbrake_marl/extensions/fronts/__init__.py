@@ -1,0 +1,1 @@
+"""Whose harm counts: fronts of what each vehicle bears, ``ethbrake study front``."""

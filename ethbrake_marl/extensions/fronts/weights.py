@@ -1,0 +1,66 @@
+"""Weights of the vehicles' harm: a grid of the simplex, and the check of weights that a user gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.physics.state import Floats, checked_numbers
+
+STEPS = 5  # default number of steps along an edge of the grid: 21 weights of three vehicles
+
+SLIGHT = 1e-4  # weight of the others in a corner, so that their harm decides between equals
+
+
+def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
+    """Return evenly spaced weights of the vehicles' harm that sum to 1, [W, N].
+
+    Neighbours in the list differ by one step. Raises ``InvalidInput`` for less than one step.
+
+    >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
+    >>> weight_grid(3, 1).tolist()
+    [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+
+    Args:
+        vehicles: number of vehicles in the line, N.
+        steps: number of steps between the weights 0 and 1.
+
+    """
+    check_whole_number("steps of the weights", steps, 1)
+
+    def shares(number: int, left: int) -> Iterator[list[int]]:
+        if number == 1:
+            yield [left]
+            return
+        for mine in range(left + 1):
+            rest = list(shares(number - 1, left - mine))
+            for others in rest if mine % 2 == 0 else reversed(rest):
+                yield [mine, *others]
+
+    return np.array(list(shares(vehicles, steps))) / steps
+
+
+def corners(vehicles: int) -> Floats:
+    """Return weights [N, N] in which one vehicle's harm counts first, and the others' only between equals."""
+    return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
+
+
+def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) -> Floats:
+    """Return weights of the vehicles' harm as an array [W, N].
+
+    Raises ``InvalidInput`` naming the first row that has another number of weights than ``vehicles``, a weight that is
+    negative or not finite, or only zeros.
+    """
+    rows = [checked_numbers("weights", row) for row in weights]
+    for k, row in enumerate(rows):
+        if row.shape != (vehicles,) or not (np.isfinite(row).all() and (row >= 0.0).all() and (row > 0.0).any()):
+            told = ",".join(f"{weight:g}" for weight in row.ravel())
+            raise InvalidInput(
+                f"weights[{k}] = {told}: must be {vehicles} finite numbers of at least 0, one per vehicle and not all"
+                " 0, as in 1,4,1"
+            )
+    if not rows:
+        raise InvalidInput("weights: there are none; give at least one row, as in 1,4,1")
+    return np.array(rows)
