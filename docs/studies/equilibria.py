@@ -41,7 +41,7 @@ from ethbrake_marl.training.recipe import Scheme
 from ethbrake_marl.training.team import load_team
 
 LEVELS = [name for name in STANDARD if eb.load_scenario(name).learners]
-WORLDS, SEED, BUDGET, ROUNDS, JOINT_BUDGET = 250, 6005, 3_000, 20, 50_000
+WORLDS, SEED, BUDGET, ROUNDS, JOINT_BUDGET = 300, 6005, 3_000, 20, 50_000
 OBJECTIVES = ("own", "total", "maximin")
 TRAINED = ("cooperation-3-pair", "cooperation-4-all")
 SCHEMES: dict[str, Scheme] = {"cooperation": "shared", "cooperation-ppo": "independent"}  # recipe -> scheme

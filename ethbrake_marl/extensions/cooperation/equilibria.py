@@ -17,18 +17,19 @@ from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles,
 from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
 from ethbrake_marl.evaluation.statistics import relative_decrease
 from ethbrake_marl.extensions.search.best_harm import (
-    CONSTANTS,
     SEARCH_BUDGET,
     best_harm,
+    joined,
     scripted_commands,
+    starting_profiles,
     task_problem,
 )
-from ethbrake_marl.extensions.search.problem import search_profiles, seeded
+from ethbrake_marl.extensions.search.problem import minimising, search_profiles, seeded
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.game.objectives import Declared, aim_of, objectives_of
+from ethbrake_marl.game.objectives import Declared
 from ethbrake_marl.physics.episode import CLOCK
-from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
@@ -63,15 +64,14 @@ class _Game(NamedTuple):
     """What the learners choose in, and what each of them minimises."""
 
     worlds: Worlds
-    task: Task
+    task: Task  # its vehicles are the learners
+    declared: Declared  # the objectives
     joint: ProfileProblem  # the problem of all learners together
     others: Floats  # [n, N] commands of the scripts, m/s2
-    aims: list[tuple[Floats, bool]]  # of each learner: weights of the vehicles' harm [n, N]; whether the largest counts
 
     def take(self, rows: Ints) -> _Game:
         """Return the game in the worlds with the indices ``rows`` only."""
-        aims = [(weights[rows], largest) for weights, largest in self.aims]
-        return _Game(self.worlds.take(rows), self.task, self.joint.take(rows), self.others[rows], aims)
+        return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
 
     def together(self, own: list[Profiles]) -> Profiles:
         """Return the joint profile of the learners' own ones, with one phase for each decision."""
@@ -81,15 +81,27 @@ class _Game(NamedTuple):
 
     def amount(self, c: int, own: list[Profiles]) -> Floats:
         """Return what learner number ``c`` minimises under the learners' profiles, [n] m2/s2."""
-        weights, largest = self.aims[c]
-        each = weights * self.joint.borne(self.together(own))[self.task.harm_count]
-        return np.asarray(each.max(axis=1) if largest else each.sum(axis=1))
+        problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
+        return problem.values(self.together(own))[self.task.harm_count]
 
-    def alone(self, c: int, own: list[Profiles]) -> ProfileProblem:
-        """Return the problem of learner number ``c`` alone: the other learners follow ``own`` in pieces.
+    def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
+        """Return the best profile of learner number ``c`` that a search finds while the others follow ``own``.
 
-        A piece begins at a decision of the joint problem, so harm differs from the joint problem's by rounding.
+        The others follow them in pieces, which begin at the decisions of the joint problem. So harm differs from that
+        of the joint problem by rounding. ``effort`` holds the keywords of ``search_profiles``.
         """
+        task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
+        problem = profile_problem(
+            replace(self.worlds, vehicles=self._following(c, own)), task.vehicles, harm_count=task.harm_count,
+            horizon_s=task.scenario.horizon_s, time_step_s=task.scenario.time_step_s, others_mps2=others,
+            deciders=self.task.vehicles,
+        )  # fmt: skip
+        problem = minimising(problem, self.worlds, self.declared, task.vehicles)
+        given = starting_profiles(problem, self.worlds, task, others, [own[c]])
+        return search_profiles(problem, joined(given, problem.n), **effort)[0]
+
+    def _following(self, c: int, own: list[Profiles]) -> Vehicles:
+        """Return the vehicles, of which the learners but number ``c`` follow ``own`` in pieces."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
@@ -102,13 +114,7 @@ class _Game(NamedTuple):
                 time = clock[:, [CLOCK.START]] + begin * clock[:, [CLOCK.TIME_STEP]] - vehicles.latency_s[:, [vehicle]]
                 pieces[:, vehicle, 0, :MOST_PHASES] = np.where(used, np.maximum(time, 0.0), np.inf)
                 pieces[:, vehicle, 1, :MOST_PHASES] = np.where(used, own[d].commands_mps2[:, :, 0], np.inf)
-        scenario, moved = self.task.scenario, replace(vehicles, pieces=pieces.reshape(*old.shape[:2], -1))
-        weights, largest = self.aims[c]
-        return profile_problem(
-            replace(self.worlds, vehicles=moved), [self.task.vehicles[c]], harm_count=self.task.harm_count,
-            horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s, others_mps2=self.others,
-            deciders=self.task.vehicles,
-        ).minimising(weights, largest=largest)  # fmt: skip
+        return replace(vehicles, pieces=pieces.reshape(*old.shape[:2], -1))
 
 
 def find_equilibria(
@@ -158,18 +164,20 @@ def find_equilibria(
         raise InvalidInput(f"tolerance {tolerance!r}: must be a number of m2/s2, at least 0")
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r}: nobody learns; give at least one vehicle the role learner")
-    task, mass = Task(scenario, scenario.learners, harm_count), worlds.vehicles.mass_t
-    declared = objectives_of(scenario.objective if objective is None else objective, scenario.vehicles)
-    aims = [aim_of(declared[vehicle], mass, vehicle) for vehicle in task.vehicles]
-    game = _Game(worlds, task, task_problem(worlds, task), scripted_commands(worlds, task), aims)
+    task, declared = (
+        Task(scenario, scenario.learners, harm_count),
+        scenario.objective if objective is None else objective,
+    )
+    game = _Game(worlds, task, declared, task_problem(worlds, task), scripted_commands(worlds, task))
     low, high = np.moveaxis(game.joint.bounds, 2, 0)
     draws = [seeded(game.joint.identity, seed + c) >> np.uint64(11) for c in range(low.shape[1])]
     share = np.stack(draws, axis=1) * 2.0**-53
     starts = dict(zip(STARTS, (low, high, np.clip(low + share * (high - low), low, high)), strict=True))
     found = {}
-    for name, commands in starts.items():
+    for k, (name, commands) in enumerate(starts.items()):
         own = [game.joint.constant(commands[:, np.newaxis, [c]]) for c in range(low.shape[1])]
-        found[name] = _settle(game, own, rounds, tolerance, {"budget": budget, "seed": seed, "threads": threads})
+        effort = {"budget": budget, "threads": threads, "seed": seed + k * rounds}
+        found[name] = _settle(game, own, rounds, tolerance, effort)
     return found
 
 
@@ -181,11 +189,7 @@ def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, eff
         moved = np.zeros(len(active), np.bool_)
         with renumbered(active):
             for c in range(len(mine)):
-                problem = part.alone(c, mine)
-                given = _beside(problem.constant(problem.even_grid(CONSTANTS)), mine[c])
-                new = search_profiles(problem, given, **{**effort, "seed": effort["seed"] + turn})[
-                    0
-                ]  # not the same draws
+                new = part.response(c, mine, {**effort, "seed": effort["seed"] + turn})  # not the same draws again
                 better = part.amount(c, [*mine[:c], new, *mine[c + 1 :]]) < part.amount(c, mine) - tolerance
                 mine[c].ends[better], mine[c].commands_mps2[better] = new.ends[better], new.commands_mps2[better]
                 moved |= better
@@ -197,16 +201,6 @@ def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, eff
             break
     together = game.together(own)
     return Equilibrium(together, game.joint.borne(together), ~np.isin(np.arange(game.joint.n), active), taken)
-
-
-def _beside(many: Profiles, one: Profiles) -> Profiles:
-    """Return the profiles ``many`` [n * Q] of each world and then the one of ``one`` [n], [n * (Q + 1)]."""
-    n = len(one.ends)
-    joined = [
-        np.concatenate([some.reshape(n, -1, *each.shape[1:]), each[:, np.newaxis]], axis=1).reshape(-1, *each.shape[1:])
-        for some, each in zip(many, one, strict=True)
-    ]
-    return Profiles(*joined)
 
 
 def compare_starts(ends: Mapping[str, Equilibrium], harm_count: HarmCount, tolerance: float = 0.1) -> Spread:

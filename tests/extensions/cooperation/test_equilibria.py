@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.cooperation import (
     find_equilibria,
     price_of_anarchy,
 )
-from ethbrake_marl.extensions.search.best_harm import CONSTANTS, task_problem
+from ethbrake_marl.extensions.search.best_harm import joined, scripted_commands, starting_profiles, task_problem
 from ethbrake_marl.extensions.search.problem import Found, search_profiles
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.game.objectives import aim_of, parse_objective
@@ -61,10 +61,11 @@ def test_one_learner__does_what_a_search_of_its_objective_does(count: str) -> No
     scenario = eb.load_scenario("cooperation-1-front")
     worlds = scenario.sample(12, 3).worlds
     ends = find_equilibria(scenario, worlds, harm_count=count, budget=500, rounds=1, tolerance=0.0, seed=4)
-    weights, largest = aim_of(parse_objective("own"), worlds.vehicles.mass_t, 1)
+    weights, largest = aim_of(parse_objective("own"), worlds.vehicles, 1)
     problem = task_problem(worlds, Task(scenario, (1,), count)).minimising(weights, largest=largest)
-    grid = np.concatenate([problem.even_grid(CONSTANTS), problem.bounds[:, np.newaxis, :, 0]], axis=1)
-    found, _ = search_profiles(problem, problem.constant(grid), budget=500, seed=4)
+    task, braking = Task(scenario, (1,), count), problem.constant(problem.bounds[:, np.newaxis, :, 0])
+    given = starting_profiles(problem, worlds, task, scripted_commands(worlds, task), [braking])
+    found, _ = search_profiles(problem, joined(given, 12), budget=500, seed=4)
     assert ends["braking"].borne[count].tolist() == problem.borne(found)[count].tolist()
     assert not ends["driving"].converged.any() and ends["driving"].rounds.tolist() == [1] * 12
 
@@ -100,7 +101,7 @@ def beaten_by(scenario: eb.Scenario, worlds: Worlds, end: Equilibrium, objective
     problem = task_problem(worlds, Task(scenario, scenario.learners))
     steps, gains = np.arange(end.profiles.ends.shape[1]), []
     for c, vehicle in enumerate(scenario.learners):
-        weights, largest = aim_of(parse_objective(objective), worlds.vehicles.mass_t, vehicle)
+        weights, largest = aim_of(parse_objective(objective), worlds.vehicles, vehicle)
 
         def amount(borne: Floats, weights: Floats = weights, largest: bool = largest) -> Floats:
             return (weights * borne).max(axis=1) if largest else (weights * borne).sum(axis=1)
