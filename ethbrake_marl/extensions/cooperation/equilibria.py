@@ -35,7 +35,7 @@ from ethbrake_marl.scenario.task import Task
 
 STARTS = ("braking", "driving", "random")  # constant commands of all learners from which the search begins
 
-BUDGET = 3_000  # candidates per world of one search
+BUDGET = 10_000  # candidates per world of one search
 
 ROUNDS = 12  # most rounds, in each of which every learner searches once
 
