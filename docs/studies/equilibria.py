@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import importlib.util
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -153,9 +154,10 @@ def job(name: str, objective: str, recipe: str, seed: int) -> str:
 
 def write(levels: Sequence[Level], learned: list[list[str]], worlds: int, file: Path) -> str:
     """Write the tables as docs/results has them; return them as Markdown."""
-    spec = importlib.util.spec_from_file_location("results", DOCS / "extension" / "results.py")
+    spec = importlib.util.spec_from_file_location("docs_results", DOCS / "extension" / "results.py")
     assert spec is not None and spec.loader is not None
     results = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = results  # where its classes look for the names in their annotations
     spec.loader.exec_module(results)
     about = f"{worlds} worlds of seed {SEED}; first-impact harm in m²/s², mean per world with 95 % intervals."
     how = f"Best responses in turn from three starts, {BUDGET:,} candidates each, at most {ROUNDS} rounds."
