@@ -6,6 +6,14 @@ from typing import Any, assert_type
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.cooperation import (
+    Equilibrium,
+    Spread,
+    best_joint_harm,
+    compare_starts,
+    find_equilibria,
+    price_of_anarchy,
+)
 from ethbrake_marl.extensions.datasets.minari import write_dataset
 from ethbrake_marl.extensions.hosts.protocol import Host, HostCommand, HostFailed, HostState, drive_host
 from ethbrake_marl.extensions.report.deceleration import deceleration_curve, deceleration_figure
@@ -109,6 +117,14 @@ def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     assert_type(eb.summarise_by(found, "scenario"), dict[str, eb.SummaryTable])
     figures = [deceleration_figure(curve), harm_against_total_gap(found)]
     return [found.to_frame(), *figures]
+
+
+def play(level: eb.Scenario, worlds: eb.Worlds) -> float:
+    ends = find_equilibria(level, worlds, "own", budget=300)
+    assert_type(ends, dict[str, Equilibrium])
+    spread: Spread = compare_starts(ends, "first")
+    price = price_of_anarchy(spread.worst, best_joint_harm(level, worlds, ends.values(), budget=300)["first"])
+    return price.value if price else 1.0
 
 
 class Still:

@@ -36,8 +36,9 @@ from ethbrake_marl.training.recipe import Scheme
 from tests.docs.site import DOCS, load
 from tests.fixtures.installed import write_metadata
 
-sampling, price, equal_time, message_contents, team_curves = (
-    load(f"../studies/{name}") for name in ("sampling", "price", "equal_time", "message_contents", "team_curves")
+sampling, price, equal_time, message_contents, team_curves, equilibria = (
+    load(f"../studies/{name}")
+    for name in ("sampling", "price", "equal_time", "message_contents", "team_curves", "equilibria")
 )
 
 
@@ -113,6 +114,17 @@ def test_equal_time__tells_the_harm_of_an_evaluation_in_the_columns_of_the_page(
     assert list(equal_time.HEAD) in [table.columns for table in BASELINES]
     worlds = PAPER.sample(equal_time.WORLDS, equal_time.SEED).worlds  # which no table holds
     assert not np.isfinite(best_known(worlds, Task(PAPER, PAPER.learners))["first"]).any()
+
+
+def test_equilibria__have_a_row_for_each_level_objective_and_start() -> None:
+    prices, borne, learned = load("results").read_tables("equilibria")
+    level = equilibria.search("cooperation-2-paper", 2)
+    made = equilibria.price_rows(level), equilibria.bearing_rows(level)
+    for table, rows, words in ((prices, made[0], 2), (borne, made[1], 3)):
+        shown = [row for row in table.rows if row[0] == "`cooperation-2-paper`"]
+        assert [row[:words] for row in rows] == [row[:words] for row in shown] and len(rows[0]) == len(table.columns)
+        assert {row[0].strip("`") for row in table.rows} == set(equilibria.LEVELS)
+    assert [row[0].strip("`") for row in learned.rows] == [name for name in equilibria.TRAINED for _ in range(4)]
 
 
 def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_with() -> None:

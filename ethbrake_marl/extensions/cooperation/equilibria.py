@@ -1,0 +1,273 @@
+"""Equilibria of several learners: each searches its own best command profile in turn, until nobody improves.
+
+Everybody knows everything and commits to a *profile*: the commands of a whole episode (open loop), against which the
+others do not react.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.engine.profiles import MOST_PHASES, ProfileProblem, Profiles, profile_problem
+from ethbrake_marl.errors import InvalidInput, check_whole_number, renumbered
+from ethbrake_marl.evaluation.statistics import relative_decrease
+from ethbrake_marl.extensions.search.best_harm import (
+    SEARCH_BUDGET,
+    best_harm,
+    joined,
+    scripted_commands,
+    starting_profiles,
+    task_problem,
+)
+from ethbrake_marl.extensions.search.problem import minimising, search_profiles, seeded
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
+from ethbrake_marl.game.objectives import Declared
+from ethbrake_marl.physics.episode import CLOCK
+from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
+from ethbrake_marl.scenario.schema import Scenario
+from ethbrake_marl.scenario.task import Task
+
+STARTS = ("braking", "driving", "random")  # constant commands of all learners from which the search begins
+
+BUDGET = 10_000  # candidates per world of one search
+
+ROUNDS = 12  # most rounds, in each of which every learner searches once
+
+TOLERANCE = 0.01  # m2/s2; a learner changes its profile for a larger gain only
+
+
+class Equilibrium(NamedTuple):
+    """Where best responses in turn end from one start, in n worlds of N vehicles and C learners."""
+
+    profiles: Profiles  # commands of the learners, with one phase for each decision
+    borne: dict[HarmCount, Floats]  # count of harm -> [n, N] harm that each vehicle bears, m2/s2
+    converged: Bools  # [n] whether no learner's search found more than the tolerance in the last round
+    rounds: Ints  # [n] number of rounds, with the last one, in which nobody improved
+
+
+class Spread(NamedTuple):
+    """The equilibria of different starts, world by world; ends that did not converge are left out."""
+
+    found: Ints  # [n] number of starts that converged
+    differs: Bools  # [n] whether the harm of some vehicle differs between two of these by more than the tolerance
+    best: Floats  # [n, N] harm that each vehicle bears where the line's harm is least, m2/s2; NaN if none converged
+    worst: Floats  # [n, N] the same where the line's harm is greatest
+
+
+class _Game(NamedTuple):
+    """What the learners choose in, and what each of them minimises."""
+
+    worlds: Worlds
+    task: Task  # its vehicles are the learners
+    declared: Declared  # the objectives
+    joint: ProfileProblem  # the problem of all learners together
+    others: Floats  # [n, N] commands of the scripts, m/s2
+
+    def take(self, rows: Ints) -> _Game:
+        """Return the game in the worlds with the indices ``rows`` only."""
+        return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
+
+    def together(self, own: list[Profiles]) -> Profiles:
+        """Return the joint profile of the learners' own ones, with one phase for each decision."""
+        steps = np.arange(int(self.joint.last_step.max()))
+        at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
+        return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))
+
+    def amount(self, c: int, own: list[Profiles]) -> Floats:
+        """Return what learner number ``c`` minimises under the learners' profiles, [n] m2/s2."""
+        problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
+        return problem.values(self.together(own))[self.task.harm_count]
+
+    def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
+        """Return the best profile of learner number ``c`` that a search finds while the others follow ``own``.
+
+        The others follow them in pieces, which begin at the decisions of the joint problem. So harm differs from that
+        of the joint problem by rounding. ``effort`` holds the keywords of ``search_profiles``.
+        """
+        task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
+        problem = profile_problem(
+            replace(self.worlds, vehicles=self._following(c, own)), task.vehicles, harm_count=task.harm_count,
+            horizon_s=task.scenario.horizon_s, time_step_s=task.scenario.time_step_s, others_mps2=others,
+            deciders=self.task.vehicles,
+        )  # fmt: skip
+        problem = minimising(problem, self.worlds, self.declared, task.vehicles)
+        given = starting_profiles(problem, self.worlds, task, others, [own[c]])
+        return search_profiles(problem, joined(given, problem.n), **effort)[0]
+
+    def _following(self, c: int, own: list[Profiles]) -> Vehicles:
+        """Return the vehicles, of which the learners but number ``c`` follow ``own`` in pieces."""
+        vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
+        count = old.shape[2] // 2
+        pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
+        pieces[:, :, :, :count] = old.reshape(*old.shape[:2], 2, count)
+        for d, vehicle in enumerate(self.task.vehicles):
+            pieces[:, vehicle] = np.inf
+            if d != c:
+                begin = np.pad(own[d].ends, ((0, 0), (1, 0)))[:, :MOST_PHASES]
+                used = begin < self.joint.last_step[:, np.newaxis]
+                time = clock[:, [CLOCK.START]] + begin * clock[:, [CLOCK.TIME_STEP]] - vehicles.latency_s[:, [vehicle]]
+                pieces[:, vehicle, 0, :MOST_PHASES] = np.where(used, np.maximum(time, 0.0), np.inf)
+                pieces[:, vehicle, 1, :MOST_PHASES] = np.where(used, own[d].commands_mps2[:, :, 0], np.inf)
+        return replace(vehicles, pieces=pieces.reshape(*old.shape[:2], -1))
+
+
+def find_equilibria(
+    scenario: Scenario,
+    worlds: Worlds,
+    objective: Declared | None = None,
+    *,
+    harm_count: HarmCount = "first",
+    budget: int = BUDGET,
+    rounds: int = ROUNDS,
+    tolerance: float = TOLERANCE,
+    seed: int = 0,
+    threads: int = 1,
+) -> dict[str, Equilibrium]:
+    """Search equilibria of the scenario's learners by best responses in turn, one from each of ``STARTS``.
+
+    A learner keeps its profile unless the search finds one better by more than ``tolerance``. So what has converged is
+    an approximate equilibrium in open-loop profiles, as far as a search of ``budget`` candidates can tell. Nothing says
+    that it is the only one. The result does not depend on the other worlds or on ``threads``.
+
+    >>> import ethbrake_marl as eb
+    >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
+    >>> level = eb.load_scenario("cooperation-3-pair")
+    >>> ends = find_equilibria(level, level.sample(5, seed=7).worlds, "own", budget=300)
+    >>> [*ends], compare_starts(ends, "first").differs.shape
+    (['braking', 'driving', 'random'], (5,))
+
+    Args:
+        scenario: the scenario of the worlds; its learners play, the others follow their scripts.
+        worlds: the worlds at t = 0, [n].
+        objective: what each learner minimises: one for all, such as ``own``, or one for each vehicle of the line; None:
+            the scenario's.
+        harm_count: impacts that count: ``first`` of each pair, or ``total``.
+        budget: candidates of one search.
+        rounds: most rounds, in each of which every learner searches once.
+        tolerance: least gain for which a learner changes its profile, m2/s2.
+        seed: seed of the random start and of the searches.
+        threads: number of threads.
+
+    Raises ``InvalidInput`` for a scenario without learners, a script whose command is not fixed at the alert, an
+    objective that is no weighted sum of the vehicles' harm nor ``maximin``, and numbers out of range; ``PhysicsError``
+    with the worlds in which a check of the physics failed.
+
+    """
+    check_whole_number("rounds", rounds, 1)
+    if not 0.0 <= tolerance < math.inf:
+        raise InvalidInput(f"tolerance {tolerance!r}: must be a number of m2/s2, at least 0")
+    if not scenario.learners:
+        raise InvalidInput(f"scenario {scenario.name!r}: nobody learns; give at least one vehicle the role learner")
+    task, declared = (
+        Task(scenario, scenario.learners, harm_count),
+        scenario.objective if objective is None else objective,
+    )
+    game = _Game(worlds, task, declared, task_problem(worlds, task), scripted_commands(worlds, task))
+    low, high = np.moveaxis(game.joint.bounds, 2, 0)
+    draws = [seeded(game.joint.identity, seed + c) >> np.uint64(11) for c in range(low.shape[1])]
+    share = np.stack(draws, axis=1) * 2.0**-53
+    starts = dict(zip(STARTS, (low, high, np.clip(low + share * (high - low), low, high)), strict=True))
+    found = {}
+    for k, (name, commands) in enumerate(starts.items()):
+        own = [game.joint.constant(commands[:, np.newaxis, [c]]) for c in range(low.shape[1])]
+        effort = {"budget": budget, "threads": threads, "seed": seed + k * rounds}
+        found[name] = _settle(game, own, rounds, tolerance, effort)
+    return found
+
+
+def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, effort: Mapping[str, int]) -> Equilibrium:
+    """Let the learners search in turn, from the profiles ``own`` of each, until none improves by the tolerance."""
+    active, taken = np.arange(game.joint.n), np.zeros(game.joint.n, np.int64)
+    for turn in range(rounds):
+        part, mine = game.take(active), [each.take(active) for each in own]
+        moved = np.zeros(len(active), np.bool_)
+        with renumbered(active):
+            for c in range(len(mine)):
+                new = part.response(c, mine, {**effort, "seed": effort["seed"] + turn})  # not the same draws again
+                better = part.amount(c, [*mine[:c], new, *mine[c + 1 :]]) < part.amount(c, mine) - tolerance
+                mine[c].ends[better], mine[c].commands_mps2[better] = new.ends[better], new.commands_mps2[better]
+                moved |= better
+        for each, now in zip(own, mine, strict=True):
+            each.ends[active], each.commands_mps2[active] = now.ends, now.commands_mps2
+        taken[active] += 1
+        active = active[moved]
+        if not active.size:
+            break
+    together = game.together(own)
+    return Equilibrium(together, game.joint.borne(together), ~np.isin(np.arange(game.joint.n), active), taken)
+
+
+def compare_starts(ends: Mapping[str, Equilibrium], harm_count: HarmCount, tolerance: float = 0.1) -> Spread:
+    """Compare the equilibria of different starts, world by world.
+
+    Args:
+        ends: what ``find_equilibria`` returns.
+        harm_count: harm to compare, ``first`` or ``total``.
+        tolerance: two ends whose harm differs by at most this for every vehicle count as the same, m2/s2.
+
+    """
+    converged = np.stack([each.converged for each in ends.values()])
+    borne = np.where(converged[:, :, np.newaxis], np.stack([each.borne[harm_count] for each in ends.values()]), np.nan)
+    line, rows = borne.sum(axis=2), np.arange(borne.shape[1])
+    best, worst = np.where(converged, line, np.inf).argmin(axis=0), np.where(converged, line, -np.inf).argmax(axis=0)
+    differs = (np.fmax.reduce(borne) - np.fmin.reduce(borne) > tolerance).any(axis=1)
+    return Spread(converged.sum(axis=0), differs, borne[best, rows], borne[worst, rows])
+
+
+def best_joint_harm(
+    scenario: Scenario,
+    worlds: Worlds,
+    ends: Iterable[Equilibrium] = (),
+    *,
+    harm_count: HarmCount = "first",
+    budget: int = SEARCH_BUDGET,
+    seed: int = 0,
+    threads: int = 1,
+) -> dict[HarmCount, Floats]:
+    """Return what each vehicle bears where the learners together do the least harm known, count -> [n, N] m2/s2.
+
+    That is the best of a joint search (``best_harm``) and of all ``ends``, so that no equilibrium among them is better.
+
+    Args:
+        scenario: the scenario of the worlds.
+        worlds: the worlds at t = 0, [n].
+        ends: equilibria of the same learners and worlds, under any objectives.
+        harm_count: harm of the line that is to be least: of each pair's ``first`` impact, or ``total``.
+        budget: candidates of the joint search per world.
+        seed: seed of the joint search.
+        threads: number of threads.
+
+    """
+    problem = task_problem(worlds, Task(scenario, scenario.learners, harm_count))
+    table = best_harm(scenario, worlds, counts=(harm_count,), budget=budget, seed=seed, threads=threads)
+    best = problem.borne(table.best[harm_count].profiles)
+    for end in ends:
+        better = end.borne[harm_count].sum(axis=1) < best[harm_count].sum(axis=1)
+        for each in HARM_COUNTS:
+            best[each][better] = end.borne[each][better]
+    return best
+
+
+def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
+    """Return the mean harm of the line in equilibrium, divided by that of the joint optimum, with its interval.
+
+    With ``Spread.worst`` it is the price of anarchy, with ``Spread.best`` the price of stability. None if the joint
+    optimum does no harm in any world.
+
+    Args:
+        borne: [n, N] harm that each vehicle bears in equilibrium, m2/s2; worlds with NaN (none converged) are left out.
+        optimum: [n, N] harm that each vehicle bears in the joint optimum, m2/s2.
+
+    """
+    rows = np.isfinite(borne).all(axis=1)
+    saved = relative_decrease(borne[rows].sum(axis=1), optimum[rows].sum(axis=1))
+    if saved is None:
+        return None
+    low, high = saved.ends
+    return Estimate(1.0 - saved.value, saved.interval and (1.0 - high, 1.0 - low))
