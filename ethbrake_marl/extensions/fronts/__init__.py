@@ -1,1 +1,1 @@
-"""Whose harm counts: fronts of what each vehicle bears, ``ethbrake study front``."""
+"""Fronts of harm: what each choice of whose harm counts costs whom; the command ``study front``."""
