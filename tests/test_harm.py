@@ -365,6 +365,7 @@ MET = Ledger(
     *Impacts.no_obstacle(1),
     np.array([[1.0, 2.0, 1.0]]),
     np.array([0.5]),
+    np.array([[0.0, 1.0, 3.0]]),
 )
 
 
@@ -378,6 +379,8 @@ MET = Ledger(
         ("social:45", [21 / 2**0.5] * 3),
         ("social:30", [x * 0.75**0.5 + (21 - x) / 2 for x in (8, 7, 6)]),
         ("maximin", [8.0, 8.0, 8.0]),
+        ("preference", [18.75] * 3),  # 3 (7 + 3 x 6) / 4
+        ("weighted:0,1,3", [18.75] * 3),
         ("mass-weighted", [21.0, 21.0, 21.0]),
         ("weighted:1,4,2", [3 * (8 + 4 * 7 + 2 * 6) / 7] * 3),
         ("weighted:1e6, 1e-6,1e6", [21.0, 21.0, 21.0]),

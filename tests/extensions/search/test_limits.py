@@ -154,7 +154,8 @@ def outcome(evaluation: Evaluation, harms: tuple[list[float], list[float]], n: i
     first, total = (np.column_stack([harm[:n], np.zeros(n)]) for harm in harms)
     final = evaluation.worlds.take(np.arange(n))
     count = (total > 0.0).astype(np.int64)
-    ledger = Ledger(first, total, count, *Impacts.no_obstacle(n), final.vehicles.mass_t, final.vehicles.restitution)
+    of = final.vehicles
+    ledger = Ledger(first, total, count, *Impacts.no_obstacle(n), of.mass_t, of.restitution, of.harm_weight)
     return Outcome(ledger, final, np.ones(n, np.bool_), None, None)
 
 
