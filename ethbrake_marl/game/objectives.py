@@ -10,7 +10,7 @@ social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientat
                     over 45 (prosocial) to 90 degrees (the others' only)
 maximin             ``max_j H_j``: the harm of the vehicle that bears most
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
-weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: one weight (at most 1e6) per vehicle, for example its occupants
+weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: a weight (0, or 1e-6 to 1e6) per vehicle, such as its occupants
 preference          the same, with the weights ``harm_weight`` that the scenario gives or draws for each world
 injury:curve        injuries in 1,000 lines, by the pair that injures a vehicle more (``Ledger.speed_changes``)
 ==================  ================================================================================================
@@ -89,8 +89,8 @@ class Kind(NamedTuple):
 def parse_objective(text: str) -> Objective:
     """Parse the text of an objective: ``total``, ``own``, ``social:45``, ``weighted:1,4,1``, ``injury:lr4s``, ...
 
-    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight outside [0, 1e6], weights
-    that are all 0, or an unknown curve.
+    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight that is neither 0 nor
+    in [1e-6, 1e6], weights that are all 0, or an unknown curve.
     """
     kind, colon, argument = text.partition(":")
     if ":" not in OBJECTIVES[kind].form:
@@ -107,10 +107,10 @@ def parse_objective(text: str) -> Objective:
         if len(numbers) != 1 or not 0.0 <= numbers[0] <= 90.0:
             raise InvalidInput(f"objective {text!r}: social needs an angle from 0 to 90 degrees, as in social:45")
         return Objective(kind, angle_deg=numbers[0])
-    if not (any(numbers) and all(0.0 <= weight <= 1e6 for weight in numbers)):
+    if not (any(numbers) and all(weight == 0.0 or 1e-6 <= weight <= 1e6 for weight in numbers)):
         raise InvalidInput(
-            f"objective {text!r}: weighted needs a weight from 0 to 1e6 for each vehicle, not 0 for all, as in"
-            " weighted:1,4,1"
+            f"objective {text!r}: weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6 and not 0 for all, as"
+            " in weighted:1,4,1"
         )
     return Objective(kind, weights=numbers)
 
@@ -285,6 +285,8 @@ def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] |
     """
     if isinstance(declared, str):
         raise InvalidInput(f"scored: {declared!r}: must be a list of objectives, for instance [{declared!r}]")
+    for each in declared or ():
+        check_declared(each)
     vehicles, declared = ledger.mass_t.shape[1], standard_objectives() if declared is None else declared
     return {
         each if isinstance(each, str) else ", ".join(each): objective_harm(

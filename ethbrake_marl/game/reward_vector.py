@@ -40,9 +40,10 @@ def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> 
 
     """
     each = [f"harm_{k + 1}" for k in range(vehicles)]
-    if vector == VEHICLES:
+    if isinstance(vector, str) and vector == VEHICLES:
         return tuple(each)
-    if isinstance(vector, str) or not isinstance(vector, Sequence) or not vector or len(set(vector)) < len(vector):
+    listed = isinstance(vector, Sequence) and not isinstance(vector, str) and all(isinstance(n, str) for n in vector)
+    if not listed or not vector or len(set(vector)) < len(vector):
         raise InvalidInput(
             f"reward_vector = {vector!r}: must be {VEHICLES!r}, or a list of components, each once, for instance"
             " ['harm_1', 'harm_2', 'harm_3']"

@@ -35,6 +35,8 @@ UInt64s = NDArray[np.uint64]
 
 GRAVITY_MPS2 = 9.81
 
+LEAST_WEIGHT = 1e-6  # least weight of harm that one vehicle of a line must have, so that shares of weights are exact
+
 _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by friction
 
 
@@ -564,8 +566,8 @@ def make_worlds(
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
         friction: friction of the road, broadcast to [n]; it limits capacities to ``friction * GRAVITY_MPS2``. None: no
             limit.
-        harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0 and not 0 for all
-            vehicles of a world, broadcast to [n, N].
+        harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, and at least
+            ``LEAST_WEIGHT`` for one vehicle, broadcast to [n, N].
 
     Raises ``InvalidInput`` with the field, the first invalid entry and the valid range.
 
@@ -588,9 +590,11 @@ def make_worlds(
         _full("release_rate_mps3", release_rate_mps3, (n, N), 0.0, np.inf, open_low=True, finite=False),
         harm_weight=_full("harm_weight", harm_weight, (n, N), 0.0, np.inf),
     )
-    nobody = ~(vehicles.harm_weight > 0.0).any(axis=1)
+    nobody = ~(vehicles.harm_weight >= LEAST_WEIGHT).any(axis=1)
     if nobody.any():
-        raise InvalidInput(f"harm_weight[{int(np.argmax(nobody))}]: is 0 for all vehicles; must be above 0 for one")
+        raise InvalidInput(
+            f"harm_weight of world {int(np.argmax(nobody))}: must be at least {LEAST_WEIGHT:g} for one vehicle"
+        )
     speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
     if not np.all(speeds <= vehicles.speed_limit_mps):
         world, vehicle = np.argwhere(~(speeds <= vehicles.speed_limit_mps))[0]

@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from ethbrake_marl.files.model import UNSHOWN, refuse, require
 from ethbrake_marl.files.yaml import YamlPath, flow_text
+from ethbrake_marl.physics.state import LEAST_WEIGHT
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.fields import QUANTITY
@@ -58,6 +59,10 @@ def check_whole(scenario: ScenarioFields) -> None:
             right = f"must be below {horizon}, or the vehicle can never act"
             acts = support(latency)[1] < scenario.horizon_s
             require(acts, _path(scenario, "latency_s", i, kind), latency, right)
+    if scenario.declares("harm_weight"):
+        right = f"may be 0 for all vehicles; one vehicle at least must always have {LEAST_WEIGHT:g} or more"
+        weighs = any(low >= LEAST_WEIGHT for low, _ in scenario.bounds("harm_weight"))
+        require(weighs, ("harm_weight",), scenario.harm_weight, right)
     _check_reactions(scenario)
     _check_speeds(scenario)
     _check_derived(scenario)

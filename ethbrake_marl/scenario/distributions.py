@@ -73,6 +73,7 @@ class LogUniform(_Distribution):
     def _ordered(self) -> LogUniform:
         low, high = self.loguniform
         require(low > 0.0, ("loguniform",), self.loguniform, "low must be above 0")
+        require(math.isfinite(high / low), ("loguniform",), self.loguniform, "low must not be so near to 0")
         require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
         return self
 

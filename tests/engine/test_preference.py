@@ -59,7 +59,7 @@ def test_weights__reach_observations_as_shares_and_stay_through_an_episode() -> 
 
 
 def test_weights__stand_in_a_table_of_worlds_and_come_back() -> None:
-    scenario = PAPER.replace(harm_weight={"uniform": [0.0, 3.0]})
+    scenario = PAPER.replace(harm_weight=[{"uniform": [0.0, 3.0]}, 1, {"loguniform": [1e-3, 1]}])
     worlds = scenario.sample(4, 9).worlds
     again = eb.worlds_from_table(scenario, QUANTITY.columns(worlds))
     assert again.vehicles.harm_weight.tolist() == worlds.vehicles.harm_weight.tolist()
@@ -82,7 +82,10 @@ def test_weights__do_not_make_a_policy_unfamiliar(recwarn: pytest.WarningsRecord
 @pytest.mark.parametrize(
     ("weights", "words"),
     [
-        ([0, 0, 0], "harm_weight[0]: is 0 for all vehicles; must be above 0 for one"),
+        ([0, 0, 0], "harm_weight = [0, 0, 0]: may be 0 for all vehicles; one vehicle at least must always have 1e-06"),
+        ({"choice": [0, 1, 1]}, "may be 0 for all vehicles"),
+        ({"uniform": [0, 1]}, "may be 0 for all vehicles"),
+        ({"loguniform": [1e-320, 1]}, "low must not be so near to 0"),
         ([1, -1, 1], "harm_weight"),
         ([1, 1], "harm_weight"),
         ([1, float("nan"), 1], "harm_weight"),
@@ -93,3 +96,11 @@ def test_weights__that_are_none_are_refused(weights: object, words: str) -> None
     with pytest.raises(InvalidInput) as error:
         PAPER.replace(harm_weight=weights).sample(1, 0)
     assert words in str(error.value)
+
+
+def test_world__in_which_nobody_counts_is_refused_by_its_number() -> None:
+    with pytest.raises(InvalidInput, match="harm_weight of world 1: must be at least 1e-06 for one vehicle"):
+        eb.make_worlds(
+            [7.0, 7.0], [[20.0, 18.0, 20.0]] * 2, braking_capacity_mps2=6.0, driving_capacity_mps2=3.0, latency_s=0.0,
+            mass_t=4.5, restitution=0.1, harm_weight=[[1.0, 0.0, 0.0], [0.0, 0.0, 1e-9]],
+        )  # fmt: skip

@@ -113,13 +113,15 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "objective 'social:91': social needs an angle from 0 to 90 degrees": lambda: PAPER.replace(objective="social:91"),
     "objective 'social:nan': social needs an angle": lambda: PAPER.replace(objective="social:nan"),
     "objective 'social:4_5': social needs an angle": lambda: PAPER.replace(objective="social:4_5"),
-    "'weighted:0,0,0': weighted needs a weight from 0 to 1e6 for each vehicle, not 0 for all": lambda: PAPER.replace(
+    "'weighted:0,0,0': weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6": lambda: PAPER.replace(
         objective="weighted:0,0,0"
     ),
-    "'weighted:1,-1,1': weighted needs a weight from 0 to 1e6 for each vehicle": lambda: PAPER.replace(
+    "'weighted:1,-1,1': weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6": lambda: PAPER.replace(
         objective="weighted:1,-1,1"
     ),
-    "'weighted': weighted needs a weight from 0 to 1e6 for each vehicle": lambda: PAPER.replace(objective="weighted"),
+    "'weighted': weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6": lambda: PAPER.replace(
+        objective="weighted"
+    ),
     "scenario 'paper-random': objective = \"weighted:1,2\": objective 'weighted:1,2': 2 weights; 3": lambda: (
         PAPER.replace(objective="weighted:1,2")
     ),

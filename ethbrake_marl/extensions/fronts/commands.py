@@ -13,6 +13,8 @@ from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.extensions.studies.commands import FolderOption
 from ethbrake_marl.registry import Part
 
+DEFAULT_AGENTS = "e_v2x_bm,universal@shipped"  # beside the front of one learner
+
 
 def front_command(
     output: FolderOption,
@@ -20,8 +22,13 @@ def front_command(
         str, typer.Option(metavar="NAME|PATH", help="Scenario whose learners are searched.")
     ] = "paper-random",
     agents: Annotated[
-        str, typer.Option(metavar="A,B,...", help="Agents to show beside the front.")
-    ] = "e_v2x_bm,universal@shipped",
+        str | None,
+        typer.Option(
+            metavar="A,B,...",
+            help="Agents to show beside the front.",
+            show_default="of one learner e_v2x_bm, universal@shipped",
+        ),
+    ] = None,
     weights: Annotated[
         list[str] | None,
         typer.Option(metavar="W1,W2,...", help="One weight per vehicle. Repeatable.", show_default="a grid"),
@@ -37,7 +44,8 @@ def front_command(
 ) -> None:
     """Show what each choice of whose harm counts costs whom.
 
-    Searches every world for the least weighted harm, for each set of weights, and drives the agents beside it. Writes
+    Searches every world for the least weighted harm, for each set of weights, and drives the agents beside it (one
+    learner only). Writes
     front.json, front.png and, for three vehicles, front-ternary.png. The corners, where one vehicle counts first and
     the others only between equals, are part of a grid. Beside the front stand full braking, and maximin: the least harm
     of whoever bears most.
@@ -59,20 +67,18 @@ def front_command(
         else:
             rows = parsed_weights(weights, chosen.vehicles)
         check_folder(output, ("front.json", "front.png", "front-ternary.png"), force=force)
-        output.mkdir(parents=True, exist_ok=True)
         sample = chosen.sample(episodes, seed)
-        others = [spec for spec in split_specs(agents) if spec != "full_brake"]
-        several = len(chosen.learners) > 1
-        if several and others:
-            out.note(f"{chosen.name} has {len(chosen.learners)} learners: no agents beside its front")
+        beside_it = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""
+        others = [spec for spec in split_specs(beside_it) if spec != "full_brake"] if beside_it else []
         front = search_front(
             chosen, sample.worlds, rows, harm_count=task.harm_count, budget=budget, threads=jobs or 1,
-            agents=() if several else others, on_progress=lambda done, total: out.progress("front", done, total),
+            agents=others, on_progress=lambda done, total: out.progress("front", done, total),
         )  # fmt: skip
         largest = least_largest(chosen, sample.worlds, front, budget=budget, threads=jobs or 1)
         beside = {"full_brake": full_braking(chosen, sample), "maximin": largest}
         found = front_results(front, chosen, sample, beside, seed)
         found |= {"budget": budget, "settings": list(settings or ())}
+        output.mkdir(parents=True, exist_ok=True)
         out.write(output / "front.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
         for name, figure in front_figures(found).items():
             out.write(output / name, picture_bytes(figure, name), "figure")

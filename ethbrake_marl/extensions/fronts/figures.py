@@ -43,11 +43,12 @@ def sum_figure(found: Json) -> Figure:
     figure, (axes,) = new_panels((WIDTH_IN, 4.6))
     for name, harm, style in _series(found):
         axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(FuncFormatter(plain))
-        axis.set_minor_formatter(FuncFormatter(plain))
+    if all((harm.max(axis=1) > 0.0).all() for _, harm, _ in _series(found)):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(FuncFormatter(plain))
+            axis.set_minor_formatter(FuncFormatter(plain))
     axes.tick_params(which="minor", labelsize=7)
     count = {"first": "first impacts", "total": "all impacts"}[found["harm_count"]]
     name_axes(axes, x=f"Harm of the line, {count} (m²/s²)", y="Harm of the vehicle that bears most (m²/s²)")

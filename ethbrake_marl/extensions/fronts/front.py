@@ -7,6 +7,7 @@ it is exact as far as the searches are. No bound is proven for it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.engine.profiles import ProfileProblem, Profiles
-from ethbrake_marl.errors import check_one_learner
+from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.fronts.hypervolume import nondominated
 from ethbrake_marl.extensions.fronts.weights import checked_weights
@@ -32,6 +33,7 @@ from ethbrake_marl.extensions.search.shipped import shipped_profiles
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.game.objectives import weighted_harm
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
+from ethbrake_marl.policies.shipped import SHIPPED, shipped_policies
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
@@ -45,7 +47,7 @@ FIRST_SHARE = 0.6  # share of the budget for the first round; the second one sta
 
 Borne = Mapping[HarmCount, Floats]
 
-Progress = Callable[[int, int], None]  # called with the number of worlds done and their total
+Progress = Callable[[int, int], None]  # called with the number of searches done and their total
 
 
 class Front(NamedTuple):
@@ -97,8 +99,8 @@ def search_front(
     """Search the least weighted harm of every world under every set of weights.
 
     The result is in every world at least as good, under its weights, as ``CONSTANTS`` constant commands, as what was
-    found for any other weights, as the shipped profile of least harm, and as ``agents``. It does not depend on
-    ``threads`` or on the other worlds.
+    found for any other weights, as the shipped profile of least harm, as ``agents``, and, with one learner, as every
+    shipped policy that can drive it. It does not depend on ``threads`` or on the other worlds.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -117,7 +119,7 @@ def search_front(
         threads: number of threads.
         agents: specs of agents of the one learner, such as ``policy@shipped``. Each drives every world once for each
             set of weights, as the scenario's ``harm_weight`` and objective ``preference``.
-        on_progress: called with the number of worlds done and their total.
+        on_progress: called with the number of searches done and their total, two for each world and set of weights.
 
     Raises ``InvalidInput`` for weights that ``checked_weights`` refuses or agents beside several learners, and what
     ``best_harm`` and ``make_agents`` raise.
@@ -128,13 +130,19 @@ def search_front(
     effort = {"budget": budget, "seed": seed, "threads": threads}
     if agents:
         check_one_learner(scenario.name, [scenario.vehicle_names[i] for i in scenario.learners], "agents drive one")
-    preferring = [Preferring.of(scenario, row, agents, harm_count) for row in weights]
-    parts = []
+    silent = _shipped_specs(scenario) if len(scenario.learners) == 1 else ()
+    preferring = [Preferring.of(scenario, row, agents, silent, harm_count) for row in weights]
+    parts, done = [], 0
+
+    def tell(more: int) -> None:
+        nonlocal done
+        done += more
+        if on_progress is not None:
+            on_progress(done, 2 * len(weights) * worlds.n)
+
     for first in range(0, worlds.n, CHUNK):
         some = worlds.take(np.arange(first, min(first + CHUNK, worlds.n)))
-        parts.append(_searched(some, task, weights, effort, preferring))
-        if on_progress is not None:
-            on_progress(first + some.n, worlds.n)
+        parts.append(_searched(some, task, weights, effort, preferring, tell))
     profiles = []
     for several in zip(*(part.profiles for part in parts), strict=True):
         padded = Profiles.padded(several, 1)
@@ -176,13 +184,17 @@ class Preferring(NamedTuple):
     """A scenario in which the harm of the vehicles has given weights, and agents made for it."""
 
     scenario: Scenario  # with fixed ``harm_weight`` and the objective ``preference``
-    agents: Mapping[str, Driver]  # spec -> agent
+    agents: Mapping[str, Driver]  # spec -> agent, to be shown
+    silent: Mapping[str, Driver]  # spec -> further agents, whose episodes count as candidates only
 
     @classmethod
-    def of(cls, scenario: Scenario, weights: Floats, agents: Sequence[str], harm_count: HarmCount) -> Preferring:
+    def of(
+        cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
+    ) -> Preferring:
         """Return the scenario with ``weights`` [N], and the agents with these specs for it."""
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
-        return cls(fixed, make_agents(agents, fixed, harm_count=harm_count))
+        made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
+        return cls(fixed, *made)
 
     def weighted(self, worlds: Worlds) -> Worlds:
         """Return the worlds with the weights of this scenario."""
@@ -190,8 +202,23 @@ class Preferring(NamedTuple):
         return replace(worlds, vehicles=replace(worlds.vehicles, harm_weight=weight))
 
 
+def _shipped_specs(scenario: Scenario) -> list[str]:
+    """Return the specs of all shipped policies that can drive the one learner of the scenario."""
+    found = []
+    for name in shipped_policies():
+        with suppress(InvalidInput):
+            make_agents([f"policy@{SHIPPED}/{name}"], scenario)
+            found.append(f"policy@{SHIPPED}/{name}")
+    return found
+
+
 def _searched(
-    worlds: Worlds, task: Task, weights: Floats, effort: Mapping[str, int], preferring: Sequence[Preferring]
+    worlds: Worlds,
+    task: Task,
+    weights: Floats,
+    effort: Mapping[str, int],
+    preferring: Sequence[Preferring],
+    tell: Callable[[int], None],
 ) -> Front:
     """Return the front of a few worlds, from two rounds of searches, one per set of weights each.
 
@@ -201,6 +228,7 @@ def _searched(
         weights: [W, N] weights.
         effort: keywords ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
         preferring: for each set of weights the agents whose episodes count too.
+        tell: called after each search with the number of worlds.
 
     """
     problem, pool = task_problem(worlds, task), Pool()
@@ -210,10 +238,10 @@ def _searched(
         pool.add(problem, constants.take(slice(q, None, CONSTANTS)))
     if len(task.vehicles) == 1:
         pool.add(problem, shipped_profiles(problem, task.harm_count)[0])
-    driven: dict[str, list[Borne]] = {name: [] for name in preferring[0].agents}
+    driven: dict[str, list[Borne]] = {name: [] for name in (*preferring[0].agents, *preferring[0].silent)}
     for each in preferring:
         theirs = Task(each.scenario, task.vehicles, task.harm_count)
-        for name, agent in each.agents.items():
+        for name, agent in (*each.agents.items(), *each.silent.items()):
             if driven[name] and not observes_weights(agent):
                 driven[name].append(driven[name][0])
                 continue
@@ -225,10 +253,11 @@ def _searched(
         for row, aim in zip(weights, aims, strict=True):
             given = [startable(pool.best(row, task.harm_count)), *(starts if k == 0 else ())]
             pool.add(problem, search_profiles(aim, joined(given, worlds.n), **spent)[0])
+            tell(worlds.n)
     borne, best = pool.least(weights, task.harm_count)
     told = {
-        name: {count: np.stack([each[count] for each in parts]) for count in HARM_COUNTS}
-        for name, parts in driven.items()
+        name: {count: np.stack([each[count] for each in driven[name]]) for count in HARM_COUNTS}
+        for name in preferring[0].agents
     }
     return Front(weights, task.harm_count, borne, best, told)
 
@@ -259,8 +288,9 @@ class Pool:
 
         ``weights`` [N] weigh the harm of each vehicle in the given count.
         """
-        amounts = np.stack([amounts_of(borne, weights) for borne in self._borne[harm_count]])
-        whole = np.stack([borne.sum(axis=1) for borne in self._borne[harm_count]])
+        borne = np.stack(self._borne[harm_count])
+        amounts = amounts_of(borne.reshape(-1, len(weights)), weights).reshape(borne.shape[:2])
+        whole = borne.sum(axis=2)
         least = amounts.min(axis=0)
         return np.asarray(np.where(amounts == least, whole, np.inf).argmin(axis=0))
 

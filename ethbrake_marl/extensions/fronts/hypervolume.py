@@ -36,11 +36,15 @@ def hypervolume(points: Floats, reference: Floats) -> float:
         points: [Q, N].
         reference: [N].
 
-    Raises ``InvalidInput`` for more than ``MOST_DIMENSIONS`` coordinates.
+    Raises ``InvalidInput`` for more than ``MOST_DIMENSIONS`` coordinates, other shapes, or infinite numbers.
 
     """
     if len(reference) > MOST_DIMENSIONS:
         raise InvalidInput(f"hypervolume: {len(reference)} vehicles; it is computed for at most {MOST_DIMENSIONS}")
+    finite = np.isfinite(points).all() and np.isfinite(reference).all()
+    if points.ndim != 2 or points.shape[1] != len(reference) or not finite:
+        shapes = f"points {points.shape}, reference {reference.shape}"
+        raise InvalidInput(f"hypervolume: {shapes}: must be finite numbers, as [Q, N] and [N]")
     return _volume(points[(points < reference).all(axis=1)], reference)
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from math import comb
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.physics.state import Floats, checked_numbers
+from ethbrake_marl.physics.state import LEAST_WEIGHT, Floats, checked_numbers
+
+MOST = 1_000  # most sets of weights
 
 STEPS = 5  # default number of steps along an edge of the grid: 21 weights of three vehicles
 
@@ -18,7 +21,8 @@ SLIGHT = 1e-4  # weight of the others in a corner, so that their harm decides be
 def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     """Return evenly spaced weights of the vehicles' harm that sum to 1, [W, N].
 
-    Neighbours in the list differ by one step. Raises ``InvalidInput`` for less than one step.
+    Neighbours in the list differ by one step. Raises ``InvalidInput`` for less than one step, or more than ``MOST``
+    sets.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -30,6 +34,12 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
 
     """
     check_whole_number("steps of the weights", steps, 1)
+    number = comb(steps + vehicles - 1, steps)
+    if number > MOST:
+        raise InvalidInput(
+            f"{steps} steps: {number:,} sets of weights of {vehicles} vehicles; at most {MOST:,}: take fewer steps, or"
+            " list the weights"
+        )
 
     def shares(number: int, left: int) -> Iterator[list[int]]:
         if number == 1:
@@ -52,15 +62,16 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
     """Return weights of the vehicles' harm as an array [W, N].
 
     Raises ``InvalidInput`` naming the first row that has another number of weights than ``vehicles``, a weight that is
-    negative or not finite, or only zeros.
+    neither 0 nor from 1e-6 to 1e6, or only zeros.
     """
     rows = [checked_numbers("weights", row) for row in weights]
     for k, row in enumerate(rows):
-        if row.shape != (vehicles,) or not (np.isfinite(row).all() and (row >= 0.0).all() and (row > 0.0).any()):
+        good = (row == 0.0) | ((row >= LEAST_WEIGHT) & (row <= 1.0 / LEAST_WEIGHT))
+        if row.shape != (vehicles,) or not (good.all() and row.any()):
             told = ",".join(f"{weight:g}" for weight in row.ravel())
             raise InvalidInput(
-                f"weights[{k}] = {told}: must be {vehicles} finite numbers of at least 0, one per vehicle and not all"
-                " 0, as in 1,4,1"
+                f"weights[{k}] = {told}: must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6 to 1e6 and"
+                " not all 0, as in 1,4,1"
             )
     if not rows:
         raise InvalidInput("weights: there are none; give at least one row, as in 1,4,1")

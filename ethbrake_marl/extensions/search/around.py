@@ -32,7 +32,7 @@ class Searched(AgentAround):
 
     Args:
         policy: the agent around whose episode it searches.
-        scenario: the scenario in which it searches.
+        scenario: the scenario in which it searches, whose objective it minimises.
         candidates: number of candidates in each world.
         harm_count: harm to minimise, ``first`` or ``total``.
 
@@ -55,7 +55,7 @@ class Searched(AgentAround):
         check_harm_count(harm_count)
         super().__init__(policy, f"{policy.name}+search")
         self.scenario, self._candidates = scenario, candidates
-        self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s)
+        self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s, scenario.objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """Simulate the policy's episode from the alert, search around it, and return the best commands as memory.

@@ -31,23 +31,36 @@ def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, 
     answer = ethbrake(*line.split(), "--set", "harm_count=total", "--output", "out")
     found = told_json(answer)
     assert (found["harm_count"], found["agents"]) == ("total", {}) and len(found["points"]) == 2
-    assert "has 3 learners: no agents beside its front" in answer.err
 
 
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ("--weights 1,1", ("weights[0] = 1,1", "must be 3 finite numbers", "1,4,1")),
-        ("--weights 1,-1,1", ("weights[0] = 1,-1,1", "at least 0")),
+        ("--weights 1,1", ("weights[0] = 1,1", "must be 3 numbers", "1,4,1")),
+        ("--weights 1,-1,1", ("weights[0] = 1,-1,1", "each 0 or from 1e-6")),
         ("--weights 0,0,0", ("not all 0",)),
         ("--weights 1,x,1", ("'1,x,1'", "numbers with commas")),
         ("--weights 1,inf,1", ("numbers with commas",)),
         ("--agents nobody", ("unknown agent 'nobody'",)),
+        ("--scenario cooperation-4-all --agents full_brake,coast", ("agents drive one",)),
+        ("--steps 50", ("1,326 sets of weights", "at most 1,000")),
         ("--set roles.vehicle_2=full_brake", ("learner",)),
     ],
 )
 def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple[str, ...]) -> None:
     refuse(f"study front {given} --output out", *words)
+
+
+@pytest.mark.filterwarnings("error")
+def test_front__without_any_harm_has_a_figure_and_no_warning(ethbrake: Command, empty_folder: Path) -> None:
+    line = "study front --weights 1,1,1 --episodes 3 --budget 50 --agents coast --output out"
+    answer = ethbrake(*line.split(), "--set", "gaps_m=1000")
+    assert answer.status == 0 and Path("out/front.png").is_file(), answer.err
+
+
+def test_front__leaves_no_folder_after_an_error(ethbrake: Command, empty_folder: Path) -> None:
+    assert ethbrake(*["study", "front", "--agents", "constant:99", "--output", "out"]).status == 2
+    assert not Path("out").exists()
 
 
 def test_front__does_not_replace_results(ethbrake: Command, empty_folder: Path) -> None:

@@ -31,6 +31,17 @@ def test_point__is_never_beaten_under_its_weights_by_another_point_a_constant_or
             assert (least <= amounts_of(borne, row)).all()
 
 
+def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None:
+    obstacle = eb.load_scenario("paper-random-obstacle")
+    worlds, row = obstacle.sample(30, 777).worlds, [0.2, 0.8, 0.0]
+    found = search_front(obstacle, worlds, [row], budget=30, harm_count="total")
+    fixed = obstacle.replace(harm_weight=row, objective="preference")
+    for name in ("universal", "options-paper-random-obstacle-total"):
+        agent = eb.make_agent(f"policy@shipped/{name}", scenario=fixed)
+        outcome = eb.evaluate(worlds, {"it": agent}, scenario=obstacle, aftermath=False).outcome("it")
+        assert (found.amounts[0] <= amounts_of(outcome.vehicle_harm("total"), np.array(row))).all()
+
+
 def test_agents__beside_the_front_bear_what_an_evaluation_says(front: Front) -> None:
     fixed = PAPER.replace(harm_weight=WEIGHTS[4].tolist(), objective="preference")
     for spec in AGENTS:
@@ -85,5 +96,5 @@ def test_team__has_a_front_but_no_agents() -> None:
 
 
 def test_weights__of_another_number_are_refused() -> None:
-    with pytest.raises(InvalidInput, match="must be 3 finite numbers"):
+    with pytest.raises(InvalidInput, match="must be 3 numbers"):
         search_front(PAPER, WORLDS, [[1.0, 1.0]])

@@ -23,12 +23,19 @@ def test_corners__put_one_vehicle_first() -> None:
 
 @pytest.mark.parametrize(
     "row",
-    [[1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 0.0, 0.0], [math.nan, 1.0, 1.0], [math.inf, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0]],
+    [
+        [1.0, 1.0],
+        [1.0, -1.0, 1.0],
+        [0.0, 0.0, 0.0],
+        [math.nan, 1.0, 1.0],
+        [math.inf, 1.0, 1.0],
+        [1e7, 1.0, 1.0],
+        [1e-7, 1.0, 1.0],
+        [1.0, 1.0, 1.0, 1.0],
+    ],
 )
 def test_weights__that_are_none_are_refused_by_row(row: list[float]) -> None:
-    with pytest.raises(
-        InvalidInput, match=r"weights\[1\] = .*: must be 3 finite numbers of at least 0, one per vehicle"
-    ):
+    with pytest.raises(InvalidInput, match=r"weights\[1\] = .*: must be 3 numbers, one per vehicle, each 0 or from"):
         checked_weights([[1.0, 0.0, 0.0], row], 3)
 
 
@@ -41,3 +48,9 @@ def test_text__that_is_no_list_of_numbers_is_refused(text: str) -> None:
 def test_weights__none_at_all_is_refused() -> None:
     with pytest.raises(InvalidInput, match="there are none"):
         checked_weights([], 3)
+
+
+@pytest.mark.parametrize(("vehicles", "steps"), [(3, 50), (8, 50), (3, 1_000_000)])
+def test_grid__of_too_many_weights_is_refused_at_once(vehicles: int, steps: int) -> None:
+    with pytest.raises(InvalidInput, match=r"sets of weights of . vehicles; at most 1,000: take fewer steps"):
+        weight_grid(vehicles, steps)
