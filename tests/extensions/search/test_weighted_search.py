@@ -1,12 +1,14 @@
 """A search that minimises weighted harm of the vehicles, or the largest, instead of the harm of the line."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.engine.profiles import Profiles
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.search.best_harm import task_problem
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
+from ethbrake_marl.extensions.search.best_harm import best_harm, fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.problem import search_profiles
 from ethbrake_marl.game.objectives import aim_of, parse_objective
 from ethbrake_marl.scenario.task import Task
@@ -62,3 +64,55 @@ def test_search__of_an_objective_does_no_worse_by_it_than_what_it_starts_with(te
 def test_aim__of_what_is_no_weighted_sum_is_refused() -> None:
     with pytest.raises(InvalidInput, match=r"objective 'injury': is no weighted sum of the vehicles' harm; known: "):
         aim_of(parse_objective("injury:lr4s"), eb.load_scenario("paper-random").sample(1, 0).worlds.vehicles, 1)
+
+
+@pytest.mark.parametrize("spec", ["planner:100", "best_harm:300", "universal@shipped+search"])
+def test_agent__that_searches_follows_the_objective_of_the_scenario(spec: str) -> None:
+    scenario = eb.load_scenario("paper-random").replace(objective=["total", "weighted:1,0,0", "own"])
+    worlds = scenario.sample(30, 8).worlds
+    agents = {name: eb.make_agent(name, scenario=scenario) for name in ("full_brake", "universal@shipped", spec)}
+    found = eb.evaluate(worlds, agents, scenario=scenario, aftermath=False)
+    least = found.outcome(spec).vehicle_harm("first")[:, 0].mean()
+    assert least < 0.95 * min(found.outcome(name).vehicle_harm("first")[:, 0].mean() for name in [*agents][:2])
+    predicted = found.outcome(spec).predicted_harm  # the amount of the objective: 3 times Vehicle 1's harm
+    assert (3.0 * found.outcome(spec).vehicle_harm("first")[:, 0] <= predicted + 1e-6).all()
+
+
+@pytest.mark.parametrize("spec", ["planner:100", "best_harm:300", "full_brake+search"])
+def test_agent__that_searches_refuses_an_objective_that_is_no_sum(spec: str) -> None:
+    scenario = eb.load_scenario("paper-random").replace(objective="injury:lr4s")
+    agent = eb.make_agent(spec, scenario=scenario)
+    with pytest.raises(EthBrakeError, match="is no weighted sum of the vehicles' harm"):
+        eb.evaluate(scenario.sample(2, 8).worlds, {"it": agent}, scenario=scenario)
+
+
+def test_table__of_an_objective_says_so_and_is_not_folded_with_harm_of_the_line() -> None:
+    scenario = eb.load_scenario("paper-random")
+    worlds = scenario.sample(6, 8).worlds
+    table = best_harm(scenario, worlds, counts=("first",), budget=300, objective="weighted:1,0,0", threads=1)
+    plain = best_harm(scenario, worlds, counts=("first",), budget=300, threads=1)
+    again = best_harm(scenario, worlds, counts=("first",), budget=300, objective="weighted:1,0,0", known=plain)
+    assert (
+        table.header["objective"] == again.header["objective"] == "weighted:1,0,0" and "objective" not in plain.header
+    )
+    profiles, _ = plain.profiles(plain.identity, "first", problem_of(scenario, worlds).last_step)
+    of_first = 3.0 * problem_of(scenario, worlds).borne(profiles)["first"][:, 0]
+    assert (again.best["first"].harm <= of_first + 1e-6).all()
+    with pytest.raises(InvalidInput, match="table of the objective 'weighted:1,0,0': give one of the line's harm"):
+        fold_episodes(table, scenario, worlds, "coast", {"first": eb.make_agent("coast")})
+
+
+def test_vehicles__that_minimise_different_amounts_cannot_be_searched_together() -> None:
+    pair = eb.load_scenario("cooperation-3-pair")
+    with pytest.raises(InvalidInput, match="its 2 vehicles minimise different amounts"):
+        best_harm(pair, pair.sample(2, 1).worlds, counts=("first",), budget=50, objective="own")
+
+
+def test_chunks__of_another_objective_are_searched_again(tmp_path: Path) -> None:
+    scenario = eb.load_scenario("paper-random")
+    sample = scenario.sample(3, 8)
+    found = [
+        search_list(scenario, sample, counts=("first",), budget=100, chunks=tmp_path, objective=text).best["first"].harm
+        for text in ("total", "weighted:1,0,0", "total")
+    ]
+    assert found[0].tolist() == found[2].tolist() != found[1].tolist()
