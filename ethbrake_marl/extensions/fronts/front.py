@@ -130,7 +130,7 @@ def search_front(
     effort = {"budget": budget, "seed": seed, "threads": threads}
     if agents:
         check_one_learner(scenario.name, [scenario.vehicle_names[i] for i in scenario.learners], "agents drive one")
-    silent = _shipped_specs(scenario) if len(scenario.learners) == 1 else ()
+    silent = [spec for spec in _shipped_specs(scenario) if spec not in agents] if len(scenario.learners) == 1 else []
     preferring = [Preferring.of(scenario, row, agents, silent, harm_count) for row in weights]
     parts, done = [], 0
 
