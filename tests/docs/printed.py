@@ -172,11 +172,14 @@ TABLES: dict[str, How] = {
     "| work | has | lacks": _by(BY_HAND),
     "| you write | values": _by(BY_HAND),
     "| for | recipe | scenario | differs": _by(BY_HAND),
+    "| Vehicle 2 minimises": _by(SEARCH),
+    "| level | joint optimum | selfish": _by(SEARCH),
 }
 
 PICTURES: dict[str, How] = {
     "emergency.svg": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal@shipped --output emergency.svg"),
     "game-loop.svg": _by(BY_HAND),
+    "front": _by(SEARCH),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),
     "deceleration.png": _by(
         NIGHTLY,

@@ -178,15 +178,17 @@ def test_with_obstacle__writes_it_out_in_front() -> None:
 
 def test_packed__columns_follow_each_other_without_a_hole() -> None:
     # 3 vehicles, 2 pairs: time | speeds 3 | commands 3 | before 3 | gaps 2 | hit 2 | first 2 | total 2 | count 2 and
-    # restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | brake rate 3 | release rate 3 | own latency
-    # 3 | news 9
+    # restitution | braking 3 | driving 3 | latency 3 | mass 3 | limit 3 | brake rate 3 | release rate 3 | weight of
+    # harm 3 | own latency 3 | news 9
     rows = Packed.of(line([5.0, 6.0], [9.0, 9.0, 9.0]))
-    assert places(rows.state) == rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 22, 25, 34)
+    assert (
+        places(rows.state) == rows.column == (3, 0, 1, 4, 7, 10, 12, 14, 20, 0, 1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 37)
+    )
     assert rows.state.shape == (1, 20)
-    assert rows.params.shape == (1, 22)
+    assert rows.params.shape == (1, 25)
     wide = rows.widened(obstacle=True, news=True)
     assert wide.state.shape == (1, 25)
-    assert wide.params.shape == (1, 34)
+    assert wide.params.shape == (1, 37)
 
 
 def test_packed__ledger_is_that_of_the_columns_of_harm_in_its_own_memory() -> None:

@@ -67,7 +67,7 @@ def ternary_figure(found: Json) -> Figure:
             ends = np.full((2, 3), 0.0)
             ends[:, i] = share
             ends[0, (i + 1) % 3] = ends[1, (i + 2) % 3] = 1.0 - share
-            axes.plot(*(ends @ _CORNERS).T, color="#dddddd", linewidth=0.6, zorder=0)
+            axes.plot(*_places(ends), color="#dddddd", linewidth=0.6, zorder=0)
     for name, at, up in zip(found["vehicles"], _CORNERS, ("top", "top", "bottom"), strict=True):
         axes.annotate(
             f"{name} bears all",
@@ -83,7 +83,7 @@ def ternary_figure(found: Json) -> Figure:
     for name, harm, style in series:
         whole = harm.sum(axis=1)
         some = whole > 0.0
-        x, y = (harm[some] / whole[some, np.newaxis] @ _CORNERS).T
+        x, y = _places(harm[some] / whole[some, np.newaxis])
         points = axes.scatter(
             x, y, s=34.0, c=whole[some], marker=style["marker"], cmap="viridis", edgecolors="white", linewidths=0.5,
             vmin=sums.min(), vmax=sums.max(),
@@ -93,6 +93,12 @@ def ternary_figure(found: Json) -> Figure:
     bar.set_label("Harm of the line (m²/s²)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     return finish(figure, _caption(found), axes, columns=2, fontsize=8)
+
+
+def _places(shares: Floats) -> Floats:
+    """Return x and y of points in the triangle, [2, k], from the shares of the three vehicles, [k, 3]."""
+    places: Floats = (shares[:, :, np.newaxis] * _CORNERS).sum(axis=1).T
+    return places
 
 
 def _series(found: Json) -> list[tuple[str, Floats, dict[str, Any]]]:

@@ -102,10 +102,9 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     if "front" in front.agents:
         raise InvalidInput("agent 'front': this name stands for the front itself; give the agent another name")
     n = len(full_brake)
-    shares = np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), RESAMPLES) / n
-    shares = np.concatenate([np.full((1, n), 1.0 / n), shares])  # row 0: all worlds alike
-    points = {name: np.einsum("rn,wnv->rwv", shares, borne) for name, borne in sets.items()}
-    braking = shares @ full_brake
+    draws = [np.arange(n), *np.random.default_rng(0).integers(n, size=(RESAMPLES, n))]  # first: all worlds, each once
+    points = {name: np.stack([borne[:, rows].mean(axis=1) for rows in draws]) for name, borne in sets.items()}
+    braking = np.stack([full_brake[rows].mean(axis=0) for rows in draws])
     found = []
     for words, reference in (
         ("full braking", braking),
