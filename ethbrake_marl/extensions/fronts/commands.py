@@ -45,10 +45,9 @@ def front_command(
     """Show what each choice of whose harm counts costs whom.
 
     Searches every world for the least weighted harm, for each set of weights, and drives the agents beside it (one
-    learner only). Writes
-    front.json, front.png and, for three vehicles, front-ternary.png. The corners, where one vehicle counts first and
-    the others only between equals, are part of a grid. Beside the front stand full braking, and maximin: the least harm
-    of whoever bears most.
+    learner only). Without --weights these are a grid, equal weights, and corners, in which one vehicle counts first and
+    the others only between equals. Beside the front stand full braking, and maximin: the least harm of whoever bears
+    most. Writes front.json, front.png and, for three vehicles, front-ternary.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
@@ -63,7 +62,8 @@ def front_command(
         task = read_task(scenario, settings)
         chosen = task.scenario
         if weights is None:
-            rows = np.concatenate([weight_grid(chosen.vehicles, steps), corners(chosen.vehicles)])
+            N = chosen.vehicles
+            rows = np.concatenate([weight_grid(N, steps), np.ones((1, N)), corners(N)])
         else:
             rows = parsed_weights(weights, chosen.vehicles)
         check_folder(output, ("front.json", "front.png", "front-ternary.png"), force=force)

@@ -16,7 +16,9 @@ def test_front__writes_json_and_two_figures_and_prints_both_counts(ethbrake: Com
     assert answer.status == 0, answer.err
     found = json.loads(Path("out/front.json").read_text())
     assert [point["weights"] for point in found["points"][:3]] == [[0, 0, 1], [0, 1, 0], [1, 0, 0]]
-    assert len(found["points"]) == len(found["agents"]["e_v2x_bm"]) == 6  # three corners, and three that break ties
+    assert (
+        len(found["points"]) == len(found["agents"]["e_v2x_bm"]) == 7
+    )  # corners, equal weights, corners that break ties
     assert found["agents"]["e_v2x_bm"][1]["ratio"] >= 1.0
     assert {each["reference"] for each in found["hypervolume"]} == {"full braking", "largest harm of each vehicle"}
     for name in ("front.png", "front-ternary.png"):
