@@ -13,44 +13,71 @@ from ethbrake_marl.registry import Part
 
 
 def from_data_command(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings.")],
-    format: Annotated[Literal["highd", "ngsim", "openacc"], typer.Option(help="Format of the recordings.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings, searched with all below; or one file.")
+    ],
+    format: Annotated[
+        Literal["highd", "exid", "ngsim", "openacc", "table"],
+        typer.Option(help="Format of the recordings; table: CSV or Parquet whose columns you name."),
+    ],
     output: Annotated[
         Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows stand in the .csv beside.")
     ],
+    columns: Annotated[
+        str,
+        typer.Option(
+            metavar="ROLE=COLUMN,...",
+            help="Of table: time=T,vehicle=V,lane=L,front=X,length=B,speed=S,units=m|ft|km/h. time is in s (T/1000: in"
+            " ms, T/25: frames at 25 Hz); front is where the front bumper is, and must grow along travel: turn its sign"
+            " for the other direction. With m, speed is in m/s; with ft, in ft/s; with km/h, lengths are in m.",
+        ),
+    ] = "",
     based_on: Annotated[
         str,
-        typer.Option(metavar="NAME|PATH", help="Scenario for what is not recorded, and for the number of vehicles."),
+        typer.Option(
+            metavar="NAME|PATH",
+            help="Scenario for what is not recorded, and for the number of vehicles: realistic-pair for two.",
+        ),
     ] = "realistic-motorway",
     every: Annotated[float, typer.Option(help="Seconds between two moments that become rows.")] = 1.0,
     draw: Annotated[
         Literal["rows", "normal", "lognormal", "quantiles"],
         typer.Option(help="Draw whole rows, or each quantity from a fit to it."),
     ] = "rows",
+    strict: Annotated[bool, typer.Option("--strict", help="Write nothing if one of the files is refused.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
+    """Make a scenario of recorded traffic: highD, exiD, NGSIM, OpenACC, or any table of trajectories.
 
     Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
     """
     with Out(as_json=as_json, force=force) as out:
-        from ethbrake_marl.extensions.recorded.traffic import scenario_from_data
+        from ethbrake_marl.extensions.recorded.scenario import RefusedFiles, scenario_from_data
 
         rows = output.with_suffix(".csv")
         out.check(output, ".yaml", what="the scenario")
         out.check(rows)
-        text, table, told = scenario_from_data(
-            output.stem, folder, format, based_on=based_on, every_s=every, draw=draw, progress=out.progress
-        )
+        try:
+            made = scenario_from_data(
+                output.stem, folder, format, columns=columns, based_on=based_on, every_s=every, draw=draw,
+                strict=strict, progress=out.progress,
+            )  # fmt: skip
+        except RefusedFiles as error:
+            for each in error.files:
+                out.note(each)
+            raise
+        for each in made.refused:
+            out.note(f"refused: {each}")
         with new_file(output) as partial:
-            partial.write_text(text, "utf-8")
+            partial.write_text(made.text, "utf-8")
             if draw == "rows":
-                out.write(rows, table, what="rows")
+                out.write(rows, made.csv, what="rows")
             else:  # remove the rows of an earlier run, to which no scenario refers any more
                 rows.unlink(missing_ok=True)
         out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
-        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, "found": told}, *told)
+        lists = {"found": made.found, "refused": made.refused, "skipped": made.skipped}
+        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, **lists}, *made.found)
 
 
 FROM_DATA = Part(

@@ -11,10 +11,16 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.recorded import traffic as recorded
-from ethbrake_marl.extensions.recorded.traffic import DataDraw, scenario_from_data
+from ethbrake_marl.extensions.recorded import folder as of_folder, reading
+from ethbrake_marl.extensions.recorded.fits import DataDraw
+from ethbrake_marl.extensions.recorded.scenario import FromData, scenario_from_data
 from tests.docs.site import DOCS
 from tests.fixtures.recordings import HIGHD, write_files, write_highd, write_ngsim, write_openacc
+
+
+def rows_of(made: FromData) -> list[str]:
+    """The rows without the recording."""
+    return [line.rpartition(",")[0] for line in made.csv.splitlines()[1:]]
 
 
 def track(frame: int, who: int, x: float, width: float, v: float, ahead: int, lane: int = 6) -> str:
@@ -34,22 +40,26 @@ def test_rows__are_bumper_to_bumper_in_both_directions_and_no_vehicle_is_in_two(
     rows += [track(2, k, 0, 4, 0, 0) for k in range(1, 6)]  # at no moment that is looked at
     rows += [track(26, 1, 100, 4, 20, 0), track(26, 2, 80, 4, 20, 1, 5), track(26, 3, 60, 4, -0.1, 2, 5)]  # no queue
     rows += [track(51, k, 500 - 20 * k, 4, 0, k - 1 if k > 1 else 0) for k in (1, 2, 3)]  # these stand
-    text, csv, told = scenario_from_data("mine", recording(tmp_path, rows, "2222211"), "highd")
-    assert csv.splitlines()[1:] == ["16.0,16.0,29.0,28.0,27.0", "16.0,16.0,0.0,0.0,0.0"]
-    assert told[1:] == [
+    made = scenario_from_data("mine", recording(tmp_path, rows, "2222211"), "highd")
+    assert made.csv.splitlines()[1:] == [
+        "16.0,16.0,29.0,28.0,27.0,01_tracks.csv: 1-2-3",
+        "16.0,16.0,0.0,0.0,0.0,01_tracks.csv: 1-2-3",
+    ]
+    assert made.found[1:] == [
+        "rows of 1 different trio of vehicles in 1 recording",
         "left out: 2 links to another lane, or of a vehicle that rolls backwards",
         "left out: 7 vehicles that were too few, or left over, at the end of a queue",
     ]
     two = "braking_capacity_mps2: 6, driving_capacity_mps2: 3, mass_t: 2, latency_s: 0, roles: {vehicle_2: learner}}"
     write_files(tmp_path, {"two.yaml": [f"{{name: two, vehicles: 2, gaps_m: 9, speeds_mps: 9, {two}"]})
-    text, csv, _ = scenario_from_data("mine", tmp_path, "highd", based_on=f"{tmp_path}/two.yaml")
-    assert csv.splitlines()[1:] == ["16.0,29.0,28.0", "16.0,27.0,26.0", "10.0,20.0,21.0", "16.0,0.0,0.0"]
-    assert "must not be passed on" in text
+    made = scenario_from_data("mine", tmp_path, "highd", based_on=f"{tmp_path}/two.yaml")
+    assert rows_of(made) == ["16.0,29.0,28.0", "16.0,27.0,26.0", "10.0,20.0,21.0", "16.0,0.0,0.0"]
+    assert "must not be passed on" in made.text
 
 
 def test_formats__same_queues_in_metres_and_in_feet_are_the_same_rows(tmp_path: Path) -> None:
     one, two = (
-        np.loadtxt(scenario_from_data("mine", write(tmp_path / of, 20), of)[1].splitlines(), delimiter=",", skiprows=1)
+        np.loadtxt(rows_of(scenario_from_data("mine", write(tmp_path / of, 20), of)), delimiter=",")
         for of, write in (("highd", write_highd), ("ngsim", write_ngsim))
     )
     assert one.shape == (40, 5) and np.abs(one - two).max() < 0.02  # feet have been rounded
@@ -57,16 +67,17 @@ def test_formats__same_queues_in_metres_and_in_feet_are_the_same_rows(tmp_path: 
 
 def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) -> None:
     folder = write_openacc(tmp_path / "openacc", 40)
-    text, csv, told = scenario_from_data("mine", folder, "openacc")
-    assert told == [
+    made = scenario_from_data("mine", folder, "openacc")
+    assert made.found == [
         "30 chains of 3 vehicles, every 1 s, each vehicle in one of them at most",
+        "rows of 1 different trio of vehicles in 1 recording",
         "left out: 100 vehicles that were too few, or left over, at the end of a queue",
     ]
     cells = (folder / "platoon.csv").read_text().splitlines()[6].split(",")
-    assert csv.splitlines()[1] == ",".join(f"{float(cells[k])}" for k in (16, 17, 1, 4, 7))
-    assert "read its terms" in text and scenario_from_data("mine", folder, "openacc", every_s=0.1)[1].count("\n") == 301
+    assert rows_of(made)[0] == ",".join(f"{float(cells[k])}" for k in (16, 17, 1, 4, 7))
+    assert "CC BY 4.0" in made.text and len(rows_of(scenario_from_data("mine", folder, "openacc", every_s=0.1))) == 300
     (folder / "later.csv").write_text((folder / "platoon.csv").read_text())
-    assert scenario_from_data("mine", folder, "openacc")[2][0].startswith("60 chains")
+    assert scenario_from_data("mine", folder, "openacc").found[0].startswith("60 chains")
     with pytest.raises(InvalidInput, match=r"gaps change 0\.31 times as much as speeds say .*OpenACC has m and m/s"):
         scenario_from_data("mine", write_openacc(tmp_path / "feet", 100, unit=0.3048), "openacc")
 
@@ -119,24 +130,24 @@ def test_overlaps__are_refused_but_few_of_noisy_data_are_left_out(tmp_path: Path
     text = file.read_text()
     head = next(line for line in text.splitlines() if line.startswith("4,"))  # of the second queue, twice
     file.write_text(re.sub(r"(?m)^(2,0,11,\d+,20),[^,]+", r"\1,99", text) + head + "\n")
-    _, csv, told = scenario_from_data("mine", file.parent, "ngsim")
-    assert csv.count("\n") == 40 and "left out: 2 vehicles that overlap" in told[1]
+    made = scenario_from_data("mine", file.parent, "ngsim")
+    assert len(rows_of(made)) == 39 and "left out: 2 vehicles that overlap" in made.found[2]
     file.write_text(re.sub(r"(?m)^((?:2|5|8|11|14|17),\d+,11,\d+,20),[^,]+", r"\1,99", text))
     with pytest.raises(InvalidInput, match=r"line \d+: vehicle 2 overlaps .*; 12 of 120 are like that"):
         scenario_from_data("mine", file.parent, "ngsim")
 
 
 def test_memory__does_not_grow_with_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recorded, "PIECE", 2000)
-    monkeypatch.setattr(recorded, "MOST_NUMBERS", 500)
+    monkeypatch.setattr(reading, "PIECE", 2000)
+    monkeypatch.setattr(of_folder, "MOST_NUMBERS", 500)
     most = []
     for number in (60, 60, 600):  # the first imports what is needed
         folder = write_highd(tmp_path / f"h{len(most)}", number)
         tracemalloc.start()
-        told = scenario_from_data("mine", folder, "highd")[2]
+        told = scenario_from_data("mine", folder, "highd").found
         most.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert told[1] == "left out: 1,108 chains: a table holds 500 numbers, so one in 13 is kept"
+    assert told[2] == "left out: 1,108 chains: a table holds 500 numbers, so one in 13 is kept"
     assert most[2] < 1.3 * most[1]
 
 
@@ -161,8 +172,8 @@ def test_command__writes_both_files_or_none_and_evaluates(tmp_path: Path, monkey
 def test_page__shows_the_harm_of_rows_and_of_fits(tmp_path: Path) -> None:
     folder, shown = write_highd(tmp_path / "highd"), []
     for draw in get_args(DataDraw):
-        text, csv, _ = scenario_from_data(draw, folder, "highd", draw=draw)
-        write_files(tmp_path, {f"{draw}.yaml": text.splitlines(), f"{draw}.csv": csv.splitlines()})
+        made = scenario_from_data(draw, folder, "highd", draw=draw)
+        write_files(tmp_path, {f"{draw}.yaml": made.text.splitlines(), f"{draw}.csv": made.csv.splitlines()})
         result = eb.evaluate(scenario=tmp_path / f"{draw}.yaml", agents="full_brake,e_v2x_bm", episodes=10_000, seed=7)
         harms = (f"{each.first_impact_harm.mean():.2f} |" for each in result.outcomes.values())
         shown.append(" ".join([f"| `{draw}` |", *harms]))

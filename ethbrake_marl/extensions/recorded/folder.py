@@ -1,0 +1,141 @@
+"""A folder of recordings to rows: which files are recordings, and what became of each.
+
+Each file is read once, in pieces. Its states at regular times go into a private file on disk, which returns them
+ordered by time. So memory holds only one piece of a file, one moment, and the rows of the result.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import NamedTuple
+
+from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.extensions.recorded.chains import Chains
+from ethbrake_marl.extensions.recorded.formats import Format
+from ethbrake_marl.extensions.recorded.reading import NotARecording
+from ethbrake_marl.extensions.recorded.states import STATE_TABLE, keep_states, moments
+from ethbrake_marl.scenario.vehicle_types import MOST_NUMBERS
+
+
+class Rows(NamedTuple):
+    """Rows of all recordings of a folder, and what became of its files."""
+
+    numbers: list[list[float]]  # gaps (m) and speeds (m/s) of each row
+    of: list[tuple[str, str]]  # recording and vehicles of each row
+    seen: int  # number of chains
+    longest: int  # number of vehicles of the longest queue
+    left_out: Counter[str]  # number of what was left out, by description
+    refused: list[str]  # error of each refused file
+    skipped: list[str]  # files that are no recordings
+
+
+def read_rows(
+    folder: Path, entry: Format, every_s: float, vehicles: int, progress: Callable[[str, int, int], None]
+) -> Rows:
+    """Read the chains of all recordings in a folder and below it; a file that is refused adds no row.
+
+    Args:
+        folder: the folder, or one file.
+        entry: format of the files.
+        every_s: time between two moments (s).
+        vehicles: number of vehicles in a chain.
+        progress: called with the name of a file, the KiB read of all files, and their size in KiB.
+
+    Raises ``InvalidInput`` for a folder without recordings.
+
+    """
+    files, refused, twice = _search(folder, entry)
+    if not files and not refused:
+        patterns = " or ".join(entry.files)
+        raise InvalidInput(f"{folder}: must be a folder with {patterns}, the files of {entry.title}")
+    whole, done, left_out, longest, numbers = sum(map(_kib, files)), 0, Counter[str](), 0, 2 * vehicles - 1
+    others = dict[str, str]()  # error of each file that is no recording
+    with closing(sqlite3.connect("")) as store:  # a temporary file on disk
+        store.execute(f"CREATE TABLE chain({','.join(f'n{k}' for k in range(numbers))},file,vehicles)")
+        store.execute(STATE_TABLE)
+        for file in files:
+            shown = _shown(file, folder)
+
+            def advance(kib: int, done: int = done, shown: str = shown) -> None:
+                progress(f"read: {shown}", done + kib, whole)
+
+            try:
+                chains = _read_file(store, file, shown, entry, every_s, vehicles, advance)
+                left_out.update(chains.left_out)
+                longest = max(longest, chains.longest)
+            except NotARecording as error:
+                others[shown] = str(error)
+            except InvalidInput as error:
+                refused.append(str(error))
+            except sqlite3.Error as error:
+                raise InvalidInput(f"{folder}: cannot be ordered by time ({error})") from None
+            done += _kib(file)
+        if len(others) == len(files) and not refused:
+            raise InvalidInput(f"{folder}: holds no recording of {entry.title}: {'; '.join(others.values())}")
+        ((seen,),) = store.execute("SELECT COUNT(*) FROM chain")
+        each_of = seen * numbers // MOST_NUMBERS + 1
+        kept = store.execute("SELECT * FROM chain WHERE rowid % ? = 0", (each_of,)).fetchall()
+    left_out[f"chains: a table holds {MOST_NUMBERS:,} numbers, so one in {each_of} is kept"] = seen - len(kept)
+    rows, of = [list(row[:-2]) for row in kept], [row[-2:] for row in kept]
+    return Rows(rows, of, seen, longest, left_out, refused, [*others, *twice])
+
+
+def _read_file(
+    store: sqlite3.Connection,
+    file: Path,
+    shown: str,
+    entry: Format,
+    every_s: float,
+    vehicles: int,
+    progress: Callable[[int], None],
+) -> Chains:
+    """Write all chains of a file, or none, into the table ``chain`` of ``store``; ``shown`` is the recording's name."""
+    numbers: dict[str, float] = {}
+    with store:
+        keep_states(store, file, entry, every_s, numbers, progress)
+        names = {number: plain_text(name) for name, number in numbers.items()}
+        chains = Chains(file, entry, every_s, vehicles, names)
+        rows = ([*row, shown, who] for row, who in chains.cut(moments(store)))
+        store.executemany(f"INSERT INTO chain VALUES ({', '.join('?' * (2 * vehicles + 1))})", rows)
+        store.execute("DELETE FROM state")
+    return chains
+
+
+def _search(folder: Path, entry: Format) -> tuple[list[Path], list[str], list[str]]:
+    """Find the files of a format in a folder and below it, each once, by their names.
+
+    Return them, the errors of folders that cannot be read, and names that stand for a file that is there already:
+    links, and a text without header beside its CSV. Names that begin with a dot are left out, and links to folders are
+    not followed.
+    """
+    if folder.is_file():
+        return [folder], [], []
+    found, refused, twice = dict[str, Path](), list[str](), list[str]()
+    walk = os.walk(folder, onerror=lambda error: refused.append(f"{error.filename}: cannot be read ({error.strerror})"))
+    everything = {Path(top, name) for top, _, names in walk for name in names}
+    for file in sorted(everything):
+        hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
+        if hidden or not any(fnmatch(file.name.lower(), pattern.lower()) for pattern in entry.files):
+            continue
+        again = entry.headless and file.suffix.lower() == ".txt" and file.with_suffix(".csv") in everything
+        if again or found.setdefault(os.path.realpath(file), file) is not file:
+            twice.append(_shown(file, folder))
+    return list(found.values()), refused, twice
+
+
+def _shown(file: Path, folder: Path) -> str:
+    """Return the path of a file below the folder, printable, with slashes."""
+    return plain_text(file.name if file == folder else file.relative_to(folder).as_posix())
+
+
+def _kib(file: Path) -> int:
+    try:
+        return file.stat().st_size >> 10
+    except OSError:
+        return 0

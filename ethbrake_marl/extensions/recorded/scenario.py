@@ -1,0 +1,158 @@
+"""Make scenarios from folders of recorded traffic: the scenario file, and its rows of initial states."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, count_of, plain_text
+from ethbrake_marl.extensions.recorded.fits import DataDraw, fit_rows
+from ethbrake_marl.extensions.recorded.folder import Rows, read_rows
+from ethbrake_marl.extensions.recorded.formats import DataFormat, format_of
+from ethbrake_marl.extensions.recorded.states import check_every
+from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.scenario.catalogue import check_file_name, load_scenario
+from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.schema import Scenario
+
+RECORDING = "recording"  # column of the rows' file: recording and vehicles of each row
+
+_OF_A_ROW = QUANTITY.usual["gaps_m"], QUANTITY.usual["speeds_mps"]
+
+_REPLACED = ("gaps_m", "speeds_mps", "time_gaps_s", "line_speed_mps", "speed_deviations_mps")
+
+_LISTED = 10  # largest number of skipped files that a note names
+
+
+class RefusedFiles(InvalidInput):
+    """Several files were refused; ``files`` holds the error of each."""
+
+    def __init__(self, text: str, files: list[str]) -> None:
+        super().__init__(text)
+        self.files = files
+
+
+class FromData(NamedTuple):
+    """What was made of a folder of recordings."""
+
+    text: str  # the scenario, as YAML
+    csv: str  # its rows: gaps (m), speeds (m/s), and the column ``recording``
+    found: list[str]  # sentences about what was found and left out
+    refused: list[str]  # error of each refused file
+    skipped: list[str]  # files that are no recordings
+
+
+def scenario_from_data(
+    name: str,
+    folder: Path,
+    format: DataFormat,
+    *,
+    columns: str = "",
+    based_on: str = "realistic-motorway",
+    every_s: float = 1.0,
+    draw: DataDraw = "rows",
+    strict: bool = False,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> FromData:
+    """Make a scenario from a folder of recordings, searched with all folders below it.
+
+    At regular times, queues of vehicles are cut from the front into chains of as many vehicles as ``based_on`` has; a
+    vehicle belongs to at most one chain. Each chain is a row of speeds and gaps. If there are more rows than a table
+    may hold, every k-th row is kept. A file that is refused is listed, and the others are used.
+
+    Args:
+        name: name of the scenario.
+        folder: folder with the files, or one file.
+        format: format of the files.
+        columns: of ``table``: which column is what, as ``format_of`` takes it.
+        based_on: scenario for everything that is not recorded, and for the number of vehicles.
+        every_s: time between two moments that become rows (s).
+        draw: how the scenario draws worlds: whole ``rows``, or each quantity from a fit to the rows.
+        strict: refuse the folder if one of its files is refused.
+        progress: called with the name of a file, the KiB read of all files, and their size in KiB.
+
+    Raises ``InvalidInput`` with file, line and column, if no file can be used.
+
+    """
+    entry, base = format_of(format, columns), load_scenario(based_on)
+    check_file_name("scenario", name)
+    if entry.hertz:
+        check_every(every_s, entry, entry.title)
+    if not 0.0 < every_s < math.inf:
+        raise InvalidInput(f"every = {every_s:g} s: must be above 0")
+    if base.members or base.table is not None:
+        raise InvalidInput(f"based_on = {based_on!r}: must be a scenario without mixture and table")
+    vehicles = base.vehicles
+    rows = read_rows(folder, entry, every_s, vehicles, progress)
+    if rows.refused and (strict or not rows.seen):
+        raise _refusal(folder, rows.refused)
+    if not rows.seen:
+        shorter = (
+            f"; the longest queue has {rows.longest}: --based-on NAME takes a scenario of so many vehicles, such as"
+        )
+        shorter += " realistic-pair for 2"
+        raise InvalidInput(
+            f"{folder}: no {vehicles} vehicles follow each other in a lane at any moment looked at"
+            f"{shorter if rows.longest > 1 else ''}"
+        )
+    recordings, found = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)
+    fastest_mps = max(max(row[vehicles - 1 :]) for row in rows.numbers)
+    at_rest_s = np.max(base.bounds("latency_s")) + fastest_mps / np.min(base.bounds("braking_capacity_mps2"))
+    columns_of = [rule.column_of(i) for rule in _OF_A_ROW for i in range(rule.count(vehicles))]
+    table = {"table": {"columns": columns_of, "rows": rows.numbers}}
+    content = {key: value for key, value in base.declared().items() if key not in _REPLACED} | {
+        "name": name,
+        "title": f"{entry.title}, {'row by row' if draw == 'rows' else f'{draw} of each quantity'}",
+        "description": f"Speeds and gaps of {recordings} of {entry.title}. Brakes, masses and latencies, which nobody"
+        f" recorded, are as in {base.name}.",
+        "source": f"{entry.title}, recorded in {entry.units}, folder {plain_text(folder.resolve().name)}."
+        f" {'; '.join(found)}. {entry.licence}",
+        "horizon_s": max(base.horizon_s, math.ceil(at_rest_s) + 1.0),
+        **(table if draw == "rows" else fit_rows(np.array(rows.numbers), draw)),
+    }
+    if np.min(base.bounds("speed_limit_mps")) < fastest_mps:
+        content["speed_limit_mps"] = math.ceil(fastest_mps)
+    load_scenario(content)
+    if draw == "rows":
+        content["table"] = {"file": f"{name}.csv", "columns": columns_of}
+    text = "".join(f"{key}: {flow_text(content[key])}\n" for key in Scenario.model_fields if key in content)
+    return FromData(text, _csv(columns_of, rows), found, rows.refused, rows.skipped)
+
+
+def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
+    """Return sentences that say what was found in a folder, and what was left out."""
+    groups = {2: "pair", 3: "trio"}.get(vehicles, "queue")
+    found = [
+        f"{count_of(rows.seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s, each vehicle in one of them at"
+        " most",
+        f"rows of {count_of(len(set(rows.of)), f'different {groups}')} of vehicles in"
+        f" {count_of(len({file for file, _ in rows.of}), 'recording')}",
+    ]
+    found += [f"left out: {number:,} {what}" for what, number in sorted(rows.left_out.items()) if number]
+    if rows.skipped:
+        more = f" and {len(rows.skipped) - _LISTED:,} more" if len(rows.skipped) > _LISTED else ""
+        found += [f"skipped, because they are no recordings: {', '.join(rows.skipped[:_LISTED])}{more}"]
+    if rows.refused:
+        found += [f"refused: {count_of(len(rows.refused), 'file')}"]
+    return found
+
+
+def _refusal(folder: Path, refused: list[str]) -> InvalidInput:
+    if len(refused) == 1:
+        return InvalidInput(refused[0])
+    return RefusedFiles(f"{folder}: {len(refused):,} files are refused, the first because of: {refused[0]}", refused)
+
+
+def _csv(columns: Sequence[str], rows: Rows) -> str:
+    """Return the rows as CSV, each with its recording and vehicles in the last column."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*columns, RECORDING])
+    writer.writerows([*row, f"{file}: {who}"] for row, (file, who) in zip(rows.numbers, rows.of, strict=True))
+    return text.getvalue()

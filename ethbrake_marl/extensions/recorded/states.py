@@ -1,0 +1,176 @@
+"""Numbers of a recording to vehicles at moments: position along the direction of travel, length and speed in m and m/s.
+
+The vehicles at regular moments go into a table of a private file on disk, which returns them ordered by time.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import namedtuple
+from collections.abc import Callable, Iterator
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.recorded.formats import Format
+from ethbrake_marl.extensions.recorded.reading import Piece, read_pieces
+from ethbrake_marl.physics.state import Floats
+
+FASTEST_MPS, LONGEST_M = 75.0, 40.0  # limits of a road vehicle: 270 km/h, and more than any road train in the data
+
+CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3  # range of lengths of cars and vans, and their least share, to detect feet
+
+OFF = 0.05  # largest accepted distance of a time from a tick, in ticks
+
+# A vehicle at a moment, in m and m/s. ``front`` is its position along the direction of travel, ``side`` across it; with
+# a ``heading`` (radians), they are x and y of its front. ``preceding`` is the vehicle ahead, below 0 for none.
+# ``length`` is 0 if the data hold gaps. ``tick`` counts the moments that are looked at, ``line`` is that of the file.
+State = namedtuple("State", "tick id lane preceding front side heading length speed line")
+
+STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
+
+
+def check_every(every_s: float, entry: Format, what: str) -> int:
+    """Return the number of ticks of a format in ``every_s``; raise ``InvalidInput`` if it is no whole number.
+
+    ``what`` names the data for the message.
+    """
+    stride = every_s * entry.hertz
+    if not (1.0 - 1e-6 <= stride < 1e9 and abs(stride - round(stride)) < 1e-6):
+        raise InvalidInput(f"every = {every_s:g} s: must be a multiple of {1 / entry.hertz:g} s, as {what} has it")
+    return round(stride)
+
+
+def keep_states(
+    store: sqlite3.Connection,
+    file: Path,
+    entry: Format,
+    every_s: float,
+    names: dict[str, float],
+    progress: Callable[[int], None],
+) -> None:
+    """Write the vehicles of a file at every moment that is looked at into the table ``state`` of ``store``.
+
+    Args:
+        store: database with an empty table ``state``.
+        file: the file.
+        entry: its format.
+        every_s: time between two moments that are looked at (s).
+        names: number of each name of a vehicle or lane, if the file has names; new names are added.
+        progress: called with the KiB read.
+
+    Raises ``InvalidInput`` with file, line and column for an impossible value.
+
+    """
+    turned, first, stride, cars, states = np.empty((0, 2)), None, 1, 0, 0
+    if entry.title == "highD":
+        meta = read_pieces(Path(f"{str(file)[:-4]}Meta.csv"), entry._replace(mixed=False), ("id", "drivingDirection"))
+        turned = np.concatenate([piece.values for piece in meta])
+        turned = turned[np.argsort(turned[:, 0])]
+    for piece in read_pieces(file, entry, list(entry.columns.values()), names, progress):
+        times = piece.values[:, 0]
+        if first is None:
+            first, entry = times[0], entry if entry.hertz else _with_rate(entry, times, every_s)
+            stride = check_every(every_s, entry, entry.title)
+        ticks = (times - first) * entry.ticks
+        right = f"must be a multiple of {1 / entry.hertz:g} s from the first on"
+        piece.refuse(~(abs(ticks - np.rint(ticks)) <= OFF), 0, right)
+        taken = np.rint(ticks) % stride == 0.0
+        kept = _states(piece.of(taken), entry, np.rint(ticks[taken]) / stride, turned)
+        store.executemany(f"INSERT INTO state VALUES ({', '.join('?' * len(State._fields))})", kept.tolist())
+        lengths = kept[:, State._fields.index("length")]
+        cars, states = cars + int(((lengths > CAR_M[0]) & (lengths < CAR_M[1])).sum()), states + len(kept)
+    if not entry.gaps and cars < LEAST_CARS * states:
+        raise InvalidInput(
+            f"{file}: {cars:,} of {states:,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, fewer than a third; its"
+            f" lengths and speeds must be in {entry.units}"
+        )
+
+
+def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
+    """Yield each moment of the table ``state`` in order of time: its tick and its vehicles in the order of the file."""
+    for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
+        yield tick, [State(*row) for row in rows]
+
+
+def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
+    """Return the format with the rate that ``times`` [rows] show: their smallest difference is a tick.
+
+    A rate within 2 % of a whole number is that number, because times are rounded: 0.033 and 0.067 s are 30 Hz.
+    """
+    steps = np.diff(np.unique(np.round(times * entry.ticks, 6)))
+    hertz = 1.0 / (steps.min() if len(steps) else every_s)
+    if abs(hertz - round(hertz)) <= 0.02 * hertz:
+        hertz = float(round(hertz))
+    return entry._replace(hertz=hertz, ticks=entry.ticks * hertz)
+
+
+def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Floats:
+    """Return the fields of ``State`` for each vehicle and moment, [rows, fields].
+
+    Args:
+        piece: rows of a file.
+        entry: its format.
+        ticks: number of the moment of each row, [rows].
+        turned: of highD: id and driving direction of each vehicle, [vehicles, 2], sorted by id.
+
+    """
+    if entry.gaps:
+        return _of_gaps(piece, entry, ticks)
+    given, at = dict(zip(entry.columns, piece.values.T, strict=True)), list(entry.columns).index
+    for role in ("id", "lane", "preceding") if not entry.texts else ():
+        if role in given:
+            value, least = given[role], entry.alone if role == "preceding" else 0.0
+            odd, right = (value != np.rint(value)) | (value < least), f"must be a whole number, {least:g} or above"
+            piece.refuse(odd, at(role), right)
+    zero = np.zeros(len(ticks))
+    who, lane, ahead = given["id"], given.get("lane", zero), given.get("preceding", zero - 1.0)
+    ahead = np.where(ahead == entry.alone, -1.0, ahead)
+    front, side, length = (given.get(role, zero) * entry.metres for role in ("front", "side", "length"))
+    heading, speed = np.deg2rad(given.get("heading", zero)), given["speed"] * entry.mps
+    right = f"m of length: must be in (0, {LONGEST_M:g}]; {entry.title} has {entry.units}"
+    piece.refuse((length <= 0.0) | (length > LONGEST_M), at("length"), right, length)
+    if entry.title == "highD":
+        place = np.searchsorted(turned[:, 0], who).clip(max=len(turned) - 1)
+        odd = (turned[place, 0] != who) | ~np.isin(turned[place, 1], (1.0, 2.0))
+        piece.refuse(odd, at("id"), "must have the drivingDirection 1 or 2 in its tracksMeta.csv")
+        right_hand = turned[place, 1] == 2.0  # x is the left edge of the vehicle and grows to the right
+        front, speed = np.where(right_hand, front + length, -front), speed * np.where(right_hand, 1.0, -1.0)
+    elif entry.title == "exiD":  # x and y are those of the centre
+        front, side = front + length / 2.0 * np.cos(heading), side + length / 2.0 * np.sin(heading)
+    right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
+    piece.refuse(speed > FASTEST_MPS, at("speed"), right, speed)
+    return np.column_stack([ticks, who, lane, ahead, front, side, heading, length, speed, piece.lines])
+
+
+def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
+    """Return the states of OpenACC: car k follows car k - 1 where both speeds and IVS k - 1 are there.
+
+    The position of the first car of a queue is 0, that of each other the sum of the gaps ahead of it.
+    """
+    at = {name.lower(): k for k, name in enumerate(piece.columns)}
+    cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))
+    ivs = {k: f"ivs{k - 1}" for k in cars if f"ivs{k - 1}" in at and k - 1 in cars}
+    if not ivs:
+        raise InvalidInput(
+            f"{piece.file}: no car follows another: {', '.join(piece.columns[1:])}; for one k at least, Speed k,"
+            " Speed k+1 and IVS k must be there"
+        )
+    right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
+    for k in cars:
+        column = at[f"speed{k}"]
+        piece.refuse(piece.values[:, column] > FASTEST_MPS, column, right)
+    n, none = len(cars), np.zeros((len(ticks), len(cars)))
+    speeds = np.column_stack([piece.values[:, at[f"speed{k}"]] for k in cars])
+    gaps = np.column_stack([piece.values[:, at[ivs[k]]] if k in ivs else np.full(len(ticks), np.nan) for k in cars])
+    linked = np.isfinite(gaps) & np.isfinite(speeds)
+    linked[:, 1:] &= np.isfinite(speeds[:, :-1])
+    behind, numbers = np.cumsum(np.where(linked, gaps, 0.0), axis=1), np.tile(np.array(cars, float), (len(ticks), 1))
+    ahead = np.where(linked, numbers - 1.0, -1.0)
+    tick, line = (np.repeat(each[:, None], n, axis=1) for each in (ticks, piece.lines))
+    fields = [tick, numbers, none, ahead, -behind, none, none, none, speeds, line]
+    return np.stack(fields, axis=-1)[np.isfinite(speeds)]
