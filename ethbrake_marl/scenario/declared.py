@@ -21,7 +21,7 @@ from ethbrake_marl.physics.motion import stopping_distances
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, as_road_allows
 from ethbrake_marl.scenario.channel import V2X, Equipage, Equipped
 from ethbrake_marl.scenario.distributions import LEAVE_OUT, AnyQuantity, AnyTypeQuantity, Quantity, TableColumn, support
-from ethbrake_marl.scenario.fields import ALSO, MEANING, QUANTITY, Entry, columns_of_table, is_tabled
+from ethbrake_marl.scenario.fields import ALSO, MEANING, QUANTITY, RECORDING, Entry, columns_of_table, is_tabled
 from ethbrake_marl.scenario.member import Member
 from ethbrake_marl.scenario.roles import LEARNER, Role, Roles, ScriptSpec
 from ethbrake_marl.scenario.vehicle_types import (
@@ -113,12 +113,15 @@ class ScenarioFields(FileModel):
 
     _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
     _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # columns of the table, by what they give
+    _recordings: TableColumn | None = PrivateAttr(default=None)
 
     @model_validator(mode="after")
     def _tabulated(self) -> ScenarioFields:
         if self.table is not None:
             known = columns_of_table(QUANTITY.declared, self.vehicles)
-            self._columns = {known[name]: column for name, column in self.table.column_values().items()}
+            columns = self.table.column_values()
+            self._recordings = columns.pop(RECORDING, None)
+            self._columns = {known[name]: column for name, column in columns.items()}
         return self
 
     @classmethod
@@ -210,6 +213,8 @@ class ScenarioFields(FileModel):
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
         for name, column in value.column_values().items():
+            if name == RECORDING:
+                continue
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
             require(name in known, ("columns",), name, f"unknown column; {hint}")
             rule = QUANTITY.declared[known[name][0]]
@@ -342,6 +347,11 @@ class ScenarioFields(FileModel):
     def table_entries(self) -> dict[Entry, TableColumn]:
         """Columns of the scenario's table, ``{("gaps_m", 0): column}`` by quantity and index; empty without one."""
         return self._columns
+
+    @property
+    def recordings(self) -> TableColumn | None:
+        """Column of the table that says from which recording each row comes; None without one, and for a mixture."""
+        return self._recordings
 
     @property
     def by_link(self) -> bool:

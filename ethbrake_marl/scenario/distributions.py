@@ -12,6 +12,7 @@ from operator import not_
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Discriminator, Field, PrivateAttr, Tag, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.files.model import FileModel, refuse, require
@@ -211,7 +212,7 @@ class TableColumn:
     """A column of a scenario's table of measured values; every world takes one row of the table, by weight."""
 
     name: str  # name of the column, such as ``gap_1_m``
-    rows: Floats = data_field(compare=False)  # [rows] value in each row of the table
+    rows: NDArray[Any] = data_field(compare=False)  # [rows] value in each row of the table; a text if it is a recording
     cumulative: Floats = data_field(compare=False)  # [rows] cumulative weight of the rows, up to 1
 
     def __repr__(self) -> str:
@@ -229,13 +230,12 @@ class TableColumn:
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
 
-    def value(self, u: Floats) -> Floats:
+    def value(self, u: Floats) -> NDArray[Any]:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
         It is the value of the first row whose cumulative weight is above u.
         """
-        found: Floats = self.rows[np.searchsorted(self.cumulative, u, side="right")]
-        return found
+        return self.rows[np.searchsorted(self.cumulative, u, side="right")]
 
 
 def _kind(value: object) -> str | None:

@@ -31,6 +31,8 @@ OF_WORLD = 4  # numbers per world in the streams OBSTACLE, MIXTURE, LATER_LOSSES
 
 PER_TYPE = 4  # numbers per vehicle in the stream TYPES: type, load, two unused; one Philox counter
 
+RECORDING = "recording"  # column of texts in a scenario's table: the recording and vehicles that a row comes from
+
 ROW = (SURROUNDINGS, 1)  # place of the number that selects the row of a table
 
 Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers and a column in it

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ethbrake_marl.physics.state import Ints, Worlds
+from ethbrake_marl.scenario.fields import RECORDING
 
 _Texts = NDArray[np.str_]
 
@@ -28,6 +29,7 @@ class Sample:
     rejected: int  # number of draws that were rejected for an early impact
     types: _Texts | None = None  # [n, N] type of every vehicle; "": no type; None: a scenario without types
     scenarios: _Texts | None = None  # [n] member of a mixture that each world was drawn from; None: no mixture
+    recordings: _Texts | None = None  # [n] recording that each world's row comes from; "": none; None: no such column
 
     def __repr__(self) -> str:
         numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
@@ -36,20 +38,20 @@ class Sample:
     def take(self, rows: ArrayLike) -> Sample:
         """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy, with ``rejected`` 0."""
         some = np.asarray(rows)
-        types, scenarios = (None if each is None else each[some] for each in (self.types, self.scenarios))
-        return Sample(self.worlds.take(some), self.index[some], 0, types, scenarios)
+        texts = (None if each is None else each[some] for each in (self.types, self.scenarios, self.recordings))
+        return Sample(self.worlds.take(some), self.index[some], 0, *texts)
 
     @staticmethod
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Either all parts have types (or scenarios) or none has. ``rejected``: number of rejected draws to note in the
-        result.
+        Either all parts have types (or scenarios, or recordings) or none has. ``rejected``: number of rejected draws
+        to note in the result.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
         joined: dict[str, _Texts] = {}
-        for name in ("types", "scenarios"):
+        for name in ("types", "scenarios", "recordings"):
             given = [getattr(part, name) for part in parts if getattr(part, name) is not None]
             joined |= {name: np.concatenate(given)[order]} if given else {}
         worlds = Worlds.concatenate([part.worlds for part in parts]).take(order)
@@ -57,18 +59,20 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns of text, [n] each: ``scenario`` of a mixture, and ``vehicle_1_type`` and so on if there are types."""
+        """Columns of text, [n] each: ``scenario`` of a mixture, ``recording`` of a row, ``vehicle_1_type`` and on."""
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
+        columns |= {} if self.recordings is None else {RECORDING: self.recordings}
         types = () if self.types is None else self.types.T
         return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 
     def count_kinds(self) -> str:
         """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type.
 
-        For example ``"; vehicle_1_type: car 7, truck 3"``; empty without mixture and types.
+        For example ``"; vehicle_1_type: car 7, truck 3"``; of recordings only how many there are. Empty without any.
         """
         told = ""
         for kind, column in self.kinds.items():
             names, counts = np.unique(column, return_counts=True)
-            told += f"; {kind}: " + ", ".join(f"{n or 'none'} {c}" for n, c in zip(names, counts, strict=True))
+            each = ", ".join(f"{n or 'none'} {c}" for n, c in zip(names, counts, strict=True))
+            told += f"; {kind}: {each if kind != RECORDING else f'{len(names)} different'}"
         return told

@@ -74,13 +74,16 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
         return _draw_numbers(scenario, np.arange(first, first + n, dtype=np.int64), int(seed), channel)
     chosen = members_of(scenario, n, int(seed), first=first, channel=channel)
     typed = any(member.vehicle_types is not None for member in scenario.members)
+    recorded = any(member.recordings is not None for member in scenario.members)
     parts = []
     for k, member in enumerate(scenario.members):
         index = first + np.flatnonzero(chosen == k)
         if len(index):
             drawn = _draw_numbers(member, index, int(seed), channel)
             no_type = np.full((len(index), scenario.vehicles), "") if typed and drawn.types is None else drawn.types
-            parts.append(replace(drawn, types=no_type, scenarios=np.full(len(index), member.name)))
+            no_recording = np.full(len(index), "") if recorded and drawn.recordings is None else drawn.recordings
+            named = np.full(len(index), member.name)
+            parts.append(replace(drawn, types=no_type, scenarios=named, recordings=no_recording))
     return Sample.join(parts, sum(part.rejected for part in parts))
 
 
@@ -129,7 +132,10 @@ def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]]
         equipped = scenario.equipped(None if typed is None else typed[0])
         worlds = scenario.v2x.with_channel(worlds, u, key, scenario.time_step_s, equipped)
     worlds = scenario.play_pieces(worlds)
-    return Sample(worlds, index, 0, None if typed is None or line is None else np.array(line.names)[typed[0]])
+    types = None if typed is None or line is None else np.array(line.names)[typed[0]]
+    column, (stream, place) = scenario.recordings, ROW
+    recordings = None if column is None else column.value(numbers(OF_WORLD, stream)[:, place])
+    return Sample(worlds, index, 0, types, recordings=recordings)
 
 
 def drawn_quantities(

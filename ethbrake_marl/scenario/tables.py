@@ -20,7 +20,7 @@ from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Bools, Floats, Worlds, make_worlds, real_numbers
 from ethbrake_marl.scenario.declared import ScenarioFields, obstacle_gap, on_road
 from ethbrake_marl.scenario.distributions import support
-from ethbrake_marl.scenario.fields import QUANTITY, Entry, QuantityRule, columns_of_table
+from ethbrake_marl.scenario.fields import QUANTITY, RECORDING, Entry, QuantityRule, columns_of_table
 
 SIZE_LIMIT = 64 << 20  # largest size of a table in bytes
 
@@ -199,8 +199,8 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
     return [name.strip() for name in rows[0]], rows[1:], lines[1:]
 
 
-def _number_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float:
-    """Return the number in one column of a CSV row; raise ``InvalidInput`` if it is not a number.
+def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float | str:
+    """Return the number in one column of a CSV row, or the text of ``recording``; raise ``InvalidInput`` for another.
 
     Args:
         file: the file, for messages.
@@ -213,7 +213,7 @@ def _number_at(file: Path, header: list[str], row: list[str], line: int, column:
     if len(row) != len(header):
         raise InvalidInput(f"{file}, line {line}: {len(row)} values, but the header has {len(header)} columns")
     text = row[header.index(column)]
-    number = parse_numeral(text.strip())
+    number = parse_numeral(text.strip()) if column != RECORDING else text.strip()
     if number is None:
         raise InvalidInput(f"{file}, line {line}, column {column}: {text!r:.60} is not a number")
     return number
@@ -238,7 +238,7 @@ def read_worlds(scenario: ScenarioFields, path: str | Path) -> Worlds:
     entries = _known_columns(header, scenario, f"{file}, line 1")
     table = np.empty((len(rows), len(header)))
     for r, row in enumerate(rows):
-        table[r] = [_number_at(file, header, row, lines[r], name) for name in header]
+        table[r] = [_cell_at(file, header, row, lines[r], name) for name in header]
     given = {entry: table[:, c] for c, entry in enumerate(entries)}
     return _worlds(given, scenario, _Naming(str(file), "file", lines))
 
@@ -264,7 +264,7 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
             many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
             raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
     found = [
-        [_number_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
+        [_cell_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
         for row, line in zip(rows, lines, strict=False)  # ignore blank lines at the end
     ]
     told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}

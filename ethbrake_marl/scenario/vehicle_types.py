@@ -30,8 +30,17 @@ from ethbrake_marl.game.features import ListedFeatures
 from ethbrake_marl.game.objectives import OBJECTIVES
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.scenario.channel import Equipage
-from ethbrake_marl.scenario.distributions import LEAVE_OUT, Numbers, Quantity, TableColumn, Uniform, WithLoad, support
-from ethbrake_marl.scenario.fields import MEANING, QUANTITY
+from ethbrake_marl.scenario.distributions import (
+    LEAVE_OUT,
+    Number,
+    Numbers,
+    Quantity,
+    TableColumn,
+    Uniform,
+    WithLoad,
+    support,
+)
+from ethbrake_marl.scenario.fields import MEANING, QUANTITY, RECORDING
 
 ANY = "any"  # in ``types``: every type, in proportion to its weight
 
@@ -178,24 +187,38 @@ ObjectiveName = Annotated[str, _ObjectiveSchema]
 
 MOST_NUMBERS = 100_000  # largest number of values in a table, which every copy of the scenario contains
 
+MOST_CHARACTERS = 200  # longest name of a recording in a table
+
+_NAME = f"recording must be a text of 1 to {MOST_CHARACTERS} printable characters, as in 'drive_1.csv: 2-3-4'"
+
 Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
+
+Cell = Annotated[
+    Annotated[Number, Tag("#number")] | Annotated[str, Tag("#text")],
+    Discriminator(lambda value: "#text" if isinstance(value, str) else "#number"),
+]
+
+Row = Annotated[tuple[Cell, ...], Field(strict=False, min_length=1)]
 
 
 class Table(FileModel):
     """Rows of measured values; every world takes one row, by weight.
 
-    In a scenario file they may come from a CSV file.
+    In a scenario file they may come from a CSV file. Rows with the same text in the column ``recording`` are not
+    independent of each other: they come from the same vehicles in the same recording.
     """
 
     file: str = Field(default="", exclude_if=not_, description="CSV file with a header, from the scenario's folder on")
     columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
-        description="as in a table of initial states: gap_1_m, speed_2_mps, ...; of a file those that are used"
+        description="as in a table of initial states: gap_1_m, speed_2_mps, ...; of a file those that are used;"
+        " recording is a text: which recording and vehicles a row comes from"
     )
     weights: str | Annotated[Numbers, Field()] | None = Field(
         default=None, exclude_if=not_, description="how likely each row is; of a file the column that says it"
     )
-    rows: Annotated[tuple[Numbers, ...], Field(strict=False, min_length=1)] | None = Field(
-        default=None, description="one row of numbers for each; left out with a file, which has them"
+    rows: Annotated[tuple[Row, ...], Field(strict=False, min_length=1)] | None = Field(
+        default=None,
+        description="one number for each column, of recording a text; left out with a file, which has them",
     )
 
     @model_validator(mode="after")
@@ -207,10 +230,14 @@ class Table(FileModel):
         for k, row in enumerate(rows):
             right = f"has {len(row)} numbers; there are {len(self.columns)} columns"
             require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
+            for c, (name, cell) in enumerate(zip(self.columns, row, strict=True)):
+                good = _names(cell) if name == RECORDING else not isinstance(cell, str)
+                require(good, ("rows", k, c), cell, _NAME if name == RECORDING else f"{name} must be a number")
         numbers = len(rows) * len(self.columns)
         require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, f"{numbers:,} numbers; at most {MOST_NUMBERS:,}")
         twice = [name for name in self.columns if self.columns.count(name) > 1]
         require(not twice, ("columns",), twice[:1], "each column can be given once")
+        require(self.columns != (RECORDING,), ("columns",), self.columns, "a column of numbers is needed beside it")
         if isinstance(self.weights, tuple):
             fits = f"must be one for each of {len(rows)} rows, all above 0, and their sum finite"
             good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
@@ -218,11 +245,16 @@ class Table(FileModel):
         return self
 
     def column_values(self) -> dict[str, TableColumn]:
-        """Return the columns of the table by name, each with the weights of the rows."""
-        rows = np.array(self.rows)
+        """Return the columns of the table by name, ``recording`` too, each with the weights of the rows."""
+        rows = self.rows or ()
         weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
         cumulative = np.cumsum(np.asarray(weights))
         return {
-            name: TableColumn(name, column, cumulative / cumulative[-1])
-            for name, column in zip(self.columns, rows.T, strict=True)
+            name: TableColumn(name, np.array(column), cumulative / cumulative[-1])
+            for name, column in zip(self.columns, zip(*rows, strict=True), strict=True)
         }
+
+
+def _names(cell: float | str) -> bool:
+    """Return whether a cell of a table can name a recording: a short printable text without blanks around it."""
+    return isinstance(cell, str) and 0 < len(cell) <= MOST_CHARACTERS and cell.isprintable() and cell == cell.strip()

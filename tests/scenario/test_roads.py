@@ -12,6 +12,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.agents.protocol import Team
+from ethbrake_marl.evaluation.identity import worlds_sha256
 from ethbrake_marl.evaluation.varying import states_of
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.ranges import ranges
@@ -40,6 +41,13 @@ TABLE = {"columns": ["gap_1_m", "speed_2_mps"], "rows": [[5.0, 18.0], [6.0, 19.0
 def tabled(table):
     given = {"gaps_m": 9.0, "speeds_mps": {"uniform": [18, 22]}, "table": table}
     return eb.Scenario(**without(PAPER, *given), **given)
+
+
+# Two trios of one recording, and one of another.
+NAMED = {
+    "columns": ["gap_1_m", "recording", "speed_2_mps"],
+    "rows": [[5.0, "a.csv: 1-2-3", 18.0], [6.0, "a.csv: 4-5-6", 19.0], [7.0, "b.csv: 1-2-3", 20.0]],
+}
 
 
 LINKS = {"preset": "nominal", "link_latency_s": 0.3, "sensing_s": [1.0, 1.0]}
@@ -145,6 +153,45 @@ def test_table_of_a_file__is_read_once_and_goes_along(empty_folder: Path) -> Non
     assert len(again.table.rows) == 14
     assert again.table.weights == (3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0)
     assert (again.sample(50, 7).worlds.gaps_m == mine.sample(50, 7).worlds.gaps_m).all()
+
+
+def test_recording__goes_with_its_row_and_changes_no_world() -> None:
+    found, without_it = tabled(NAMED).sample(300, 7), tabled(TABLE).sample(300, 7)
+    assert worlds_sha256(found.worlds, found.index) == worlds_sha256(without_it.worlds, without_it.index)
+    of_gap = {5.0: "a.csv: 1-2-3", 6.0: "a.csv: 4-5-6", 7.0: "b.csv: 1-2-3"}
+    assert found.kinds["recording"].tolist() == [of_gap[gap] for gap in found.worlds.gaps_m[:, 0].tolist()]
+    assert found.take([7, 2]).recordings.tolist() == found.recordings[[7, 2]].tolist()
+    assert without_it.recordings is None and "recording" not in without_it.kinds
+    assert found.count_kinds() == "; recording: 3 different"
+    assert tabled(NAMED).bounds("gaps_m") == ((5.0, 7.0), (9.0, 9.0))
+    assert ranges(tabled(NAMED)).names == ranges(tabled(TABLE)).names
+    again = eb.Scenario(**tabled(NAMED).declared()).sample(300, 7)
+    assert again.recordings.tolist() == found.recordings.tolist()
+
+
+def test_recording__of_a_rejected_row_is_that_of_the_row_drawn_instead() -> None:
+    # 18 m/s, 2 m behind a vehicle at rest: an impact after 0.11 s, before vehicle_2 may act (0.5 s).
+    rows = [[2.0, "close", 0.0, 18.0], [40.0, "far", 0.0, 1.0]]
+    table = {"columns": ["gap_1_m", "recording", "speed_1_mps", "speed_2_mps"], "rows": rows}
+    given = {"gaps_m": 9.0, "speeds_mps": 1.0, "latency_s": [0.0, 0.5, 0.8], "table": table}
+    sample = eb.Scenario(**without(PAPER, *given), **given).replace(early_impacts="reject").sample(100, 7)
+    assert sample.rejected > 20 and set(sample.recordings.tolist()) == {"far"}
+
+
+def test_recording__of_a_mixture_is_empty_where_a_scenario_has_none() -> None:
+    mixed = eb.Scenario(name="mixed", mixture=[{"scenario": PAPER}, {"scenario": tabled(NAMED).replace(name="named")}])
+    sample = mixed.sample(60, 7)
+    drawn = tabled(NAMED).sample(60, 7).recordings
+    expected = np.where(sample.scenarios == "named", drawn, "")
+    assert sample.recordings.tolist() == expected.tolist() and 10 < (expected == "").sum() < 50
+
+
+def test_recording__is_read_from_a_file_as_text(empty_folder: Path) -> None:
+    Path("rows.csv").write_text('recording,gap_1_m,gap_2_m\n"a, b.csv: 1-2-3",5,6\n 12 ,7,8\n')
+    declared = {**without(PAPER, "gaps_m"), "name": "mine", "early_impacts": "keep"}
+    table = {"file": "rows.csv", "columns": ["gap_1_m", "gap_2_m", "recording"]}
+    Path("mine.yaml").write_text(json.dumps({**declared, "table": table}))
+    assert eb.load_scenario(Path("mine.yaml")).table.rows == ((5.0, 6.0, "a, b.csv: 1-2-3"), (7.0, 8.0, "12"))
 
 
 def test_lognormal__is_truncated_as_in_the_textbook() -> None:
@@ -265,6 +312,19 @@ TABLES: dict[str, Callable[[], object]] = {
     ),
     "scenario 'paper-random': gaps_m = 9: the table says it for all; leave it out": lambda: tabled(
         {"columns": ["gap_1_m", "gap_2_m"], "rows": [[5, 6]]}
+    ),
+    "table.rows[0][1] = 12: recording must be a text of 1 to 200 printable": lambda: tabled(
+        {**NAMED, "rows": [[5.0, 12, 18.0]]}
+    ),
+    'table.rows[1][1] = "": recording must be a text of 1 to 200 printable': lambda: tabled(
+        {**NAMED, "rows": [[5.0, "a", 18.0], [5.0, "", 18.0]]}
+    ),
+    "recording must be a text of 1 to 200 printable characters, as in 'drive_1.csv: 2-3-4'": lambda: tabled(
+        {**NAMED, "rows": [[5.0, "a\tb", 18.0]]}
+    ),
+    "table.rows[0][2] = fast: speed_2_mps must be a number": lambda: tabled({**NAMED, "rows": [[5.0, "a", "fast"]]}),
+    "table.columns = [recording]: a column of numbers is needed beside it": lambda: tabled(
+        {"columns": ["recording"], "rows": [["a"]]}
     ),
     "scenario: table.file = ../rows.csv: must be a path from the scenario's folder on": lambda: eb.load_scenario(
         {**PAPER.declared(), "table": {"file": "../rows.csv"}}
