@@ -233,7 +233,7 @@ class Table(FileModel):
             for c, (name, cell) in enumerate(zip(self.columns, row, strict=True)):
                 good = _names(cell) if name == RECORDING else not isinstance(cell, str)
                 require(good, ("rows", k, c), cell, _NAME if name == RECORDING else f"{name} must be a number")
-        numbers = len(rows) * len(self.columns)
+        numbers = len(rows) * sum(name != RECORDING for name in self.columns)
         require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, f"{numbers:,} numbers; at most {MOST_NUMBERS:,}")
         twice = [name for name in self.columns if self.columns.count(name) > 1]
         require(not twice, ("columns",), twice[:1], "each column can be given once")

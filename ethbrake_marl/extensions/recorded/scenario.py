@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,10 +18,9 @@ from ethbrake_marl.extensions.recorded.formats import DataFormat, format_of
 from ethbrake_marl.extensions.recorded.states import check_every
 from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.scenario.catalogue import check_file_name, load_scenario
-from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.fields import QUANTITY, RECORDING
 from ethbrake_marl.scenario.schema import Scenario
-
-RECORDING = "recording"  # column of the rows' file: recording and vehicles of each row
+from ethbrake_marl.scenario.vehicle_types import MOST_CHARACTERS
 
 _OF_A_ROW = QUANTITY.usual["gaps_m"], QUANTITY.usual["speeds_mps"]
 
@@ -104,8 +103,9 @@ def scenario_from_data(
     recordings, found = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)
     fastest_mps = max(max(row[vehicles - 1 :]) for row in rows.numbers)
     at_rest_s = np.max(base.bounds("latency_s")) + fastest_mps / np.min(base.bounds("braking_capacity_mps2"))
-    columns_of = [rule.column_of(i) for rule in _OF_A_ROW for i in range(rule.count(vehicles))]
-    table = {"table": {"columns": columns_of, "rows": rows.numbers}}
+    headings = [rule.column_of(i) for rule in _OF_A_ROW for i in range(rule.count(vehicles))] + [RECORDING]
+    named = [[*row, _name(*of)] for row, of in zip(rows.numbers, rows.of, strict=True)]
+    table = {"table": {"columns": headings, "rows": named}}
     content = {key: value for key, value in base.declared().items() if key not in _REPLACED} | {
         "name": name,
         "title": f"{entry.title}, {'row by row' if draw == 'rows' else f'{draw} of each quantity'}",
@@ -120,9 +120,16 @@ def scenario_from_data(
         content["speed_limit_mps"] = math.ceil(fastest_mps)
     load_scenario(content)
     if draw == "rows":
-        content["table"] = {"file": f"{name}.csv", "columns": columns_of}
+        content["table"] = {"file": f"{name}.csv", "columns": headings}
     text = "".join(f"{key}: {flow_text(content[key])}\n" for key in Scenario.model_fields if key in content)
-    return FromData(text, _csv(columns_of, rows), found, rows.refused, rows.skipped)
+    lines = io.StringIO()
+    csv.writer(lines, lineterminator="\n").writerows([headings, *named])
+    return FromData(text, lines.getvalue(), found, rows.refused, rows.skipped)
+
+
+def _name(file: str, vehicles: str) -> str:
+    """Return the recording of a row, such as ``drive_1.csv: 2-3-4``; a long one keeps its end."""
+    return f"{file}: {vehicles}".strip()[-MOST_CHARACTERS:].strip()
 
 
 def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
@@ -147,12 +154,3 @@ def _refusal(folder: Path, refused: list[str]) -> InvalidInput:
     if len(refused) == 1:
         return InvalidInput(refused[0])
     return RefusedFiles(f"{folder}: {len(refused):,} files are refused, the first because of: {refused[0]}", refused)
-
-
-def _csv(columns: Sequence[str], rows: Rows) -> str:
-    """Return the rows as CSV, each with its recording and vehicles in the last column."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*columns, RECORDING])
-    writer.writerows([*row, f"{file}: {who}"] for row, (file, who) in zip(rows.numbers, rows.of, strict=True))
-    return text.getvalue()
