@@ -51,7 +51,7 @@ def read_rows(
 
     """
     files, refused, twice = _search(folder, entry)
-    if not files and not refused:
+    if not files and (not refused or not folder.is_dir()):
         patterns = " or ".join(entry.files)
         raise InvalidInput(f"{folder}: must be a folder with {patterns}, the files of {entry.title}")
     whole, done, left_out, longest, numbers = sum(map(_kib, files)), 0, Counter[str](), 0, 2 * vehicles - 1

@@ -222,10 +222,12 @@ def _header(
     """
     looked_at = []
     for number, line in islice(source, HEAD):
-        if entry.headless and len(row := line.split()) > 1 and None not in map(parse_numeral, row):
+        row = line.split()
+        numbers = sum(parse_numeral(cell) is not None for cell in row)
+        if entry.headless and number == 1 and 2 * numbers > len(row) > 1:
             if len(row) != len(entry.headless):
                 right = f"the text files of {entry.title} have {len(entry.headless)}"
-                raise InvalidInput(f"{file}, line {number}: {len(row)} numbers without a header; {right}")
+                raise InvalidInput(f"{file}, line {number}: {len(row)} values without a header; {right}")
             at = [entry.headless.index(name) for name in columns]
             return entry.headless, at, " ", chain([(number, line)], source)
         for separator in entry.separators:

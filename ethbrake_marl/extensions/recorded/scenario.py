@@ -144,7 +144,7 @@ def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
     found += [f"left out: {number:,} {what}" for what, number in sorted(rows.left_out.items()) if number]
     if rows.skipped:
         more = f" and {len(rows.skipped) - _LISTED:,} more" if len(rows.skipped) > _LISTED else ""
-        found += [f"skipped, because they are no recordings: {', '.join(rows.skipped[:_LISTED])}{more}"]
+        found += [f"skipped, no recordings or there already: {', '.join(rows.skipped[:_LISTED])}{more}"]
     if rows.refused:
         found += [f"refused: {count_of(len(rows.refused), 'file')}"]
     return found

@@ -67,15 +67,12 @@ def keep_states(
 
     """
     turned, first, stride, cars, states = np.empty((0, 2)), None, 1, 0, 0
-    if entry.title == "highD":
-        meta = read_pieces(Path(f"{str(file)[:-4]}Meta.csv"), entry._replace(mixed=False), ("id", "drivingDirection"))
-        turned = np.concatenate([piece.values for piece in meta])
-        turned = turned[np.argsort(turned[:, 0])]
     for piece in read_pieces(file, entry, list(entry.columns.values()), names, progress):
         times = piece.values[:, 0]
         if first is None:
             first, entry = times[0], entry if entry.hertz else _with_rate(entry, times, every_s)
             stride = check_every(every_s, entry, entry.title)
+            turned = _directions(file, entry) if entry.title == "highD" else turned
         ticks = (times - first) * entry.ticks
         right = f"must be a multiple of {1 / entry.hertz:g} s from the first on"
         piece.refuse(~(abs(ticks - np.rint(ticks)) <= OFF), 0, right)
@@ -95,6 +92,13 @@ def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
     """Yield each moment of the table ``state`` in order of time: its tick and its vehicles in the order of the file."""
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
+
+
+def _directions(file: Path, entry: Format) -> Floats:
+    """Return id and driving direction of each vehicle of a file of highD, [vehicles, 2], sorted by id."""
+    meta = read_pieces(Path(f"{str(file)[:-4]}Meta.csv"), entry, ("id", "drivingDirection"))
+    turned = np.concatenate([piece.values for piece in meta])
+    return turned[np.argsort(turned[:, 0])]
 
 
 def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:

@@ -13,14 +13,10 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.recorded import folder as of_folder, reading
 from ethbrake_marl.extensions.recorded.fits import DataDraw
-from ethbrake_marl.extensions.recorded.scenario import FromData, scenario_from_data
+from ethbrake_marl.extensions.recorded.scenario import scenario_from_data
 from tests.docs.site import DOCS
+from tests.extensions.recorded.made import rows_of, scenario_of
 from tests.fixtures.recordings import HIGHD, write_files, write_highd, write_ngsim, write_openacc
-
-
-def rows_of(made: FromData) -> list[str]:
-    """The rows without the recording."""
-    return [line.rpartition(",")[0] for line in made.csv.splitlines()[1:]]
 
 
 def track(frame: int, who: int, x: float, width: float, v: float, ahead: int, lane: int = 6) -> str:
@@ -50,9 +46,7 @@ def test_rows__are_bumper_to_bumper_in_both_directions_and_no_vehicle_is_in_two(
         "left out: 2 links to another lane, or of a vehicle that rolls backwards",
         "left out: 7 vehicles that were too few, or left over, at the end of a queue",
     ]
-    two = "braking_capacity_mps2: 6, driving_capacity_mps2: 3, mass_t: 2, latency_s: 0, roles: {vehicle_2: learner}}"
-    write_files(tmp_path, {"two.yaml": [f"{{name: two, vehicles: 2, gaps_m: 9, speeds_mps: 9, {two}"]})
-    made = scenario_from_data("mine", tmp_path, "highd", based_on=f"{tmp_path}/two.yaml")
+    made = scenario_from_data("mine", tmp_path, "highd", based_on=scenario_of(2, tmp_path))
     assert rows_of(made) == ["16.0,29.0,28.0", "16.0,27.0,26.0", "10.0,20.0,21.0", "16.0,0.0,0.0"]
     assert "must not be passed on" in made.text
 

@@ -1,0 +1,211 @@
+"""Tables of trajectories by named columns, from CSV and Parquet; exiD; formats that are refused by name."""
+
+from math import cos, radians, sin
+from pathlib import Path
+
+import pytest
+
+from ethbrake_marl.errors import InvalidInput, MissingExtra
+from ethbrake_marl.extensions.recorded.scenario import FromData, scenario_from_data
+from tests.extensions.recorded.made import rows_of
+from tests.fixtures.recordings import write_files
+
+COLUMNS = "time=t,vehicle=who,lane=lane,front=x,length=l,speed=v,units=m"
+HEAD = ["who", "t", "lane", "x", "l", "v"]
+# At 0 and 1 s. Lane a: cars c, b, a at 20 m/s, 20 m apart and 5 m long, then two lorries; lane b: one car.
+CARS = [
+    (who, t, lane, x + v * t, length, v)
+    for t in (0.0, 0.5, 1.0)
+    for who, lane, x, length, v in [
+        ("a", "E1_0", 60.0, 5.0, 20.0),
+        ("lorry 1", "E1_0", 20.0, 12.0, 18.0),
+        ("c", "E1_0", 100.0, 4.0, 20.0),
+        ("b", "E1_0", 80.0, 5.0, 20.0),
+        ("other", "E1_1", 70.0, 4.5, 25.0),
+    ]
+]
+ROWS = ["16.0,15.0,20.0,20.0,20.0"] * 2
+
+
+def table(folder: Path, cars: list[tuple[object, ...]] = CARS, separator: str = ",", name: str = "a.csv") -> Path:
+    """A folder with these cars as a table."""
+    return write_files(folder, {name: [separator.join(map(str, row)) for row in [HEAD, *cars]]})
+
+
+def made_of(folder: Path, columns: str = COLUMNS, **options: object) -> FromData:
+    """A scenario of a table."""
+    return scenario_from_data("mine", folder, "table", columns=columns, **options)  # type: ignore[arg-type]
+
+
+def scaled(lengths: float = 1.0, speeds: float = 1.0, times: float = 1.0) -> list[tuple[object, ...]]:
+    """The cars in other units."""
+    return [(w, t * times, lane, x * lengths, long * lengths, v * speeds) for w, t, lane, x, long, v in CARS]
+
+
+def test_leaders__are_the_next_in_the_lane_at_that_time(tmp_path: Path) -> None:
+    made = made_of(table(tmp_path))
+    assert rows_of(made) == ROWS and made.csv.endswith("a.csv: c-b-a\n")
+    assert "left out: 4 vehicles that were too few, or left over, at the end of a queue" in made.found
+    assert rows_of(made_of(table(tmp_path), every_s=0.5)) == [ROWS[0]] * 3
+    assert "licence is not known" in made.text
+
+
+@pytest.mark.parametrize(
+    ("units", "time", "cars"),
+    [
+        ("ft", "t", scaled(1 / 0.3048, 1 / 0.3048)),
+        ("km/h", "t", scaled(1.0, 3.6)),
+        ("m", "t/1000", scaled(times=1000.0)),
+        ("m", "t/25", scaled(times=25.0)),
+    ],
+)
+def test_units__of_lengths_speeds_and_time(
+    units: str, time: str, cars: list[tuple[object, ...]], tmp_path: Path
+) -> None:
+    columns = COLUMNS.replace("time=t", f"time={time}").replace("units=m", f"units={units}")
+    assert rows_of(made_of(table(tmp_path, cars), columns)) == ROWS
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_separator__is_that_of_the_header(separator: str, tmp_path: Path) -> None:
+    assert rows_of(made_of(table(tmp_path, separator=separator))) == ROWS
+
+
+def test_times_of_30_hertz__may_be_rounded(tmp_path: Path) -> None:
+    cars = [
+        (*car[:1], round(k / 30, 3), *car[2:3], car[3] + car[5] * k / 30, *car[4:])
+        for car in CARS[:5]
+        for k in range(61)
+    ]
+    assert rows_of(made_of(table(tmp_path, cars))) == [ROWS[0]] * 3
+    with pytest.raises(InvalidInput, match=r"every = 0.05 s: must be a multiple of 0.0333333 s, as the table has it"):
+        made_of(table(tmp_path, cars), every_s=0.05)
+
+
+def test_parquet__gives_the_same_rows_and_names_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+
+    def write(cars: list[tuple[object, ...]]) -> Path:
+        columns = dict(zip(HEAD, zip(*cars, strict=True), strict=True))
+        parquet.write_table(
+            arrow.table({name: list(column) for name, column in columns.items()}), tmp_path / "a.parquet"
+        )
+        return tmp_path
+
+    assert rows_of(made_of(write(CARS))) == ROWS
+    numbered = [(k % 5 + 1, *row[1:2], int(row[2][-1]), *row[3:]) for k, row in enumerate(CARS)]
+    assert made_of(write(numbered)).csv.endswith("a.parquet: 3-4-1\n")
+    for k, cell, right in (
+        (4, -1.0, r"a.parquet, row 3, column l: -1 m of length: must be in \(0, 40\]"),
+        (5, None, "a.parquet, row 3, column v: nan must be a finite number"),
+        (0, None, "a.parquet, row 3, column who: nan must be a finite number"),
+    ):
+        with pytest.raises(InvalidInput, match=right):
+            made_of(write([*CARS[:2], (*CARS[2][:k], cell, *CARS[2][k + 1 :]), *CARS[3:]]))
+    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read as Parquet with numbers .*fast"):
+        made_of(write([(*car[:5], "fast") for car in CARS]))
+    (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
+    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read as Parquet"):
+        made_of(tmp_path)
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(MissingExtra, match=r"needs the package pyarrow.*pip install 'ethbrake-marl\[data\]'"):
+        made_of(tmp_path)
+
+
+def one_more(*car: object) -> list[tuple[object, ...]]:
+    """The cars, and another one in line 17."""
+    return [*CARS, car]
+
+
+WRONG = {
+    "direction": (
+        [(*car[:3], -car[3], *car[4:]) for car in CARS],
+        "lane E1_0, front changes -1.00 times as much as speed",
+    ),
+    "backwards": (
+        [(*car[:3], -car[3], car[4], -car[5]) for car in CARS],
+        "in lane E1_0, front changes 1.00 times as much as a speed below 0 says; front must grow along travel",
+    ),
+    "feet": (
+        [(*car[:3], car[3] / 0.3048, *car[4:]) for car in CARS],
+        r"front changes 3.28 times as much as speed says; .* both in m and m/s",
+    ),
+    "km/h": (scaled(1.0, 2.5), r"front changes 0.40 times as much as speed says"),
+    "twice": (one_more(*CARS[2]), "line 17: vehicle c is there at that time in line 4, too"),
+    "overlap": (one_more("d", 1.0, "E1_0", 119.0, 5.0, 20.0), "line 17: vehicle d overlaps vehicle c ahead by 3.00 m"),
+    "no name": (one_more("", 1.0, "E1_0", 150.0, 5.0, 20.0), "line 17, column who: '' must not be empty"),
+    "no number": (one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0), "line 17, column l: '5 m' is not a number"),
+    "time": (one_more("d", 0.625, "E1_0", 150.0, 5, 20.0), "every = 0.8 s: must be a multiple of 0.125 s"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_wrong_table__is_refused_with_what_would_be_right(what: str, tmp_path: Path) -> None:
+    cars, right = WRONG[what]
+    with pytest.raises(InvalidInput, match=right):
+        made_of(table(tmp_path, cars), every_s=0.8 if what == "time" else 1.0)
+
+
+@pytest.mark.parametrize(
+    ("columns", "right"),
+    [
+        ("", "must be time=...,vehicle=...,lane=...,front=...,length=...,speed=...,units=m|ft|km/h, each once"),
+        (COLUMNS.removesuffix(",units=m"), "units=m|ft|km/h, each once"),
+        (COLUMNS + ",time=t", "each once"),
+        (COLUMNS + ",colour=c", "each once"),
+        (COLUMNS.replace("x", ""), "each once"),
+        (COLUMNS.replace("=m", "=mph"), "columns: units = 'mph': must be one of m, ft, km/h"),
+        (COLUMNS.replace("=t,", "=t/0,"), "columns: time = .../0: must be the number of units of time in a second"),
+        (COLUMNS.replace("=who", "=id"), "a.csv: has no column id, as files of the table have"),
+    ],
+)
+def test_wrong_columns__are_refused(columns: str, right: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput) as told:
+        made_of(table(tmp_path), columns)
+    assert right in str(told.value)
+    with pytest.raises(InvalidInput, match="only --format table takes columns; those of highD are known"):
+        scenario_from_data("mine", tmp_path, "highd", columns=COLUMNS)
+
+
+EXID = (
+    "recordingId,trackId,frame,trackLifetime,xCenter,yCenter,heading,width,length,xVelocity,yVelocity,xAcceleration,"
+    "yAcceleration,lonVelocity,latVelocity,lonAcceleration,latAcceleration,traveledDistance,latLaneCenterOffset,"
+    "laneletId,laneChange,lonLaneletPos,leadDHW,leadTHW,leadTTC,leadId,rearId"
+)
+
+
+def exid(folder: Path, degrees: float, ahead: int = 4) -> Path:
+    """A car, a lorry 30 m behind its centre, a car 25 m behind that, all to one direction; in two lanelets."""
+    rows = []
+    for who, back, length, lead, lanelet in (
+        (0, 0.0, 4.0, -1, "1574"),
+        (ahead, 30.0, 12.0, 0, "1574;1573"),
+        (7, 55.0, 5.0, ahead, "1573"),
+    ):
+        x, y = 100.0 - back * cos(radians(degrees)), -50.0 - back * sin(radians(degrees))
+        rows.append(
+            f"3,{who},0,0,{x:.4f},{y:.4f},{degrees},1.9,{length},0,0,0,0,{30 - who},0,0,0,9,0.1;0.2,{lanelet},0,1;2,"
+            f"9,1,1,{lead},-1"
+        )
+    return write_files(folder, {"03_tracks.csv": [EXID, *rows], "03_tracksMeta.csv": ["recordingId,trackId"]})
+
+
+@pytest.mark.parametrize("degrees", [0.0, 90.0, 137.5, 300.0])
+def test_exid__has_gaps_along_the_direction_of_travel(degrees: float, tmp_path: Path) -> None:
+    made = scenario_from_data("mine", exid(tmp_path, degrees), "exid")
+    assert made.csv.splitlines()[1:] == ["22.0,16.5,30.0,26.0,23.0,03_tracks.csv: 0-4-7"]  # 30 - 2 - 6 and 25 - 6 - 2.5
+    assert "must not be passed on" in made.text
+
+
+@pytest.mark.parametrize("name", ["exid", "highd"])
+def test_ind_and_round__are_refused_by_name(name: str, tmp_path: Path) -> None:
+    file = exid(tmp_path, 0.0) / "03_tracks.csv"
+    lines = [",".join(line.split(",")[:17]) for line in file.read_text().splitlines()]
+    file.write_text("\n".join([*lines, ""]))
+    with pytest.raises(InvalidInput, match=r"03_tracks.csv: this is inD or rounD, which has no lanes to follow"):
+        scenario_from_data("mine", tmp_path, name)  # type: ignore[arg-type]
+
+
+def test_other_format__is_named(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=r"03_tracks.csv: is not highD; this is exiD"):
+        scenario_from_data("mine", exid(tmp_path, 0.0), "highd")
