@@ -334,6 +334,8 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
         out.note("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
         why = found.unpaired_because
         out.note("paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}")
+        if found.recordings:
+            out.note(evaluation.by_recording(found.recordings))
         if found.exploits_line:
             out.note(found.exploits_line)
         for which, agents in zip(("first", "second"), found.left_over, strict=True):
@@ -366,6 +368,8 @@ def shield_command(
         rows = _measure_modes(out, agents, sample, task)
         out.result(rows.to_json(sample, task), *rows.sheets())
         _tell_left_out(out, rows[0].left_out, episodes)
+        if sample.clusters is not None:
+            out.note(evaluation.by_recording(len({*sample.clusters.tolist()})))
         moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != "none"}
         _tell_horizon(out, moving, episodes - len(rows[0].left_out), task.scenario.horizon_s)
 
@@ -378,8 +382,9 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
     lineup = make_drivers(agents, task, bare=True)
     n = sample.worlds.n
     return evaluation.compare_modes(
-        lineup, sample.worlds, task, on_progress=lambda name, done: out.progress(name, done, n)
-    )
+        lineup, sample.worlds, task, clusters=sample.clusters,
+        on_progress=lambda name, done: out.progress(name, done, n),
+    )  # fmt: skip
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from ethbrake_marl.evaluation.measure_sets import BASELINE, Measure, MeasureSet, every_set
 from ethbrake_marl.evaluation.outcome import COLUMN, Outcome, Values
 from ethbrake_marl.evaluation.own_measures import registered_measure
-from ethbrake_marl.evaluation.statistics import Moments, exact_sum, rate
+from ethbrake_marl.evaluation.statistics import Moments, Texts, exact_sum, rate
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.game.measures import REPORTED
 
@@ -26,7 +26,8 @@ class AgentTally:
 
     # True/false measures, by name: number of worlds in which it is true, number of worlds with a value.
     counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    moments: Mapping[str, Moments] = field(default_factory=dict)  # measures that are numbers, by name
+    # Measures that are numbers, by name; true/false measures too, as 1 and 0, if the worlds have clusters.
+    moments: Mapping[str, Moments] = field(default_factory=dict)
     # Measures that are compared with a baseline, by name: sum over worlds of own value times the baseline's value.
     products: Mapping[str, Fraction] = field(default_factory=dict)
 
@@ -67,6 +68,7 @@ def tally_agents(
     *,
     baseline: str = BASELINE,
     objectives: Sequence[str] | None = None,
+    clusters: Texts | None = None,
 ) -> dict[str, AgentTally]:
     """Return the sums of every agent's measures over the same worlds, by the agent's name.
 
@@ -76,6 +78,7 @@ def tally_agents(
         baseline: name of the agent to compare with, for sets of measures without a baseline of their own.
         objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
             the harm that each vehicle bears, and its value under each objective; None: neither.
+        clusters: name of each world's cluster, [n]; None: all worlds are independent.
 
     """
     values: dict[str, dict[str, Values]] = {}
@@ -98,7 +101,7 @@ def tally_agents(
         truths = {name: column for name, column in own.items() if column.dtype == np.bool_}
         tallies[agent] = AgentTally(
             {name: (int(column.sum()), len(column)) for name, column in truths.items()},
-            {name: Moments.of(column) for name, column in own.items() if name not in truths},
+            {name: Moments.of(own[name], clusters) for name in own if clusters is not None or name not in truths},
             {
                 name: exact_sum(own[name], values[other][name])
                 for name, other in compared_with.items()
@@ -121,7 +124,9 @@ def estimate_all(
 
     """
     own = tallies[agent]
-    columns = [name.removeprefix(COLUMN) for name in (*own.counts, *own.moments) if name.startswith(COLUMN)]
+    columns = [
+        name.removeprefix(COLUMN) for name in dict.fromkeys((*own.counts, *own.moments)) if name.startswith(COLUMN)
+    ]
     registered = list(REPORTED.values())
     columns.sort(key=lambda column: registered.index(each) if (each := registered_measure(column)) else len(registered))
     return {
@@ -147,7 +152,7 @@ def _estimate(
     """
     name = measure.name if callable(measure.of) else measure.of
     if own.share(name, worlds) is not None:
-        return rate(own.count(name), worlds)
+        return own.moments[name].share if name in own.moments else rate(own.count(name), worlds)
     sums = own.sums(name, worlds)
     if sums is None or not measure.against:
         return None if sums is None else sums.estimate

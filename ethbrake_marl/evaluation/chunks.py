@@ -160,7 +160,7 @@ def evaluate_held(
     for part in run_each(calls, jobs, ray):
         parts.append(part)
         _tell(on_done, len(parts), sample.worlds.n)
-    return Evaluation.join(parts)
+    return replace(Evaluation.join(parts), rejected=sample.rejected)
 
 
 def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evaluation:
@@ -239,7 +239,15 @@ def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
     teams = {name: Team.of(agent, scenario.learners) for name, agent in lineup.make().items()}
     return summarise_sums(
         {name: tally.agents[name] for name in teams},
-        Conditions.of_test(task, seed, tally.worlds, tally.silent, Conditions.of_ranges(tally.ranges)),
+        Conditions.of_test(
+            task,
+            seed,
+            tally.worlds,
+            tally.silent,
+            Conditions.of_ranges(tally.ranges),
+            recordings=len(tally.recordings),
+            rejected=tally.rejected,
+        ),
         silent_in_long_lists(),
         knows={name: Knowledge.of(team) for name, team in teams.items()},
         policies={name: policies_of(team.drivers) for name, team in teams.items()},

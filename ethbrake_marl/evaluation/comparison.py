@@ -11,10 +11,12 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.exploits import MARK, Exploits
-from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, told_of
-from ethbrake_marl.evaluation.statistics import paired_difference, unpaired_difference
+from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, recordings_of, told_of
+from ethbrake_marl.evaluation.statistics import Texts, paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.scenario.fields import RECORDING
+from ethbrake_marl.scenario.sample import clusters_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,7 @@ class Comparison:
 
     differences: tuple[Difference, ...]  # second result minus first, one entry per agent of both
     unpaired_because: str | None  # reason why the intervals are not paired by world; None: they are paired
+    recordings: int  # number of recordings that the intervals are by; 0: all worlds are independent
     left_over: tuple[tuple[str, ...], tuple[str, ...]]  # names of agents in the first result only, in the second only
     # Settings of the agents that differ, by name: value in the first and in the second result; None: not there.
     other_settings: Mapping[str, tuple[str | None, str | None]]
@@ -69,6 +72,7 @@ class Comparison:
         return {
             "intervals": "paired" if self.unpaired_because is None else "unpaired",
             "unpaired_because": self.unpaired_because,
+            **({"recordings": self.recordings} if self.recordings else {}),
             "agents": [difference.to_json() for difference in self.differences],
             "only_in_first": list(self.left_over[0]),
             "only_in_second": list(self.left_over[1]),
@@ -96,18 +100,19 @@ def compare_results(first: Result, second: Result) -> Comparison:
         agents = " and ".join(f"{', '.join(names)}" for names in left_over)
         raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
     worlds, because = _worlds_of_both(first, second, common)
+    recordings = recordings_of(first.about)
     differences = []
     for agent in common:
         one, other = first.rows[agent], second.rows[agent]
         if worlds is None:
-            sizes = other["episodes"], one["episodes"]
+            sizes = [recordings or row["episodes"] for row in (other, one)]
             harms = {
                 harm: unpaired_difference(second.estimate(agent, harm), sizes[0], first.estimate(agent, harm), sizes[1])
                 for harm in COMPARED[first.about["kind"]]
             }
         else:
-            before, after = worlds[agent]
-            harms = {name: paired_difference(after[:, k], before[:, k]) for k, name in enumerate(HARMS)}
+            before, after, by = worlds[agent]
+            harms = {name: paired_difference(after[:, k], before[:, k], by) for k, name in enumerate(HARMS)}
         policies = one["policy_sha256"], other["policy_sha256"]
         same: Literal["same", "other"] = "same" if policies[0] == policies[1] else "other"
         exploits = Exploits.of_json(one), Exploits.of_json(other)
@@ -117,10 +122,11 @@ def compare_results(first: Result, second: Result) -> Comparison:
         one, other = (each if isinstance(each := of.about.get(key), dict) else {} for of in (first, second))
         names = [name for name in dict.fromkeys([*one, *other]) if one.get(name) != other.get(name)]
         changed.append({name: (one.get(name), other.get(name)) for name in names})
-    return Comparison(tuple(differences), because, (left_over[0], left_over[1]), *changed)
+    return Comparison(tuple(differences), because, recordings, (left_over[0], left_over[1]), *changed)
 
 
-Worlds = dict[str, tuple[Floats, Floats]]  # agent -> harms [n, 2] of every world, in the first and second result
+# Agent -> harms [n, 2] of every world in the first and second result, and the worlds' clusters or None.
+Worlds = dict[str, tuple[Floats, Floats, Texts | None]]
 
 
 def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
@@ -129,20 +135,22 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
     ``common``: names of the agents that both results have.
     """
     try:
-        one, other = first.harms(), second.harms()
+        (one, named), (other, _) = first.harms(), second.harms()
     except InvalidInput as error:
         return None, f"one row per world is needed of both; {error}"
-    found = {}
+    found: Worlds = {}
     for agent in common:
         worlds = sorted(one.get(agent, {}))
         if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
             return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
-        found[agent] = tuple(np.array([side[agent][world] for world in worlds]) for side in (one, other))
-        for result, harms in zip((first, second), found[agent], strict=True):
+        harms_of_both = [np.array([side[agent][world] for world in worlds]) for side in (one, other)]
+        kinds = {RECORDING: np.array([named[world] for world in worlds])} if named else {}
+        found[agent] = harms_of_both[0], harms_of_both[1], clusters_of(kinds, np.array(worlds))
+        for result, harms in zip((first, second), harms_of_both, strict=True):
             for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
                 told = result.rows[agent].get(name)
                 if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
                     raise InvalidInput(
                         f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}"
                     )
-    return found, None  # type: ignore[return-value]  # two of them each
+    return found, None

@@ -65,7 +65,15 @@ class Conditions(dict[str, Any]):
 
     @classmethod
     def of_test(
-        cls, task: Task, seed: int | None, count: int, because: Mapping[str, str | None], quantities: Mapping[str, Any]
+        cls,
+        task: Task,
+        seed: int | None,
+        count: int,
+        because: Mapping[str, str | None],
+        quantities: Mapping[str, Any],
+        *,
+        recordings: int = 0,
+        rejected: int = 0,
     ) -> Conditions:
         """Return all conditions of an evaluation, with the keys that JSON results have under ``parameters``.
 
@@ -76,9 +84,12 @@ class Conditions(dict[str, Any]):
             because: key of a set of measures (``MeasureSet.because_key``) -> why the set does not apply to these
                 worlds; None if it applies.
             quantities: quantities of the worlds, as ``of`` returns them.
+            recordings: number of recordings that the worlds come from; 0: they come from none.
+            rejected: number of draws that were rejected for an early impact; only told of a table's rows.
 
         """
         scenario = task.scenario
+        tabled = any(each.table is not None for each in scenario.members or (scenario,))
         driven = [scenario.vehicle_names[i] for i in task.vehicles]
         scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items()}
         return cls(
@@ -90,16 +101,26 @@ class Conditions(dict[str, Any]):
             time_step_s=scenario.time_step_s,
             horizon_s=scenario.horizon_s,
             **({} if scenario.v2x.channel.tells is None else {"tells": _plain(scenario.v2x.channel.tells)}),
+            **({"recordings": recordings} if recordings else {}),
+            **({"rejected_draws": rejected} if rejected and tabled else {}),
             **because,
             **quantities,
         )
 
     @property
     def line(self) -> str:
-        """Caption in one line: scenario, number of worlds, seed, quantities with their units, unusual messages."""
+        """Caption in one line: scenario, number of worlds, seed, recordings, quantities, unusual messages."""
         seed = "" if self["seed"] is None else f", seed {self['seed']}"
         told = f"; {_message_words(self['tells'])}" if "tells" in self else ""
-        return f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}; {self.quantities}{told}"
+        return (
+            f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}{self.by_recording}; {self.quantities}{told}"
+        )
+
+    @property
+    def by_recording(self) -> str:
+        """Caption on the recordings that intervals are by: ``; 95 % intervals by 55 recordings``; empty without any."""
+        number = self.get("recordings", 0)
+        return f"; {by_recording(number)}" if number else ""
 
     @property
     def quantities(self) -> str:
@@ -115,6 +136,13 @@ class Conditions(dict[str, Any]):
                 told = texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"
                 parts.append(f"{symbol}{_STAY}={_STAY}{told}{f'{_STAY}{unit}' if unit else ''}")
         return "; ".join(parts)
+
+
+def by_recording(recordings: int) -> str:
+    """Return a text for captions on how many recordings intervals are by; a single one allows no interval."""
+    if recordings == 1:
+        return "no 95 % intervals: all worlds are of one recording"
+    return f"95 % intervals by {recordings:,} recordings"
 
 
 def _plain(tells: Tells) -> Any:

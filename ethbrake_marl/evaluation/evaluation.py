@@ -17,13 +17,14 @@ from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Silent, contexts_of, silent_because
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome, none_for_nan
 from ethbrake_marl.evaluation.rescores import Rescored, Rescores
-from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.evaluation.statistics import mean, share_of
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.game.objectives import Declared, scored
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.state import Bools, Ints, Worlds
-from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.fields import QUANTITY, RECORDING
+from ethbrake_marl.scenario.sample import clusters_of
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
@@ -31,7 +32,13 @@ _SHOWN_AGENTS = 5  # number of agents named in ``repr``
 
 Columns = dict[str, list[Any]]  # columns of a table with one row per agent and world
 
-_TEXTS = {"agent", "scenario", "ended", "knows"}  # columns of texts, in addition to those of sets of measures
+_TEXTS = {
+    "agent",
+    "scenario",
+    RECORDING,
+    "ended",
+    "knows",
+}  # columns of texts, in addition to those of sets of measures
 
 _ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in these tables even if all worlds agree
 
@@ -63,6 +70,7 @@ class Evaluation:
     # Groups of the worlds: ``{"scenario": [n names], "vehicle_2_type": [n names]}``. Only a mixture has ``scenario``,
     # and only a scenario with vehicle types has the types; else it is empty.
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
+    rejected: int = 0  # number of draws of this list that were rejected for an early impact
     host: str = ""  # name of the simulator that moved the worlds; "": the physics of this package
     _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache of ``once``
 
@@ -115,11 +123,12 @@ class Evaluation:
             index=np.concatenate([part.index for part in some]),
             outcomes={name: Outcome.join([part.outcomes[name] for part in some]) for name in some[0].outcomes},
             left_out=left_out,
+            rejected=sum(part.rejected for part in parts),
             kinds={name: np.concatenate([part.kinds[name] for part in some]) for name in some[0].kinds},
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the same evaluation with some of its worlds only, and an empty ``left_out``.
+        """Return the same evaluation with some of its worlds only, an empty ``left_out``, and ``rejected`` 0.
 
         Args:
             rows: row numbers of the worlds to keep, or a mask [n] that is true for them.
@@ -127,9 +136,8 @@ class Evaluation:
         """
         outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
         kinds = {name: column[rows] for name, column in self.kinds.items()}
-        return replace(
-            self, worlds=self.worlds.take(rows), index=self.index[rows], outcomes=outcomes, left_out=(), kinds=kinds
-        )
+        some = replace(self, worlds=self.worlds.take(rows), index=self.index[rows], outcomes=outcomes, kinds=kinds)
+        return replace(some, left_out=(), rejected=0)
 
     @property
     def hidden(self) -> Bools:
@@ -143,10 +151,23 @@ class Evaluation:
         return hidden
 
     @property
+    def clusters(self) -> NDArray[np.str_] | None:
+        """Name of each world's cluster, [n] (``clusters_of``); None: all worlds are independent."""
+        return clusters_of(self.kinds, self.index)
+
+    @property
+    def recordings(self) -> int:
+        """Number of recordings (clusters) that the worlds come from; 0: all worlds are independent."""
+        return 0 if self.clusters is None else len(np.unique(self.clusters))
+
+    @property
     def conditions(self) -> Conditions:
         """Scenario, seed, controlled vehicles and every quantity of the worlds, as plain data for captions and JSON."""
         because = silent_because(contexts_of(self))
-        return Conditions.of_test(self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds))
+        return Conditions.of_test(
+            self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds),
+            recordings=self.recordings, rejected=self.rejected,
+        )  # fmt: skip
 
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as columns; None stands for a missing value.
@@ -221,21 +242,23 @@ class Evaluation:
         """
         return Rescores(
             [
-                Rescored(agent, objective, harm_count, tuple(mean(column) for column in values.T))
+                Rescored(agent, objective, harm_count, tuple(mean(column, self.clusters) for column in values.T))
                 for agent, outcome in self.outcomes.items()
                 for harm_count in HARM_COUNTS
                 for objective, values in scored(outcome.ledger, harm_count, declared).items()
-            ]
+            ],
+            self.recordings,
         )
 
     def _repr_html_(self) -> str:
         """Return HTML of a table with collisions and harm of each agent, for a notebook."""
-        share = Column("Collisions", digits=1, scale=100.0, unit=" %")
+        by, share = self.clusters, Column("Collisions", digits=1, scale=100.0, unit=" %")
         rows = [
-            (agent, rate(int(each.collided.sum()), self.worlds.n), mean(each.first_impact_harm), mean(each.total_harm))
+            (agent, share_of(each.collided, by), mean(each.first_impact_harm, by), mean(each.total_harm, by))
             for agent, each in self.outcomes.items()
         ]
-        note = "Means per world in m²/s², with their 95 % intervals. eb.summarise tells more."
+        note = f"Means per world in m²/s², with their 95 % intervals{self.conditions.by_recording}."
+        note += " eb.summarise tells more."
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:

@@ -23,6 +23,7 @@ def notes_of(rows: Sequence[SummaryRow]) -> list[Note]:
         return []
     notes: list[Note] = [
         ("note", _left_out(rows[0])),
+        ("note", _rejected(rows[0])),
         *(("note", warning) for warning in warnings_of(rows)),
         ("note", _cut_off(rows)),
         ("note", Exploits.sentence({row.agent: row.exploits for row in rows})),
@@ -57,6 +58,18 @@ def _left_out(row: SummaryRow) -> str:
     if not row.left_out:
         return ""
     return LeftOut.line([str(left) for left in row.left_out], row.episodes + len(row.left_out))
+
+
+def _rejected(row: SummaryRow) -> str:
+    """Return the note about draws of a table's rows that were rejected for an early impact; empty if there are none."""
+    rejected = row.parameters.get("rejected_draws", 0)
+    if not rejected:
+        return ""
+    draws = rejected + row.episodes + len(row.left_out)
+    return (
+        f"Drawn again: {rejected:,} of {draws:,} draws ({100.0 * rejected / draws:.1f} %), which had an impact before a"
+        " learner may act (early_impacts: reject). These results say nothing about such rows."
+    )
 
 
 def _cut_off(rows: Sequence[SummaryRow]) -> str:

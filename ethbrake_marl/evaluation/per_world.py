@@ -19,6 +19,7 @@ from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.sheet import Estimate, parquet_file
 from ethbrake_marl.files.store import check_target, write_output
 from ethbrake_marl.game.objectives import Declared
+from ethbrake_marl.scenario.fields import RECORDING
 
 CSV, PARQUET = ".csv", ".parquet"
 
@@ -64,8 +65,11 @@ def write_per_world(
     write_output(path, text.getvalue().encode(), force=force)
 
 
-def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]]]:
-    """Return the harms in a file of ``write_per_world``: agent -> world -> (first-impact harm, total harm) in m2/s2.
+Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impact harm, total harm) in m2/s2
+
+
+def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
+    """Return the harms in a file of ``write_per_world``, and the recording of each world; empty without this column.
 
     Left-out worlds are omitted.
 
@@ -79,20 +83,26 @@ def read_harms(path: Path, data: bytes) -> dict[str, dict[int, tuple[float, ...]
     try:
         if path.suffix.lower() == PARQUET:
             with naming_extras():
-                from pyarrow.parquet import read_table
-            table = read_table(io.BytesIO(data), columns=list(_HARMS)).to_pydict()
-            rows = list(zip(*(table[name] for name in _HARMS), strict=True))
+                from pyarrow.parquet import ParquetFile
+            file = ParquetFile(io.BytesIO(data))
+            names = [*_HARMS, *({RECORDING} & {*file.schema_arrow.names})]
+            table = file.read(names).to_pydict()
+            rows = list(zip(*(table[name] for name in names), strict=True))
         else:
             lines = csv.DictReader(data.decode("utf-8").splitlines())
-            rows = [tuple(line[name] for name in _HARMS) for line in lines]
-        found: dict[str, dict[int, tuple[float, ...]]] = {}
+            names = [*_HARMS, *({RECORDING} & {*(lines.fieldnames or ())})]
+            rows = [tuple(line[name] for name in names) for line in lines]
+        found: Harms = {}
+        recordings: dict[int, str] = {}
         for agent, world, *harms in rows:
+            told, harms = harms[2:], harms[:2]
             if harms[0] not in (None, ""):
                 values = tuple(map(float, harms))
                 if not all(0.0 <= value <= _MOST_HARM for value in values):
                     raise ValueError(f"world {world}: harm {harms}")
                 found.setdefault(agent, {})[int(world)] = values
-        return found
+                recordings |= {int(world): name for name in told}
+        return found, recordings
     except (KeyError, TypeError, ValueError, NotImplementedError, OSError, csv.Error) as error:
         raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
 
@@ -186,10 +196,10 @@ class Result:
         mean, interval = row[harm], row.get(f"{harm}_interval")
         return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
 
-    def harms(self) -> dict[str, dict[int, tuple[float, ...]]]:
+    def harms(self) -> tuple[Harms, dict[int, str]]:
         """Read the harms of every world from the file that was written beside this one with ``--per-world``.
 
-        Returns agent -> world -> (first-impact harm, total harm) in m2/s2. Raises ``InvalidInput`` if that file is
+        Returns them, and the recording of each world, as ``read_harms`` does. Raises ``InvalidInput`` if that file is
         missing or was changed.
         """
         beside = self.about.get("per_world")
@@ -226,11 +236,14 @@ def read_result(path: Path) -> Result:
             raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
         if not 0 <= row["horizon_ends"] <= row["episodes"]:
             raise InvalidInput(f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be 0 to {row['episodes']:,}")
+        draws = recordings_of(row) or row["episodes"]
+        if not 1 <= draws <= row["episodes"]:
+            raise InvalidInput(f"{who}: recordings = {draws}: must be 1 to {row['episodes']:,}, or left out")
         shoved = row.get("vehicle_1_shoved_m")
         if shoved is not None and not (type(shoved) in (int, float) and abs(shoved) <= _MOST_HARM):
             raise InvalidInput(f"{who}: vehicle_1_shoved_m = {shoved!r:.40}: must be metres, or null")
         for harm in COMPARED[row["kind"]]:
-            if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), row["episodes"]):
+            if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), draws):
                 raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
     if len({tuple(told_of(row, key) for key in SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
@@ -253,13 +266,24 @@ def told_of(row: Mapping[str, Any], key: str) -> str | None:
     return None if told is None else str(told)
 
 
-def _is_mean(mean: Any, interval: Any, episodes: int) -> bool:
+def recordings_of(row: Mapping[str, Any]) -> int:
+    """Return the number of recordings that the intervals of an agent's JSON object are by; 0 without recordings.
+
+    Raises ``InvalidInput`` if it is no whole number.
+    """
+    told = told_of(row, "recordings") or "0"
+    if not (told.isdecimal() and len(told) <= len(str(_MOST_EPISODES))):
+        raise InvalidInput(f"recordings = {told:.40}: must be a whole number")
+    return int(told)
+
+
+def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
     """Return whether these JSON values are a mean harm and an interval ``[low, high]`` around it.
 
-    ``interval`` may be None; for ``episodes`` = 1 it must be.
+    ``interval`` may be None; for a single independent draw (``draws`` = 1) it must be.
     """
     ends = [mean, mean] if interval is None else interval
-    if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and episodes == 1):
+    if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and draws == 1):
         return False
     low, high = ends
     are_numbers = all(type(each) in (int, float) for each in (low, mean, high))

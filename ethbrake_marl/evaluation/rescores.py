@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from ethbrake_marl.evaluation.conditions import by_recording
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, terminal_text
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
@@ -27,6 +29,10 @@ class Rescored:
 class Rescores(list[Rescored]):
     """List of ``Rescored`` rows that ``print`` and a notebook show as two tables: first-impact and total harm."""
 
+    def __init__(self, rows: Iterable[Rescored] = (), recordings: int = 0) -> None:
+        super().__init__(rows)
+        self.recordings = recordings  # number of recordings that the intervals are by; 0: all worlds are independent
+
     def __str__(self) -> str:
         return terminal_text(self.sheet("first"), "", self.sheet("total"))
 
@@ -45,4 +51,5 @@ class Rescores(list[Rescored]):
         lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
         title = f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm"
         note = "Means per world in m²/s² (injury:CURVE: injuries in 1,000 lines), with their 95 % intervals."
+        note += f" {by_recording(self.recordings)}." if self.recordings else ""
         return Sheet(title, ["Agent", "Objective", *columns], lines, note)

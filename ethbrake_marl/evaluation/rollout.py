@@ -101,7 +101,7 @@ def evaluate(
         if on_progress is not None:
             for name in agents:
                 on_progress(name, first + part.worlds.n)
-    return Evaluation.join(parts)
+    return replace(Evaluation.join(parts), rejected=sample.rejected)
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
@@ -136,7 +136,7 @@ def drive_chunk(
     n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
     outcomes: dict[str, Outcome] = {}
     advanced: dict[str, Ints] = {}  # rows of the worlds in each outcome
-    lost: dict[int, LeftOut] = {}
+    lost, rejected = dict[int, LeftOut](), sample.rejected
     for name, agent in agents.items():
         roll_out = partial(_roll_out, sample.worlds, agent, vehicles, scenario, aftermath)
         with AgentFailed.naming(name, others), renumbered(range(first, first + n)):
@@ -150,8 +150,9 @@ def drive_chunk(
         outcomes = {name: outcome.take(np.isin(advanced[name], good)) for name, outcome in outcomes.items()}
     left_out = tuple(lost[row] for row in sorted(lost))
     return Evaluation(
-        scenario, vehicles, sample.worlds, sample.index, seed, outcomes, left_out=left_out, kinds=sample.kinds
-    )
+        scenario, vehicles, sample.worlds, sample.index, seed, outcomes, left_out=left_out, kinds=sample.kinds,
+        rejected=rejected,
+    )  # fmt: skip
 
 
 def _check_request(worlds: object, agents: object, chunk: object) -> None:

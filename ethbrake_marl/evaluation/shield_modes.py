@@ -13,7 +13,7 @@ from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.evaluation.identity import policies_of, result_identity
-from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.evaluation.statistics import Texts, mean, paired_difference
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.physics.left_out import LeftOutRows, measured_without_failed
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
@@ -98,6 +98,8 @@ class ShieldModes(list[ModeRow]):
         left_out = [world for world, _ in self[0].left_out]
         about = result_identity("shield", task.scenario, sample, left_out)
         about |= {"harm_count": task.harm_count, "episodes": sample.worlds.n - len(left_out)}
+        if sample.clusters is not None:
+            about["recordings"] = len(np.unique(np.delete(sample.clusters, left_out)))
         return [about | row.to_json() for row in self]
 
     def sheets(self) -> list[Sheet]:
@@ -128,6 +130,7 @@ def compare_modes(
     task: Task,
     *,
     behind: bool = False,
+    clusters: Texts | None = None,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> ShieldModes:
     """Compare every agent without a shield, behind a shield in episode mode, and in step mode, on the same worlds.
@@ -143,6 +146,7 @@ def compare_modes(
         task: the scenario, the controlled vehicles, and the harm that the shield bounds.
         behind: ``agents`` have shields already. Compare the policies inside those that have an episode or step shield,
             and ignore the others; the result is empty if there is none.
+        clusters: name of each world's cluster, [n]; None: all worlds are independent.
         on_progress: called with an agent's name and its number of worlds done.
 
     Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where every world is left out.
@@ -158,7 +162,8 @@ def compare_modes(
         if not agents:
             return ShieldModes()
     rows, _, left_out = measured_without_failed(
-        lambda at: _compare(agents, worlds.take(at), task, on_progress), worlds.n
+        lambda at: _compare(agents, worlds.take(at), task, None if clusters is None else clusters[at], on_progress),
+        worlds.n,
     )
     drivers = {
         name: agent.drivers if isinstance(agent, Team) else dict.fromkeys(task.vehicles, agent)
@@ -178,7 +183,11 @@ class _Part(NamedTuple):
 
 
 def _compare(
-    agents: Mapping[str, Driver], worlds: Worlds, task: Task, on_progress: Callable[[str, int], None] | None
+    agents: Mapping[str, Driver],
+    worlds: Worlds,
+    task: Task,
+    clusters: Texts | None,
+    on_progress: Callable[[str, int], None] | None,
 ) -> list[ModeRow]:
     """Return the rows of all agents and modes, with arguments as in ``compare_modes``.
 
@@ -194,7 +203,7 @@ def _compare(
             if on_progress is not None:
                 on_progress(name, min(first + CHUNK, worlds.n))
         harm = {mode: np.concatenate([part[mode].harm for part in parts]) for mode in parts[0]}
-        rows += [_row(name, mode, [part[mode] for part in parts], harm, task) for mode in harm]
+        rows += [_row(name, mode, [part[mode] for part in parts], harm, task, clusters) for mode in harm]
     return rows
 
 
@@ -220,7 +229,9 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
     return found
 
 
-def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task) -> ModeRow:
+def _row(
+    agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task, clusters: Texts | None
+) -> ModeRow:
     """Return the row of an agent in one mode.
 
     Args:
@@ -229,14 +240,16 @@ def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats]
         parts: results of the chunks of worlds in this mode.
         harm: mode -> harm of the agent in every world [n], to compare this mode with the others.
         task: the scenario, the controlled vehicles, and the harm that the shield bounds.
+        clusters: name of each world's cluster, [n], or None.
 
     """
 
     def minus(other: Mode) -> Estimate | None:
-        return None if mode == other or other not in harm else paired_difference(harm[mode], harm[other])
+        there = mode != other and other in harm
+        return paired_difference(harm[mode], harm[other], clusters) if there else None
 
     moving = sum(part.moving for part in parts)
-    row = ModeRow(agent, mode, mean(harm[mode]), moving, minus("episode"), minus("none"))
+    row = ModeRow(agent, mode, mean(harm[mode], clusters), moving, minus("episode"), minus("none"))
     shielded = [part.shielded for part in parts if part.shielded is not None]
     if not shielded:
         return row
@@ -248,7 +261,7 @@ def _row(agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats]
     return replace(
         row,
         replaced=replaced / (decisions * len(task.vehicles)),
-        bound=mean(whole.bound),
+        bound=mean(whole.bound, clusters),
         verdicts=tuple(count / replaced for count in counted) if replaced else None,
         above_bound=int((whole.harm > whole.bound).sum()),
         vehicles=tuple(

@@ -4,11 +4,16 @@ The worlds of a list are independent draws, and every agent is measured on the s
 interval, means have the t interval, and comparisons with a baseline are paired by world, so that the spread between
 easy and hard worlds cancels. Means and their errors come from exact sums, so the order of the worlds does not change a
 bit.
+
+Worlds whose rows come from the same recording form a *cluster*: only clusters are independent of each other. Errors
+then are cluster-robust with the factor G / (G - 1) for G clusters, and t has G - 1 degrees of freedom (Cameron and
+Miller 2015, "A practitioner's guide to cluster-robust inference", Journal of Human Resources 50(2)).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -18,7 +23,9 @@ from scipy.special import ndtri, stdtrit
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.physics.state import Floats, Ints
+from ethbrake_marl.physics.state import Bools, Floats, Ints
+
+Texts = NDArray[np.str_]
 
 
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
@@ -34,6 +41,21 @@ def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
         wholes, powers = wholes * factors, powers + more
     sums = {power: int(wholes[powers == power].sum()) for power in np.unique(powers).tolist()}
     return sum((number * Fraction(2) ** power for power, number in sums.items()), Fraction())
+
+
+def cluster_sums(values: Floats, clusters: Texts) -> dict[str, tuple[int, Fraction]]:
+    """Return the number of ``values`` [n] and their exact sum for each name in ``clusters`` [n], by this name.
+
+    Raises ``InvalidInput`` unless all values are finite, and there are as many clusters as values.
+    """
+    wholes, powers = _in_wholes(values)
+    if clusters.shape != powers.shape:
+        raise InvalidInput(f"statistics: {len(clusters)} clusters of {len(powers)} values; one for each is needed")
+    names, which, counts = np.unique(clusters, return_inverse=True, return_counts=True)
+    least, sums = powers.min(), np.zeros(len(names), np.object_)
+    np.add.at(sums, which, wholes << (powers - least).astype(np.object_))
+    unit = Fraction(2) ** int(least)
+    return {name: (n, unit * total) for name, n, total in zip(names.tolist(), counts.tolist(), sums, strict=True)}
 
 
 def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
@@ -67,25 +89,40 @@ class Moments:
     # Number of negative values. If it is 0, intervals do not reach below 0. For differences (``minus``), whose signs
     # are not known, it is the number of all values.
     negative: int = field(default=0, compare=False)
+    # Number and exact sum of the values of each cluster, by its name; empty: all values are independent.
+    clusters: Mapping[str, tuple[int, Fraction]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, values: Floats) -> Moments:
+    def of(cls, values: Floats, clusters: Texts | None = None) -> Moments:
         """Return the moments (number, sum and sum of squares) of ``values`` [n].
 
-        Raises ``InvalidInput`` unless all values are finite.
+        ``clusters``: name of the cluster of each value, [n]; None: all values are independent. Raises ``InvalidInput``
+        unless all values are finite.
         """
-        return cls(len(values), exact_sum(values), exact_sum(values, values), int(np.count_nonzero(values < 0.0)))
+        negative, sums = int(np.count_nonzero(values < 0.0)), {} if clusters is None else cluster_sums(values, clusters)
+        return cls(len(values), exact_sum(values), exact_sum(values, values), negative, sums)
 
     def __add__(self, other: Moments) -> Moments:
-        negative = self.negative + other.negative
-        return Moments(self.count + other.count, self.total + other.total, self.squares + other.squares, negative)
+        negative, clusters = self.negative + other.negative, dict(self.clusters)
+        for name, (n, total) in other.clusters.items():
+            before = clusters.get(name, (0, Fraction()))
+            clusters[name] = before[0] + n, before[1] + total
+        total, squares = self.total + other.total, self.squares + other.squares
+        return Moments(self.count + other.count, total, squares, negative, clusters)
 
     def minus(self, other: Moments, products: Fraction) -> Moments:
         """Return the moments of the differences ``value - other``, paired by world.
 
         ``products`` is the exact sum over all pairs of ``value * other`` (``exact_sum``).
         """
-        return Moments(self.count, self.total - other.total, self.squares - 2 * products + other.squares, self.count)
+        clusters = {name: (n, total - other.clusters[name][1]) for name, (n, total) in self.clusters.items()}
+        squares = self.squares - 2 * products + other.squares
+        return Moments(self.count, self.total - other.total, squares, self.count, clusters)
+
+    @property
+    def independent(self) -> int:
+        """Number of independent draws: of the clusters if there are any, else of the values."""
+        return len(self.clusters) or self.count
 
     @property
     def mean(self) -> float:
@@ -96,9 +133,12 @@ class Moments:
     def standard_error(self) -> float:
         """Standard error of the mean, ``s / sqrt(n)`` with n - 1 degrees of freedom.
 
-        Raises ``ZeroDivisionError`` for fewer than two values.
+        With G clusters, ``sqrt(G / (G - 1) * sum(sum of deviations in the cluster ** 2)) / n``. Raises
+        ``ZeroDivisionError`` for fewer than two values or clusters.
         """
         n = self.count
+        if self.clusters:
+            return _ratio_by_cluster(self._sums, [Fraction(size) for size, _ in self.clusters.values()])
         return root((n * self.squares - self.total**2) / (n * n * (n - 1)))
 
     @property
@@ -107,21 +147,47 @@ class Moments:
 
         Raises ``ZeroDivisionError`` without values.
         """
-        found = self._around(self.mean, self.standard_error if self.count > 1 else 0.0)
+        found = self._around(self.mean, self.standard_error if self.independent > 1 else 0.0)
         return found if self.negative else of_amounts(found, nothing=not self.squares)
+
+    @property
+    def share(self) -> Estimate:
+        """Mean of values that are 0 or 1, with Wilson's interval (``rate``).
+
+        With clusters it is the interval of as many independent draws as would have this standard error,
+        ``1 + p (1 - p) / error ** 2``, but at most all and, where all values agree, one for each cluster; times
+        ``(z / t) ** 2``, because the error has G - 1 degrees of freedom (Korn and Graubard 1998, "Confidence intervals
+        for proportions with small expected number of positive counts estimated from survey data", Survey Methodology
+        24). There is no interval for a single cluster.
+        """
+        if not self.clusters:
+            return rate(int(self.total), self.count)
+        p, clusters = self.mean, len(self.clusters)
+        if clusters < 2:
+            return Estimate(p, None)
+        error = self.standard_error
+        draws = clusters if p in (0.0, 1.0) else min(self.count, 1.0 + p * (1.0 - p) / max(error * error, 1e-300))
+        return Estimate(p, wilson(p, draws * float(ndtri(_UPPER) / stdtrit(clusters - 1, _UPPER)) ** 2))
+
+    @property
+    def _sums(self) -> list[Fraction]:
+        return [total for _, total in self.clusters.values()]
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
         The residuals ``values - r * others`` have mean 0, so the error is
         ``std(residuals) / (sqrt(n) * abs(mean(others)))``. With x the values, y the others, sums S and sums of products
-        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``.
+        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``. With clusters, their sums take
+        the place of the values.
 
         Args:
             others: moments of the denominator, in the same worlds.
             products: exact sum over all pairs of ``value * other``.
 
         """
+        if self.clusters:
+            return _ratio_by_cluster(self._sums, [others.clusters[name][1] for name in self.clusters])
         n, x, y = self.count, self.total, others.total
         residuals = self.squares * y * y - 2 * x * y * products + x * x * others.squares
         return root(n * residuals / ((n - 1) * y**4))
@@ -136,18 +202,28 @@ class Moments:
         """
         if baseline.total == 0:
             return None
-        error = self.ratio_error(baseline, products) if self.count > 1 else 0.0
+        error = self.ratio_error(baseline, products) if self.independent > 1 else 0.0
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return the estimate ``value`` with the interval ``value -+ t error``; no interval for a single value.
+        """Return the estimate ``value`` with the interval ``value -+ t error``; no interval for a single draw.
 
-        ``error`` is the standard error; t has n - 1 degrees of freedom.
+        ``error`` is the standard error; t has one degree of freedom less than there are independent draws.
         """
-        if self.count < 2:
+        if self.independent < 2:
             return Estimate(value, None)
-        half = float(stdtrit(self.count - 1, _UPPER)) * error
+        half = float(stdtrit(self.independent - 1, _UPPER)) * error
         return Estimate(value, (value - half, value + half))
+
+
+def _ratio_by_cluster(x: Sequence[Fraction], y: Sequence[Fraction]) -> float:
+    """Return the standard error of ``r = sum(x) / sum(y)`` over the sums ``x`` and ``y`` of each cluster, [G].
+
+    It is ``sqrt(G / (G - 1) * sum((x - r y) ** 2)) / abs(sum(y))``.
+    """
+    whole, below, count = sum(x, Fraction()), sum(y, Fraction()), len(x)
+    residuals = sum(((own * below - other * whole) ** 2 for own, other in zip(x, y, strict=True)), Fraction())
+    return root(count * residuals / ((count - 1) * below**4))
 
 
 def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
@@ -181,12 +257,12 @@ def rate(successes: int, count: int) -> Estimate:
     return Estimate(successes / count, wilson(successes / count, count))
 
 
-def wilson(p: float, count: int) -> tuple[float, float]:
+def wilson(p: float, count: float) -> tuple[float, float]:
     """Return the ends (low, high) of Wilson's 95 % score interval of a share.
 
     Args:
         p: observed share, 0 to 1; ``p * count`` need not be a whole number.
-        count: number of draws.
+        count: number of independent draws, not necessarily whole.
 
     """
     z = float(ndtri(_UPPER))
@@ -198,23 +274,33 @@ def wilson(p: float, count: int) -> tuple[float, float]:
     return low, high
 
 
-def mean(values: Floats) -> Estimate:
+def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
     """Return the mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t has n - 1 degrees of freedom.
 
     With thousands of worlds, the mean is nearly normal whatever the distribution of harm, and the interval equals the
-    bootstrap's. If no value is negative, the interval starts at 0 or above; if all are 0, there is no interval. Raises
-    ``InvalidInput`` when ``values`` is empty or not finite.
+    bootstrap's. If no value is negative, the interval starts at 0 or above; if all are 0, there is no interval.
+    ``clusters``: name of the cluster of each value, [n]; None: all are independent. Raises ``InvalidInput`` when
+    ``values`` is empty or not finite.
     """
-    return Moments.of(check(values)).estimate
+    return Moments.of(check(values), clusters).estimate
 
 
-def paired_difference(values: Floats, baseline: Floats) -> Estimate:
+def share_of(truths: Bools, clusters: Texts | None = None) -> Estimate:
+    """Return the share of ``truths`` [n] that are true, with the interval of ``Moments.share``.
+
+    ``clusters``: name of the cluster of each value, [n]; None: all are independent.
+    """
+    return Moments.of(check(truths), clusters).share
+
+
+def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None = None) -> Estimate:
     """Return the mean of ``values - baseline`` with its t interval.
 
-    ``values`` and ``baseline`` are [n] each, in the same worlds. Raises ``InvalidInput`` if their lengths differ, or if
-    they are empty or not finite.
+    ``values`` and ``baseline`` are [n] each, in the same worlds, as are ``clusters``, the name of each world's cluster;
+    None: all worlds are independent. Raises ``InvalidInput`` if their lengths differ, or if they are empty or not
+    finite.
     """
-    data, reference, products = _check_pair(values, baseline)
+    data, reference, products = _check_pair(values, baseline, clusters)
     return data.minus(reference, products).estimate
 
 
@@ -227,9 +313,9 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
 
     Args:
         value: first mean with its interval.
-        n: number of its worlds.
+        n: number of its worlds, or of the clusters of worlds that its interval is by.
         baseline: second mean with its interval.
-        m: number of its worlds.
+        m: number of its worlds or clusters.
 
     """
     difference = value.value - baseline.value
@@ -248,14 +334,16 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
     return Estimate(difference, (difference - half, difference + half))
 
 
-def relative_decrease(values: Floats, baseline: Floats) -> Estimate | None:
+def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None = None) -> Estimate | None:
     """Return ``1 - mean(values) / mean(baseline)`` of two arrays [n] in the same worlds, with its interval.
+
+    ``clusters``: name of the cluster of each world, [n]; None: all worlds are independent.
 
     Returns None if the baseline's mean is 0. Interval by the delta method: with ``r`` the ratio of the means, the
     residuals ``values - r baseline`` have mean 0 and the standard error of r is
     ``s_residual / (sqrt(n) mean(baseline))``.
     """
-    data, reference, products = _check_pair(values, baseline)
+    data, reference, products = _check_pair(values, baseline, clusters)
     return data.decrease(reference, products)
 
 
@@ -274,9 +362,9 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
     return data
 
 
-def _check_pair(values: Floats, baseline: Floats) -> tuple[Moments, Moments, Fraction]:
+def _check_pair(values: Floats, baseline: Floats, clusters: Texts | None) -> tuple[Moments, Moments, Fraction]:
     """Return the moments of ``values`` and of ``baseline``, and the exact sum of their products."""
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")
-    return Moments.of(data), Moments.of(reference), exact_sum(data, reference)
+    return Moments.of(data, clusters), Moments.of(reference, clusters), exact_sum(data, reference)

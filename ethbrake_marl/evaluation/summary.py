@@ -72,7 +72,10 @@ class SummaryTable(list[SummaryRow]):
     def _repr_html_(self) -> str:
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
         note += "".join(f" {warning}" for warning in warnings_of(self))
-        worlds = f"{self[0].parameters['scenario']}, {count_of(self[0].episodes, 'world')}" if self else "no agent"
+        worlds = "no agent"
+        if self:
+            told = self[0].parameters
+            worlds = f"{told['scenario']}, {count_of(self[0].episodes, 'world')}{told.by_recording}"
         sheet = replace(SummaryTable(self).sheet(), title=worlds, note=note)
         shown = {"Agent", "Knows"}.union(*(each.notebook for _, each in every_set()))
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
@@ -179,7 +182,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
     """
     contexts = contexts_of(evaluation)
     return summarise_sums(
-        tally_agents(evaluation.outcomes, contexts, baseline=baseline),
+        tally_agents(evaluation.outcomes, contexts, baseline=baseline, clusters=evaluation.clusters),
         evaluation.conditions,
         contexts,
         baseline=baseline,

@@ -28,6 +28,8 @@ class Tally:
     worlds_hash: int = 0  # ``hash_of_chunks`` of the worlds
     # Smallest and largest value of every quantity, one pair for each vehicle, pair or world, by the quantity's key.
     ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)
+    recordings: frozenset[str] = frozenset()  # recordings that the worlds come from (``clusters_of``)
+    rejected: int = 0  # number of draws that were rejected for an early impact
     left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; nothing else counts them
     agents: Mapping[str, AgentTally] = field(default_factory=dict)  # sums of each agent's measures, by name
     # ``MeasureSet.because_key`` -> why that set of measures does not apply; None if it applies.
@@ -46,7 +48,7 @@ class Tally:
         """
         worlds = part.worlds
         if not worlds.n:
-            return cls(left_out=part.left_out)
+            return cls(left_out=part.left_out, rejected=part.rejected)
         ranges = {
             name: tuple((float(np.nanmin(c)), float(np.nanmax(c))) for c in rule.of(worlds).T)
             for name, rule in QUANTITY.of(worlds).items()
@@ -57,8 +59,10 @@ class Tally:
             int(part.hidden.sum()),
             hash_of_chunks(worlds, part.index),
             ranges,
+            frozenset() if part.clusters is None else frozenset(part.clusters.tolist()),
+            part.rejected,
             part.left_out,
-            tally_agents(part.outcomes, contexts, objectives=objectives),
+            tally_agents(part.outcomes, contexts, objectives=objectives, clusters=part.clusters),
             silent_because(contexts),
         )
 
@@ -72,6 +76,8 @@ class Tally:
             self.hidden + other.hidden,
             (self.worlds_hash + other.worlds_hash) % HASHES,
             ranges,
+            self.recordings | other.recordings,
+            self.rejected + other.rejected,
             tuple(sorted((*self.left_out, *other.left_out))),
             agents | {name: agents.get(name, AgentTally()) + each for name, each in other.agents.items()},
             {**self.silent, **{key: why or self.silent.get(key) for key, why in other.silent.items()}},
@@ -94,5 +100,6 @@ class Tally:
                 for name, own in self.agents.items()
                 for count in HARM_COUNTS
                 for each in objectives
-            ]
+            ],
+            len(self.recordings),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,20 @@ from ethbrake_marl.physics.state import Ints, Worlds
 from ethbrake_marl.scenario.fields import RECORDING
 
 _Texts = NDArray[np.str_]
+
+
+def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
+    """Return the name of each world's cluster, [n]; only clusters are independent. None: all worlds are.
+
+    A cluster is a recording; a world without one, in a mixture, is a cluster of its own.
+
+    Args:
+        kinds: columns of text by name, as ``Sample.kinds``.
+        index: [n] number of each world in its list.
+
+    """
+    column = kinds.get(RECORDING)
+    return None if column is None else np.where(column == "", np.char.add(" ", index.astype(str)), column)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +78,11 @@ class Sample:
         columns |= {} if self.recordings is None else {RECORDING: self.recordings}
         types = () if self.types is None else self.types.T
         return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
+
+    @property
+    def clusters(self) -> _Texts | None:
+        """Name of each world's cluster, [n] (``clusters_of``); None: all worlds are independent."""
+        return clusters_of(self.kinds, self.index)
 
     def count_kinds(self) -> str:
         """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type.

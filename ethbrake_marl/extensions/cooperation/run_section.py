@@ -234,7 +234,7 @@ def _added(experiment: Experiment) -> Sheet:
     rows: list[Row] = []
     for vehicle in scenario.learners:
         name = scenario.vehicle_names[vehicle]
-        pair = (evaluation.outcome(without(name)), evaluation.outcome(TRAINED_TEAM))
-        rows.append((name, *(paired_difference(*(one.world_harm(each) for one in pair)) for each in HARM_COUNTS)))
+        less, team = _harms(evaluation.outcome(without(name))), _harms(evaluation.outcome(TRAINED_TEAM))
+        rows.append((name, *(paired_difference(less[each], team[each], evaluation.clusters) for each in HARM_COUNTS)))
     about = "The same team, but that vehicle brakes fully; the others were not trained for that."
     return Sheet("What each learner adds, mean per world (m²/s²)", columns, rows, about)

@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.notes import identity_line
 from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
-from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.evaluation.statistics import mean, share_of
 from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.harm_figures import harm_by_agent, harm_in_parts, regret_distribution
@@ -79,20 +79,21 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     elif regrets is None or avoidable is None:
         body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
     else:
-        share = rate(int(avoidable.sum()), len(avoidable)).in_words(digits=1, scale=100.0, unit=" %")
+        share = share_of(avoidable, evaluation.clusters).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
             f"Contact can be avoided in {share} of these worlds (proven, world by world); in the others no command can."
         )
         for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
             if among.any():
                 part = evaluation.take(among)
-                caption = f"{where}: {count_of(part.worlds.n, 'world')}"
+                by = part.clusters
+                caption = f"{where}: {count_of(part.worlds.n, 'world')}{part.conditions.by_recording}"
                 rows = [
                     (
                         agent,
-                        rate(int(each.collided.sum()), part.worlds.n),
-                        *(mean(each.world_harm(count)) for count in HARM_COUNTS),
-                        *(mean(regrets.regret(evaluation.outcomes[agent], count)[among]) for count in HARM_COUNTS),
+                        share_of(each.collided, by),
+                        *(mean(each.world_harm(count), by) for count in HARM_COUNTS),
+                        *(mean(regrets.regret(evaluation.outcomes[agent], count)[among], by) for count in HARM_COUNTS),
                     )
                     for agent, each in part.outcomes.items()
                 ]
@@ -186,9 +187,11 @@ class Report:
             Played.drive(played, worlds, name, agent, scenario)
             if on_agent is not None:
                 on_agent(name)
-        some = evaluation.worlds.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
-        modes = compare_modes(agents, some, Task(evaluation.scenario, evaluation.vehicles, harm_count), behind=True)
-        line = Conditions({**evaluation.conditions, "count": some.n}).line
+        some = evaluation.take(np.arange(min(evaluation.worlds.n, SHIELD_WORLDS)))
+        task = Task(evaluation.scenario, evaluation.vehicles, harm_count)
+        modes = compare_modes(agents, some.worlds, task, behind=True, clusters=some.clusters)
+        changed = {"count": some.worlds.n, "recordings": some.recordings}
+        line = Conditions({**evaluation.conditions, **changed}).line
         count = "First-impact" if harm_count == "first" else "Total"
         shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.")
         return replace(self, played=played, shield=shield, focus=focus)
@@ -361,7 +364,8 @@ def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
 
 def _short_table(rows: SummaryTable) -> Part:
     """Return a table of each agent's collision rate, first-impact harm and total harm."""
-    return _table(SummaryTable(rows).sheet(), _CAPTION, _SHORT)
+    caption = _CAPTION + (rows[0].parameters.by_recording if rows else "")
+    return _table(SummaryTable(rows).sheet(), caption, _SHORT)
 
 
 def _remarks(rows: SummaryTable) -> list[str]:

@@ -76,6 +76,7 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     """
     if not bins >= 1:
         raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")
+    by = evaluation.clusters
     gap, gaps = evaluation.worlds.gaps_m.sum(axis=1), [f"d{p}" for p in range(1, evaluation.worlds.N)]
     part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * bins).astype(np.int64), bins - 1)
     groups = [part == k for k in np.unique(part)]
@@ -84,7 +85,7 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
     for axes, (name, label) in zip(panels, _PANELS[:2], strict=True):
         for number, agent in enumerate(evaluation.outcomes if agents is None else agents):
             harm, style = getattr(evaluation.outcome(agent), name), series_style(number)
-            estimates = [mean(harm[group]) for group in groups]
+            estimates = [mean(harm[group], None if by is None else by[group]) for group in groups]
             at = [float(gap[group].mean()) for group in groups]
             axes.plot(at, [each.value for each in estimates], label=label_text(agent), **style)
             ends = np.array([each.ends for each in estimates])
