@@ -3,10 +3,13 @@
 from tests.test_same_bits import PACKAGE, SQUARES, TRAINED, calls_in
 
 SEARCHED = "a search, whose finds are written down as numbers"
+ROUNDED = "degrees to a direction; what is made of it is rounded to millimetres"
 REMAINS = {
     ("learners/rollout_classification_model.py", "**"): TRAINED,
     ("learners/scout.py", "np.exp"): TRAINED,
     ("learners/vine_model.py", "**"): TRAINED,
+    ("recorded/states.py", "np.cos"): ROUNDED,
+    ("recorded/states.py", "np.sin"): ROUNDED,
     ("report/player.py", "**"): SQUARES,
     ("reproduction/trajectories.py", "**"): SQUARES,
     ("studies/falsification.py", "**"): SEARCHED,

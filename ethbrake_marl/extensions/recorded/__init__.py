@@ -1,1 +1,1 @@
-"""Scenarios from recorded traffic: highD, NGSIM, OpenACC."""
+"""Scenarios from recorded traffic: highD, exiD, NGSIM, OpenACC, and tables of trajectories."""

@@ -171,6 +171,6 @@ class Chains:
 
 def _gap(ahead: Any, state: Any) -> float:
     """Return the gap from the rear of ``ahead`` to the front of ``state``, along the travel of ``state`` (m)."""
-    rear = ahead.front - ahead.length * math.cos(ahead.heading)
-    across = ahead.side - ahead.length * math.sin(ahead.heading) - state.side
-    return float((rear - state.front) * math.cos(state.heading) + across * math.sin(state.heading))
+    along = ahead.front - ahead.length * ahead.dx - state.front
+    across = ahead.side - ahead.length * ahead.dy - state.side
+    return float(along * state.dx + across * state.dy)

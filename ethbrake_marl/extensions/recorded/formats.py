@@ -82,7 +82,8 @@ FORMATS: dict[DataFormat, Format] = {
     ),
     "openacc": Format(
         "OpenACC", ("*.csv",), {"tick": "Time", "speed": "Speed#", "gap": "IVS#"}, "m and m/s",
-        "OpenACC is of the European Commission's Joint Research Centre, CC BY 4.0: name the source.",
+        "OpenACC is of the European Commission's Joint Research Centre, CC BY 4.0: name the source, and say that these"
+        " rows are made from it.",
         ticks=10.0, impossible=0.01, standing_mps=0.5, mixed=True,
     ),
 }  # fmt: skip

@@ -26,10 +26,10 @@ CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3  # range of lengths of cars and vans, and 
 
 OFF = 0.05  # largest accepted distance of a time from a tick, in ticks
 
-# A vehicle at a moment, in m and m/s. ``front`` is its position along the direction of travel, ``side`` across it; with
-# a ``heading`` (radians), they are x and y of its front. ``preceding`` is the vehicle ahead, below 0 for none.
+# A vehicle at a moment, in m and m/s. ``front`` and ``side`` are x and y of its front, ``dx`` and ``dy`` its direction
+# of travel: 1 and 0 where positions are along the road. ``preceding`` is the vehicle ahead, below 0 for none.
 # ``length`` is 0 if the data hold gaps. ``tick`` counts the moments that are looked at, ``line`` is that of the file.
-State = namedtuple("State", "tick id lane preceding front side heading length speed line")
+State = namedtuple("State", "tick id lane preceding front side dx dy length speed line")
 
 STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
 
@@ -135,7 +135,7 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
     who, lane, ahead = given["id"], given.get("lane", zero), given.get("preceding", zero - 1.0)
     ahead = np.where(ahead == entry.alone, -1.0, ahead)
     front, side, length = (given.get(role, zero) * entry.metres for role in ("front", "side", "length"))
-    heading, speed = np.deg2rad(given.get("heading", zero)), given["speed"] * entry.mps
+    dx, dy, speed = zero + 1.0, zero, given["speed"] * entry.mps
     right = f"m of length: must be in (0, {LONGEST_M:g}]; {entry.title} has {entry.units}"
     piece.refuse((length <= 0.0) | (length > LONGEST_M), at("length"), right, length)
     if entry.title == "highD":
@@ -145,10 +145,11 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
         right_hand = turned[place, 1] == 2.0  # x is the left edge of the vehicle and grows to the right
         front, speed = np.where(right_hand, front + length, -front), speed * np.where(right_hand, 1.0, -1.0)
     elif entry.title == "exiD":  # x and y are those of the centre
-        front, side = front + length / 2.0 * np.cos(heading), side + length / 2.0 * np.sin(heading)
+        dx, dy = np.cos(np.deg2rad(given["heading"])), np.sin(np.deg2rad(given["heading"]))
+        front, side = front + length / 2.0 * dx, side + length / 2.0 * dy
     right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
     piece.refuse(speed > FASTEST_MPS, at("speed"), right, speed)
-    return np.column_stack([ticks, who, lane, ahead, front, side, heading, length, speed, piece.lines])
+    return np.column_stack([ticks, who, lane, ahead, front, side, dx, dy, length, speed, piece.lines])
 
 
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
@@ -176,5 +177,5 @@ def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
     behind, numbers = np.cumsum(np.where(linked, gaps, 0.0), axis=1), np.tile(np.array(cars, float), (len(ticks), 1))
     ahead = np.where(linked, numbers - 1.0, -1.0)
     tick, line = (np.repeat(each[:, None], n, axis=1) for each in (ticks, piece.lines))
-    fields = [tick, numbers, none, ahead, -behind, none, none, none, speeds, line]
+    fields = [tick, numbers, none, ahead, -behind, none, none + 1.0, none, none, speeds, line]
     return np.stack(fields, axis=-1)[np.isfinite(speeds)]
