@@ -88,10 +88,13 @@ def _no_impact(rows: Sequence[SummaryRow]) -> str:
     unhurt = [row for row in rows if not row.collisions]
     if not unhurt:
         return ""
+    where = f"No impact in {count_of(unhurt[0].episodes, 'world')}: {', '.join(row.agent for row in unhurt)}."
+    if unhurt[0].collision_rate.interval is None:
+        return f"{where} They are all of one recording, which says nothing about others."
     most = 100 * unhurt[0].collision_rate.ends[1]
     return (
-        f"No impact in {count_of(unhurt[0].episodes, 'world')}: {', '.join(row.agent for row in unhurt)}. With 95 %"
-        f" confidence at most {most:.2g} % of all such worlds have one; how much harm these would do is not known."
+        f"{where} With 95 % confidence at most {most:.2g} % of all such worlds have one; how much harm these would do"
+        " is not known."
     )
 
 

@@ -1,12 +1,21 @@
 """Intervals by recording: worlds whose rows come from the same recording form a cluster."""
 
+import json
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
+import ethbrake_marl as eb
+from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.chunks import Lineup, evaluate_held, summarise_tally, tally_list
+from ethbrake_marl.evaluation.comparison import compare_results
+from ethbrake_marl.evaluation.per_world import read_result, results_to_json, write_per_world
+from ethbrake_marl.evaluation.shield_modes import compare_modes
 from ethbrake_marl.evaluation.statistics import (
     Moments,
     mean,
@@ -14,8 +23,10 @@ from ethbrake_marl.evaluation.statistics import (
     rate,
     relative_decrease,
     share_of,
+    unpaired_difference,
     wilson,
 )
+from ethbrake_marl.scenario.task import Task
 from tests.refused import refused
 
 T_2 = 4.302652729911275  # quantile of Student's t with 2 degrees of freedom at 97.5 %
@@ -106,3 +117,159 @@ def test_intervals__by_clusters_cover_the_truth_as_often_as_they_say() -> None:
     covered = hits / 300
     assert ((covered[:, 0] > 0.88) & (covered[:, 0] < 0.985)).all(), covered
     assert (covered[:, 1] < 0.83).all(), covered
+
+
+PAPER = eb.load_scenario("paper-random")
+AGENTS = {name: eb.make_agent(name) for name in ("full_brake", "e_v2x_bm")}
+
+
+def in_one_line(table):
+    return " ".join(str(table).split())
+
+
+def recorded(recordings, rows_of_each=20, **changes):
+    """A scenario of rows of several recordings, each with gaps and speeds of its own."""
+    rng, rows = np.random.default_rng(2), []
+    for k in range(recordings):
+        gap_m, speed_mps = rng.uniform(4, 12), rng.uniform(14, 22)
+        rows += [[gap_m + rng.uniform(0, 1), speed_mps, f"drive_{k}.csv: 1-2-3"] for _ in range(rows_of_each)]
+    table = {"columns": ["gap_1_m", "speed_2_mps", "recording"], "rows": rows}
+    return eb.Scenario(**{**PAPER.declared(), "name": "recorded", "table": table, **changes})
+
+
+@pytest.fixture(scope="module")
+def found():
+    scenario = recorded(8)
+    return eb.evaluate(scenario.sample(400, 7), AGENTS, scenario=scenario, seed=7)
+
+
+def test_evaluation__has_the_recording_of_each_world_and_intervals_by_it(found) -> None:
+    sample, column = found.scenario.sample(400, 7), found.kinds["recording"]
+    assert column.tolist() == sample.recordings.tolist()
+    assert found.recordings == len(set(column.tolist())) == 8
+    rows = eb.summarise(found)
+    harm, braking = found.outcome("e_v2x_bm"), found.outcome("full_brake")
+    assert rows[1].total_harm == mean(harm.total_harm, column)
+    assert rows[1].collision_rate == share_of(harm.collided, column)
+    assert rows[1]["harm_decrease_total"] == relative_decrease(harm.total_harm, braking.total_harm, column)
+    assert rows[1]["total_harm_difference"] == paired_difference(harm.total_harm, braking.total_harm, column)
+    assert rows[1].total_harm.interval[1] > 1.05 * mean(harm.total_harm).interval[1]
+    assert rows[0].parameters["recordings"] == 8
+    assert "400 worlds, seed 7; 95 % intervals by 8 recordings; d = " in in_one_line(rows)
+    assert "95 % intervals by 8 recordings." in in_one_line(found.rescore(["total"]))
+    assert found.rescore(["total"])[1].each[1] == mean(found.outcome("full_brake").total_harm, column)
+    assert found.take(column == column[0]).recordings == 1
+
+
+def test_evaluation__without_recordings_says_nothing_of_them() -> None:
+    rows = eb.summarise(eb.evaluate(PAPER.sample(20, 7), AGENTS, scenario=PAPER))
+    assert "recording" not in str(rows) and "recordings" not in rows[0].parameters
+
+
+def test_long_list__has_the_same_intervals_by_recording() -> None:
+    scenario = recorded(8, latency_s=[0, {"uniform": [0.3, 1.5]}, 1.6])
+    lineup = Lineup.of(["full_brake", "coast"], scenario)
+    held = evaluate_held(lineup, scenario.sample(6_000, 7), 7)
+    tally = tally_list(lineup, 6_000, 7, objectives=["total"])
+    long, rows = summarise_tally(lineup, tally, 7), eb.summarise(held)
+    for one, other in zip(long, rows, strict=True):
+        for name in ("total_harm", "collision_rate", "harm_decrease_first"):
+            assert one[name] == other[name]
+    assert long[0].parameters["recordings"] == rows[0].parameters["recordings"] == 8
+    assert long[0].parameters["rejected_draws"] == rows[0].parameters["rejected_draws"] == held.rejected > 0
+    assert tally.rescore(["total"], 3).recordings == 8
+
+
+def test_single_recording__has_no_interval_and_the_table_says_so() -> None:
+    scenario = recorded(1)
+    rows = eb.summarise(eb.evaluate(scenario.sample(50, 7), AGENTS, scenario=scenario))
+    assert rows[0].total_harm.interval is None and rows[0].collision_rate.interval is None
+    assert "no 95 % intervals: all worlds are of one recording" in in_one_line(rows)
+    far = recorded(1, gaps_m=[9, 300], speeds_mps=[20, 20, 20], table={
+        "columns": ["gap_1_m", "recording"], "rows": [[300.0, "a"]]
+    })  # fmt: skip
+    text = in_one_line(eb.summarise(eb.evaluate(far.sample(5, 7), AGENTS, scenario=far)))
+    assert "They are all of one recording, which says nothing about others." in text
+
+
+def test_rejected_rows__are_counted_below_the_table() -> None:
+    # Every fifth row is hit 0.25 s after the alert, before vehicle_2 may act at 0.5 s.
+    rows = [[5.0 if k == 0 else 30.0, 0.0, 20.0, f"drive_{k}"] for k in range(5)]
+    table = {"columns": ["gap_1_m", "speed_1_mps", "speed_2_mps", "recording"], "rows": rows}
+    scenario = recorded(1, latency_s=[0, 0.5, 0.8], table=table)
+    sample = scenario.sample(400, 7)
+    again = f"Drawn again: {sample.rejected} of {sample.rejected + 400} draws ("
+    text = in_one_line(eb.summarise(eb.evaluate(sample, AGENTS, scenario=scenario)))
+    assert again in text and 60 < sample.rejected < 140
+    kept = scenario.replace(early_impacts="keep")
+    assert "Drawn again" not in str(eb.summarise(eb.evaluate(kept.sample(50, 7), AGENTS, scenario=kept)))
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_comparison__of_results_that_were_read_again_is_by_recording(found, ending: str, tmp_path: Path) -> None:
+    if ending == "parquet":
+        pytest.importorskip("pyarrow")
+    other = replace(found, outcomes={"full_brake": found.outcome("e_v2x_bm")})
+    results = []
+    for name, each in (("one", found), ("two", other)):
+        (tmp_path / name).mkdir()
+        write_per_world(tmp_path / name / f"worlds.{ending}", each)
+        told = results_to_json(eb.summarise(each), per_world=tmp_path / name / f"worlds.{ending}")
+        (tmp_path / name / "results.json").write_text(json.dumps(told))
+        results.append(read_result(tmp_path / name / "results.json"))
+    paired = compare_results(*results)
+    harms = [each.outcome("full_brake").total_harm for each in (other, found)]
+    assert paired.differences[0].harms["total_harm"] == paired_difference(*harms, found.kinds["recording"])
+    assert paired.recordings == paired.to_json()["recordings"] == 8
+    (tmp_path / "two" / f"worlds.{ending}").unlink()
+    unpaired = compare_results(*results).differences[0].harms["total_harm"]
+    both = [mean(each, found.kinds["recording"]) for each in harms]
+    assert unpaired == unpaired_difference(both[0], 8, both[1], 8)
+
+
+def test_result__with_an_impossible_number_of_recordings_is_refused(found, tmp_path: Path) -> None:
+    told = results_to_json(eb.summarise(found))
+    for number, message in ((401, "recordings = 401: must be 1 to 400"), ("x", "recordings = x: must be a whole")):
+        for row in told:
+            row["parameters"]["recordings"] = number
+        (tmp_path / "results.json").write_text(json.dumps(told))
+        with refused(message):
+            read_result(tmp_path / "results.json")
+
+
+def test_shield__is_compared_by_recording(found) -> None:
+    some = found.take(np.arange(60))
+    task = Task(some.scenario, (1,))
+    agents = {"full_brake": AGENTS["full_brake"]}
+    rows = compare_modes(agents, some.worlds, task, clusters=some.clusters)
+    assert rows[0].harm == mean(some.outcome("full_brake").first_impact_harm, some.kinds["recording"])
+    assert rows.to_json(some.scenario.sample(60, 7), task)[0]["recordings"] == some.recordings
+
+
+def test_mixture__counts_a_world_without_recording_as_a_cluster_of_its_own() -> None:
+    mixed = eb.Scenario(name="mixed", mixture=[{"scenario": PAPER}, {"scenario": recorded(4)}])
+    sample = mixed.sample(60, 7)
+    alone = int((sample.scenarios == "paper-random").sum())
+    assert len(set(sample.clusters.tolist())) == alone + 4
+
+
+def test_command__says_how_many_recordings_and_how_many_draws_were_refused(
+    empty_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [[5.0 if k == 0 else 30.0, 0.0, 20.0, f"drive_{k}"] for k in range(5)]
+    table = {"columns": ["gap_1_m", "speed_1_mps", "speed_2_mps", "recording"], "rows": rows}
+    scenario = recorded(1, latency_s=[0, 0.5, 0.8], table=table)
+    Path("recorded.yaml").write_text(json.dumps(scenario.declared()))
+    rejected = scenario.sample(200, 7).rejected
+    share = f"{rejected} of {200 + rejected} draws ({100 * rejected / (200 + rejected):.1f} %)"
+    assert run_command(["scenario", "explain", "recorded.yaml"]) == 0
+    told = in_one_line(capsys.readouterr().out)
+    assert f"is drawn again: {share}." in told
+    assert "one of 5 rows of a table of 5 recordings, by which intervals are: gap_1_m" in told
+    assert run_command(["scenario", "validate", "recorded.yaml"]) == 0
+    told = in_one_line(capsys.readouterr().out)
+    assert f"early impacts: {share} refused" in told and "recording: 4 different" in told
+    assert run_command(["scenario", "sample", "recorded.yaml", "--episodes", "200"]) == 0
+    assert f"before a learner may act, and drawn again: {share}" in in_one_line(capsys.readouterr().err)
+    assert run_command(["scenario", "sample", "paper-random", "--episodes", "200"]) == 0
+    assert "drawn again" not in capsys.readouterr().err

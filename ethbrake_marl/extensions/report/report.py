@@ -299,7 +299,7 @@ class Report:
         elsewhere = {title: told for title, _, told in self.tests}
         marks = "; marks: the other tests" if elsewhere else ""
         figure = harm_by_agent(rows, self.harm_count, elsewhere)
-        about = f"Mean and 95 % interval{marks}."
+        about = f"Mean and 95 % interval{marks}{self.evaluation.conditions.by_recording}."
         drawing = Part.drawing(figure, f"{which} harm of each agent", about)
         return [Part.remarks([*self.remarks, *_remarks(rows)]), Part.beside([drawing, _short_table(rows)])]
 
@@ -350,10 +350,12 @@ def _words(estimate: Estimate | None) -> str:
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
     """Compare an agent's harm with full braking in the same worlds: "less", "more" or "as much".
 
-    It is "as much" if the interval of the difference contains 0. ``harm`` is the measure, for instance ``total_harm``.
+    It is "as much" if the interval of the difference contains 0, or is unknown for several worlds. ``harm`` is the
+    measure, for instance ``total_harm``.
     """
     difference = row[f"{harm}_difference"]
-    low, high = (0.0, 0.0) if difference is None else difference.ends
+    unknown = difference is None or (difference.interval is None and row.episodes > 1)
+    low, high = (0.0, 0.0) if difference is None or unknown else difference.ends
     return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
 
 
