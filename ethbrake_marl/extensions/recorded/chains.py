@@ -94,14 +94,14 @@ class Chains:
             by_id: the same by id, of a vehicle that is there twice the first.
 
         """
-        behind: dict[float, Link] = {}
-        preceding = {state.id: state.preceding for state in there}
+        behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: the vehicle ahead, if no file names it
         if self.entry.by_lane:
             for first, second in pairwise(sorted(there, key=lambda state: (state.lane, -state.front))):
                 if first.lane == second.lane and first.id != second.id:
-                    preceding[second.id] = first.id
+                    in_lane[second.id] = first.id
         for state in there:
-            ahead: Any = by_id.get(number) if (number := preceding[state.id]) >= 0.0 else None
+            number = in_lane.get(state.id, state.preceding)
+            ahead: Any = by_id.get(number) if number >= 0.0 else None
             gap, slowest = _gap(ahead, state) if ahead else math.nan, min(ahead.speed, state.speed) if ahead else 0.0
             noise = gap <= 0.0 and slowest < self.entry.standing_mps
             fault = (

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, example
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.store import new_file
 from ethbrake_marl.registry import Part
 
@@ -53,7 +54,7 @@ def from_data_command(
     Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
     """
     with Out(as_json=as_json, force=force) as out:
-        from ethbrake_marl.extensions.recorded.scenario import RefusedFiles, scenario_from_data
+        from ethbrake_marl.extensions.recorded.scenario import scenario_from_data
 
         rows = output.with_suffix(".csv")
         out.check(output, ".yaml", what="the scenario")
@@ -63,9 +64,9 @@ def from_data_command(
                 output.stem, folder, format, columns=columns, based_on=based_on, every_s=every, draw=draw,
                 strict=strict, progress=out.progress,
             )  # fmt: skip
-        except RefusedFiles as error:
-            for each in error.files:
-                out.note(each)
+        except InvalidInput as error:
+            for each in getattr(error, "__notes__", ()):
+                out.note(f"refused: {each}")
             raise
         for each in made.refused:
             out.note(f"refused: {each}")

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from fnmatch import fnmatch
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,7 +46,7 @@ def read_rows(
         entry: format of the files.
         every_s: time between two moments (s).
         vehicles: number of vehicles in a chain.
-        progress: called with the name of a file, the KiB read of all files, and their size in KiB.
+        progress: called with the name of a file, the KiB read of it, and its size in KiB.
 
     Raises ``InvalidInput`` for a folder without recordings.
 
@@ -54,19 +55,20 @@ def read_rows(
     if not files and (not refused or not folder.is_dir()):
         patterns = " or ".join(entry.files)
         raise InvalidInput(f"{folder}: must be a folder with {patterns}, the files of {entry.title}")
-    whole, done, left_out, longest, numbers = sum(map(_kib, files)), 0, Counter[str](), 0, 2 * vehicles - 1
-    others = dict[str, str]()  # error of each file that is no recording
+    numbers, longest, left_out, others = 2 * vehicles - 1, 0, Counter[str](), dict[str, str]()
     with closing(sqlite3.connect("")) as store:  # a temporary file on disk
         store.execute(f"CREATE TABLE chain({','.join(f'n{k}' for k in range(numbers))},file,vehicles)")
         store.execute(STATE_TABLE)
-        for file in files:
-            shown = _shown(file, folder)
-
-            def advance(kib: int, done: int = done, shown: str = shown) -> None:
-                progress(f"read: {shown}", done + kib, whole)
-
+        for shown, file in files.items():
+            names: dict[str, float] = {}
             try:
-                chains = _read_file(store, file, shown, entry, every_s, vehicles, advance)
+                with store:  # all chains of a file, or none
+                    keep_states(store, file, entry, every_s, names, partial(progress, f"read: {shown}"))
+                    named = {number: plain_text(name) for name, number in names.items()}
+                    chains = Chains(file, entry, every_s, vehicles, named)
+                    rows = ([*row, shown, who] for row, who in chains.cut(moments(store)))
+                    store.executemany(f"INSERT INTO chain VALUES ({', '.join('?' * (numbers + 2))})", rows)
+                    store.execute("DELETE FROM state")
                 left_out.update(chains.left_out)
                 longest = max(longest, chains.longest)
             except NotARecording as error:
@@ -75,67 +77,38 @@ def read_rows(
                 refused.append(str(error))
             except sqlite3.Error as error:
                 raise InvalidInput(f"{folder}: cannot be ordered by time ({error})") from None
-            done += _kib(file)
         if len(others) == len(files) and not refused:
             raise InvalidInput(f"{folder}: holds no recording of {entry.title}: {'; '.join(others.values())}")
         ((seen,),) = store.execute("SELECT COUNT(*) FROM chain")
         each_of = seen * numbers // MOST_NUMBERS + 1
         kept = store.execute("SELECT * FROM chain WHERE rowid % ? = 0", (each_of,)).fetchall()
     left_out[f"chains: a table holds {MOST_NUMBERS:,} numbers, so one in {each_of} is kept"] = seen - len(kept)
-    rows, of = [list(row[:-2]) for row in kept], [row[-2:] for row in kept]
-    return Rows(rows, of, seen, longest, left_out, refused, [*others, *twice])
+    lines, of = [list(row[:-2]) for row in kept], [row[-2:] for row in kept]
+    return Rows(lines, of, seen, longest, left_out, refused, [*others, *twice])
 
 
-def _read_file(
-    store: sqlite3.Connection,
-    file: Path,
-    shown: str,
-    entry: Format,
-    every_s: float,
-    vehicles: int,
-    progress: Callable[[int], None],
-) -> Chains:
-    """Write all chains of a file, or none, into the table ``chain`` of ``store``; ``shown`` is the recording's name."""
-    numbers: dict[str, float] = {}
-    with store:
-        keep_states(store, file, entry, every_s, numbers, progress)
-        names = {number: plain_text(name) for name, number in numbers.items()}
-        chains = Chains(file, entry, every_s, vehicles, names)
-        rows = ([*row, shown, who] for row, who in chains.cut(moments(store)))
-        store.executemany(f"INSERT INTO chain VALUES ({', '.join('?' * (2 * vehicles + 1))})", rows)
-        store.execute("DELETE FROM state")
-    return chains
-
-
-def _search(folder: Path, entry: Format) -> tuple[list[Path], list[str], list[str]]:
+def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], list[str]]:
     """Find the files of a format in a folder and below it, each once, by their names.
 
-    Return them, the errors of folders that cannot be read, and names that stand for a file that is there already:
-    links, and a text without header beside its CSV. Names that begin with a dot are left out, and links to folders are
-    not followed.
+    Return them by their printable path below the folder, the errors of folders that cannot be read, and names that
+    stand for a file that is there already: links, and a text without header beside its CSV. Names that begin with a dot
+    are left out, and links to folders are not followed.
     """
     if folder.is_file():
-        return [folder], [], []
-    found, refused, twice = dict[str, Path](), list[str](), list[str]()
+        return {plain_text(folder.name): folder}, [], []
+    found, seen, refused, twice = dict[str, Path](), set[str](), list[str](), list[str]()
     walk = os.walk(folder, onerror=lambda error: refused.append(f"{error.filename}: cannot be read ({error.strerror})"))
     everything = {Path(top, name) for top, _, names in walk for name in names}
     for file in sorted(everything):
-        hidden = any(part.startswith(".") for part in file.relative_to(folder).parts)
-        if hidden or not any(fnmatch(file.name.lower(), pattern.lower()) for pattern in entry.files):
+        below, real = file.relative_to(folder), os.path.realpath(file)
+        matches = any(fnmatch(file.name.lower(), pattern) for pattern in entry.files)
+        if not matches or any(part.startswith(".") for part in below.parts):
             continue
-        again = entry.headless and file.suffix.lower() == ".txt" and file.with_suffix(".csv") in everything
-        if again or found.setdefault(os.path.realpath(file), file) is not file:
-            twice.append(_shown(file, folder))
-    return list(found.values()), refused, twice
-
-
-def _shown(file: Path, folder: Path) -> str:
-    """Return the path of a file below the folder, printable, with slashes."""
-    return plain_text(file.name if file == folder else file.relative_to(folder).as_posix())
-
-
-def _kib(file: Path) -> int:
-    try:
-        return file.stat().st_size >> 10
-    except OSError:
-        return 0
+        shown = plain_text(below.as_posix())
+        again = entry.headless and file.suffix == ".txt" and file.with_suffix(".csv") in everything
+        if again or real in seen or shown in found:
+            twice.append(shown)
+        else:
+            seen.add(real)
+            found[shown] = file
+    return found, refused, twice

@@ -18,7 +18,7 @@ class Format(NamedTuple):
     """One format of recorded traffic; lengths and speeds become m and m/s by ``metres`` and ``mps``."""
 
     title: str  # name of the data set, for users
-    files: tuple[str, ...]  # patterns of the names of its files
+    files: tuple[str, ...]  # patterns of the names of its files, in lower case
     # Names of the columns to read, by what they hold (fields of ``states.State``; ``gap``: the gap behind a vehicle,
     # recorded instead of positions and lengths). A name ending in # stands for one column per vehicle: Speed1, ...
     columns: dict[str, str]

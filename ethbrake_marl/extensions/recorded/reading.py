@@ -6,13 +6,16 @@ Each number keeps the line (of Parquet: the row) in which it stands, so that a m
 from __future__ import annotations
 
 import csv
+import math
+import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from io import TextIOWrapper
 from itertools import chain, count, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,9 +31,11 @@ LONGEST_LINE, LARGEST_BYTES = 1 << 16, 1 << 40  # limits of a line (characters) 
 
 _OTHER_NAMES = {"preceeding": "preceding"}  # misspelt column in some files of NGSIM
 
-_NUMBERED = "[1-9][0-9]*"
+_THOUSANDS = re.compile(r"-?\d{1,3}(,\d{3})+(\.\d*)?")  # in quotes, where commas are separators, too
 
-_Line = tuple[int, str]
+_Row = tuple[int, Sequence[str]]  # line, and cells
+
+_Table = tuple[Sequence[str], Sequence[int], Iterator[_Row]]  # names of columns, indices of those to read, rows
 
 
 class NotARecording(InvalidInput):
@@ -75,7 +80,7 @@ def read_pieces(
     entry: Format,
     columns: Sequence[str],
     names: dict[str, float] | None = None,
-    progress: Callable[[int], None] = lambda _: None,
+    progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Iterator[Piece]:
     """Yield the numbers of a file piece by piece.
 
@@ -86,19 +91,22 @@ def read_pieces(
         entry: its format.
         columns: names of the columns to read, in this order.
         names: number of each name in columns of names; new names are added.
-        progress: called with the KiB read.
+        progress: called with the KiB read, and the size of the file in KiB.
 
     Raises ``InvalidInput`` with file, line and column for a missing column or a cell that is not a number, and
     ``NotARecording`` for a file that is something else.
 
     """
-    known = {} if names is None else names
     with open_plain(file, LARGEST_BYTES) as stream:
         text, empty = TextIOWrapper(stream, "utf-8-sig"), True
-        pieces = _parquet_pieces if _is_parquet(file) else _text_pieces
-        for piece in pieces(text, file, entry, columns, known):
-            progress(stream.tell() >> 10)
-            for k in range(1 if entry.gaps else len(piece.columns)):
+        shown, used, rows = (_parquet if _is_parquet(file) else _text)(text, file, entry, columns)
+        later, names = _measured if entry.gaps else _number, {} if names is None else names
+        read = [partial(_number_of, names) if k in entry.texts else later if k else _number for k in range(len(used))]
+        numbers, head = _numbers(file, rows, shown, list(zip(used, read, strict=True))), [shown[k] for k in used]
+        while some := list(islice(numbers, PIECE)):
+            progress(stream.tell() >> 10, os.fstat(stream.fileno()).st_size >> 10)
+            piece = Piece(file, head, np.array([values for _, values in some]), np.array([line for line, _ in some]))
+            for k in range(1 if entry.gaps else len(used)):
                 piece.refuse(~np.isfinite(piece.values[:, k]), k, "must be a finite number")
             empty = False
             yield piece
@@ -106,177 +114,149 @@ def read_pieces(
             raise InvalidInput(f"{file}: has no rows")
 
 
-def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number of a name: 1 for the first one, 2 for the next. Raise ``ValueError`` for an empty name."""
-    if not (name := cell.strip()):
-        raise ValueError("empty")
-    return names.setdefault(name, len(names) + 1.0)
-
-
 def _is_parquet(file: Path) -> bool:
     return file.suffix.lower() == ".parquet"
 
 
-def _parquet_pieces(
-    text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str], names: dict[str, float]
-) -> Iterator[Piece]:
+def _numbers(
+    file: Path, rows: Iterable[_Row], shown: Sequence[str], readers: Sequence[tuple[int, Callable[[str], float]]]
+) -> Iterator[tuple[int, list[float]]]:
+    """Yield the line of each row, and the numbers in its cells of which ``readers`` has the index and a reader."""
+    for line, cells in rows:
+        if len(cells) != len(shown):
+            right = f"but the header has {len(shown)} columns; is the file whole?"
+            raise InvalidInput(f"{place_of(file, line)}: {len(cells)} values, {right}")
+        k = 0
+        try:
+            yield line, [reader(cells[k := at]) for at, reader in readers]
+        except ValueError:
+            cell = cells[k].strip()
+            right = f"{cell!r:.60} is not a number" if cell else "is empty"
+            raise InvalidInput(f"{place_of(file, line)}, column {shown[k]}: {right}") from None
+
+
+def _parquet(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]) -> _Table:
+    """Return the names of the columns to read of a Parquet file, their indices, and its rows."""
     with naming_extras():
         import pyarrow
         from pyarrow.parquet import ParquetFile
-    try:
-        table, begins = ParquetFile(text.buffer), 1
-        cells = table.schema_arrow.names
-        used = _used(file, "", entry, columns, cells)
-        if used is None:
-            raise _unknown(file, entry, columns, [cells])
-        for batch in table.iter_batches(PIECE, columns=[cells[k] for k in used]):
-            lines, values = np.arange(begins, begins + batch.num_rows), np.empty((batch.num_rows, len(used)))
-            begins += batch.num_rows
-            for k, at in enumerate(used):
-                cast = batch.column(cells[at]).cast(pyarrow.string() if k in entry.texts else pyarrow.float64())
-                if k in entry.texts:
-                    cast = np.array([np.nan if not cell else _number_of(names, cell) for cell in cast.to_pylist()])
-                values[:, k] = cast
-            yield Piece(file, [cells[k] for k in used], values, lines)
-    except (pyarrow.ArrowException, OSError) as error:
-        raise InvalidInput(f"{file}: cannot be read as Parquet with numbers ({error})") from None
 
-
-def _text_pieces(
-    text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str], names: dict[str, float]
-) -> Iterator[Piece]:
-    cells, used, separator, source = _header(file, entry, columns, _lines(file, text))
-    converters: dict[int | str, Callable[[str], Any]] | None
-    converters = {used[k]: partial(_number_of, names) for k in entry.texts} or None
-    elsewhere = seen = 0
-    while piece := list(islice(source, PIECE)):
-        there = [(number, _plain(line, separator)) for number, line in piece if line.strip()]
-        kept = [(number, line) for number, line in there if not any(at in line for at in entry.elsewhere)]
-        elsewhere, seen = elsewhere + len(there) - len(kept), seen + len(kept)
-        if not kept:
-            continue
-        for number, line in kept:
-            if line.count(separator) + 1 != len(cells):
-                raise InvalidInput(
-                    f"{file}, line {number}: {line.count(separator) + 1} values, but the header has"
-                    f" {len(cells)} columns; is the file whole?"
-                )
-        lines = [re.sub(r",(?=,|\s*$)", ",nan", line) if entry.gaps else line for _, line in kept]
+    @contextmanager
+    def refusing() -> Iterator[None]:
         try:
-            values = np.loadtxt(lines, float, None, separator, converters, usecols=used, ndmin=2)
-        except ValueError:
-            raise _not_a_number(file, kept, lines, cells, used, separator, entry) from None
-        yield Piece(file, [cells[k] for k in used], values, np.array([number for number, _ in kept]))
-    if elsewhere and not seen:
-        raise InvalidInput(
-            f"{file}: all {elsewhere:,} rows are of {' or '.join(entry.elsewhere)}: streets with crossings, which are"
-            " left out"
-        )
+            yield
+        except (pyarrow.ArrowException, OSError) as error:
+            raise InvalidInput(f"{file}: cannot be read as Parquet ({error})") from None
+
+    def rows() -> Iterator[_Row]:
+        number = count(1)
+        with refusing():
+            for batch in table.iter_batches(PIECE, columns=names):
+                cells = [column.cast(pyarrow.string()).fill_null("").to_pylist() for column in batch.columns]
+                yield from ((next(number), row) for row in zip(*cells, strict=True))
+
+    with refusing():
+        table = ParquetFile(text.buffer)
+    used, missing = _match(file, columns, table.schema_arrow.names)
+    if missing:
+        raise _unknown(file, entry, missing, table.schema_arrow.names)
+    names = [table.schema_arrow.names[k] for k in used]
+    return names, range(len(names)), rows()
 
 
-def _lines(file: Path, text: TextIOWrapper) -> Iterator[_Line]:
-    for number, line in zip(count(1), iter(partial(text.readline, LONGEST_LINE), ""), strict=False):
-        if len(line) == LONGEST_LINE:
-            raise InvalidInput(f"{file}, line {number}: longer than {LONGEST_LINE:,} characters")
-        yield number, line
-
-
-def _plain(line: str, separator: str) -> str:
-    """Return a line without quotes, thousands separators in quotes, and blanks as separators: cells by ``separator``.
-
-    ``separator`` " " stands for any blanks.
-    """
-    if separator == " ":
-        return " ".join(line.split())
-    if '"' not in line:
-        return line
-    return separator.join([cell.replace(",", "") for cell in next(csv.reader([line], delimiter=separator))])
-
-
-def _not_a_number(
-    file: Path,
-    kept: list[_Line],
-    lines: list[str],
-    cells: Sequence[str],
-    used: Sequence[int],
-    separator: str,
-    entry: Format,
-) -> InvalidInput:
-    """Return the error that names the first cell that is no number, or an empty name, in the ``used`` columns."""
-    names = {used[k] for k in entry.texts}
-    for (number, _), line in zip(kept, lines, strict=True):
-        row = [cell.strip() for cell in line.split(separator)]
-        for k in used:
-            if row[k] == "" if k in names else parse_numeral(row[k]) is None and row[k] != "nan":
-                right = "must not be empty" if k in names else "is not a number"
-                return InvalidInput(f"{file}, line {number}, column {cells[k]}: {row[k]!r:.60} {right}")
-    return InvalidInput(f"{file}, lines {kept[0][0]} to {kept[-1][0]}: cannot be read as numbers")
-
-
-def _header(
-    file: Path, entry: Format, columns: Sequence[str], source: Iterator[_Line]
-) -> tuple[Sequence[str], list[int], str, Iterator[_Line]]:
-    """Find the header among the first lines of ``source``.
-
-    Return the names of all columns, the indices of ``columns``, the separator of cells, and the lines that follow.
-    """
-    looked_at = []
-    for number, line in islice(source, HEAD):
+def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]) -> _Table:
+    """Find the header among the first lines; return the names of all columns, the indices of ``columns``, and rows."""
+    lines, best, have = _lines(file, text), list(columns), list[str]()
+    for number, line in islice(lines, HEAD):
         row = line.split()
         numbers = sum(parse_numeral(cell) is not None for cell in row)
         if entry.headless and number == 1 and 2 * numbers > len(row) > 1:
             if len(row) != len(entry.headless):
                 right = f"the text files of {entry.title} have {len(entry.headless)}"
                 raise InvalidInput(f"{file}, line {number}: {len(row)} values without a header; {right}")
-            at = [entry.headless.index(name) for name in columns]
-            return entry.headless, at, " ", chain([(number, line)], source)
+            used, _ = _match(file, columns, entry.headless)
+            return entry.headless, used, _rows(file, chain([(number, line)], lines), " ", entry.elsewhere)
         for separator in entry.separators:
-            cells = [cell.strip() for cell in _plain(line, separator).split(separator)]
-            looked_at.append(cells)
-            if (used := _used(file, f", line {number}", entry, columns, cells)) is not None:
-                return cells, used, separator, source
-    raise _unknown(file, entry, columns, looked_at)
+            shown = [cell.strip() for cell in _cells(line, separator)]
+            used, missing = _match(file, columns, shown)
+            if not missing:
+                return shown, used, _rows(file, lines, separator, entry.elsewhere)
+            best, have = min(best, missing, key=len), have + shown
+    raise _unknown(file, entry, best, have)
 
 
-def _small(cells: Sequence[str]) -> list[str]:
-    return [_OTHER_NAMES.get(name.lower(), name.lower()) for name in cells]
+def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets: Sequence[str]) -> Iterator[_Row]:
+    """Yield the cells of each line that is not blank, and not of one of the ``streets``."""
+    elsewhere = seen = 0
+    for number, line in lines:
+        if any(street in line for street in streets):
+            elsewhere += 1
+        elif line.strip():
+            seen += 1
+            yield number, _cells(line, separator)
+    if elsewhere and not seen:
+        why = f"{' or '.join(streets)}: streets with crossings, which are left out"
+        raise InvalidInput(f"{file}: all {elsewhere:,} rows are of {why}")
 
 
-def _missing(columns: Sequence[str], cells: Sequence[str]) -> list[str]:
-    """Return those of ``columns`` that no name in ``cells`` matches."""
-    small = _small(cells)
-    return [each for each in columns if not any(_pattern(each).fullmatch(name) for name in small)]
+def _lines(file: Path, text: TextIOWrapper) -> Iterator[tuple[int, str]]:
+    for number, line in zip(count(1), iter(partial(text.readline, LONGEST_LINE), ""), strict=False):
+        if len(line) == LONGEST_LINE:
+            raise InvalidInput(f"{file}, line {number}: longer than {LONGEST_LINE:,} characters")
+        yield number, line
 
 
-def _pattern(column: str) -> re.Pattern[str]:
-    return re.compile(re.escape(column.lower()).replace(r"\#", _NUMBERED))
+def _cells(line: str, separator: str) -> list[str]:
+    """Return the cells of a line, without quotes and separators of thousands; the separator " " stands for blanks."""
+    if '"' not in line:
+        return line.split(None if separator == " " else separator)
+    cells = next(csv.reader([line], delimiter=separator))
+    commas = separator == ","  # in other files a comma may be that of a decimal
+    return [cell.replace(",", "") if commas and "," in cell and _THOUSANDS.fullmatch(cell) else cell for cell in cells]
 
 
-def _used(file: Path, place: str, entry: Format, columns: Sequence[str], cells: Sequence[str]) -> list[int] | None:
-    """Return the indices in ``cells`` of the columns to read; None if one is missing.
+def _number(cell: str) -> float:
+    if "_" in cell:  # Python reads 1_000
+        raise ValueError
+    return float(cell)
 
-    Raises ``InvalidInput`` for a column that is there twice. Numbered columns are in the order of their numbers.
+
+def _measured(cell: str) -> float:
+    """Return the number in a cell, NaN if it is empty."""
+    return _number(cell) if cell.strip() else math.nan
+
+
+def _number_of(names: dict[str, float], cell: str) -> float:
+    """Return the number of a name: 1 for the first one, 2 for the next. Raise ``ValueError`` for an empty name."""
+    if not (name := cell.strip()):
+        raise ValueError
+    return names.setdefault(name, len(names) + 1.0)
+
+
+def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[list[int], list[str]]:
+    """Return the indices in ``shown`` of the columns to read, and those of ``columns`` that are not there.
+
+    Numbered columns are in the order of their numbers. Raises ``InvalidInput`` for a column that is there twice.
     """
-    if _missing(columns, cells):
-        return None
-    small = _small(cells)
+    small = [_OTHER_NAMES.get(name.lower(), name.lower()) for name in shown]
     ordered = sorted((len(name), name, k) for k, name in enumerate(small))  # Speed2 before Speed10
-    used = [k for each in columns for _, name, k in ordered if _pattern(each).fullmatch(name)]
-    if len({small[k] for k in used}) < len(used):
-        raise InvalidInput(f"{file}{place}: {', '.join(cells[k] for k in used)}: each column must be there once")
-    return used
+    patterns = [re.compile(re.escape(each.lower()).replace(r"\#", "[1-9][0-9]*")) for each in columns]
+    at = [[k for _, name, k in ordered if each.fullmatch(name)] for each in patterns]
+    used, missing = [k for each in at for k in each], [name for name, each in zip(columns, at, strict=True) if not each]
+    if not missing and len({small[k] for k in used}) < len(used):
+        raise InvalidInput(f"{file}: {', '.join(shown[k] for k in used)}: each column must be there once")
+    return used, missing
 
 
-def _unknown(file: Path, entry: Format, columns: Sequence[str], looked_at: list[list[str]]) -> InvalidInput:
-    """Return the error for a file without one of ``columns``; ``looked_at``: the cells of its first lines."""
-    missing = min((_missing(columns, cells) for cells in looked_at), key=len, default=list(columns))
-    have = {name for cells in looked_at for name in _small(cells)}
+def _unknown(file: Path, entry: Format, missing: list[str], have: Sequence[str]) -> InvalidInput:
+    """Return the error for a file without ``missing`` columns; ``have``: the cells of its first lines."""
+    small = {name.lower() for name in have}
     for title, (there, absent) in REFUSED.items():
-        if have >= there and not have & absent:
+        if small >= there and not small & absent:
             return InvalidInput(f"{file}: this is {title}, which has no lanes to follow")
     for each in FORMATS.values():
-        if each is not entry and not _missing(list(each.columns.values()), list(have)):
+        if each is not entry and not _match(file, list(each.columns.values()), sorted(small))[1]:
             return InvalidInput(f"{file}: is not {entry.title}; this is {each.title}")
-    hint = "; columns are separated by commas" * (";" in str(have))
+    hint = "; columns are separated by commas" * any(";" in name for name in have)
     text = f"{file}: has no column {', '.join(missing)}, as files of {entry.title} have{hint}"
-    return NotARecording(text) if entry.mixed and 2 * len(missing) > len(columns) else InvalidInput(text)
+    return NotARecording(text) if entry.mixed and 2 * len(missing) > len(entry.columns) else InvalidInput(text)

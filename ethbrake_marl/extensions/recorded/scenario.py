@@ -29,14 +29,6 @@ _REPLACED = ("gaps_m", "speeds_mps", "time_gaps_s", "line_speed_mps", "speed_dev
 _LISTED = 10  # largest number of skipped files that a note names
 
 
-class RefusedFiles(InvalidInput):
-    """Several files were refused; ``files`` holds the error of each."""
-
-    def __init__(self, text: str, files: list[str]) -> None:
-        super().__init__(text)
-        self.files = files
-
-
 class FromData(NamedTuple):
     """What was made of a folder of recordings."""
 
@@ -74,9 +66,9 @@ def scenario_from_data(
         every_s: time between two moments that become rows (s).
         draw: how the scenario draws worlds: whole ``rows``, or each quantity from a fit to the rows.
         strict: refuse the folder if one of its files is refused.
-        progress: called with the name of a file, the KiB read of all files, and their size in KiB.
+        progress: called with the name of a file, the KiB read of it, and its size in KiB.
 
-    Raises ``InvalidInput`` with file, line and column, if no file can be used.
+    Raises ``InvalidInput`` with file, line and column if no file can be used; its notes are about further files.
 
     """
     entry, base = format_of(format, columns), load_scenario(based_on)
@@ -90,15 +82,18 @@ def scenario_from_data(
     vehicles = base.vehicles
     rows = read_rows(folder, entry, every_s, vehicles, progress)
     if rows.refused and (strict or not rows.seen):
-        raise _refusal(folder, rows.refused)
+        several = f"{folder}: {len(rows.refused):,} files refused: " * (len(rows.refused) > 1)
+        error = InvalidInput(several + rows.refused[0])
+        for each in rows.refused[1:]:
+            error.add_note(each)
+        raise error
     if not rows.seen:
-        shorter = (
-            f"; the longest queue has {rows.longest}: --based-on NAME takes a scenario of so many vehicles, such as"
+        longest = (
+            f"; the longest queue has {rows.longest}: --based-on takes a scenario of so many, as realistic-pair of 2"
         )
-        shorter += " realistic-pair for 2"
         raise InvalidInput(
             f"{folder}: no {vehicles} vehicles follow each other in a lane at any moment looked at"
-            f"{shorter if rows.longest > 1 else ''}"
+            f"{longest * (rows.longest > 1)}"
         )
     recordings, found = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)
     fastest_mps = max(max(row[vehicles - 1 :]) for row in rows.numbers)
@@ -148,9 +143,3 @@ def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
     if rows.refused:
         found += [f"refused: {count_of(len(rows.refused), 'file')}"]
     return found
-
-
-def _refusal(folder: Path, refused: list[str]) -> InvalidInput:
-    if len(refused) == 1:
-        return InvalidInput(refused[0])
-    return RefusedFiles(f"{folder}: {len(refused):,} files are refused, the first because of: {refused[0]}", refused)

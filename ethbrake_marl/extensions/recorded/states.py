@@ -51,7 +51,7 @@ def keep_states(
     entry: Format,
     every_s: float,
     names: dict[str, float],
-    progress: Callable[[int], None],
+    progress: Callable[[int, int], None],
 ) -> None:
     """Write the vehicles of a file at every moment that is looked at into the table ``state`` of ``store``.
 
@@ -61,7 +61,7 @@ def keep_states(
         entry: its format.
         every_s: time between two moments that are looked at (s).
         names: number of each name of a vehicle or lane, if the file has names; new names are added.
-        progress: called with the KiB read.
+        progress: called with the KiB read, and the size of the file in KiB.
 
     Raises ``InvalidInput`` with file, line and column for an impossible value.
 

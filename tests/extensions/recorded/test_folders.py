@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.recorded.scenario import RefusedFiles, scenario_from_data
+from ethbrake_marl.extensions.recorded.scenario import scenario_from_data
 from tests.extensions.recorded.made import openacc, rows_of
 
 COLUMNS, ROW = "Speed1,Speed2,Speed3,IVS1,IVS2", "20,20,20,15,16"
@@ -67,10 +67,11 @@ def test_refused_files__are_all_listed_and_add_no_row(
     assert json.loads(out.out)["refused"] == made.refused and out.err.count("refused: data/") == 3
     assert run_command([*command, "--strict", "--force"]) == 2
     error = capsys.readouterr().err
-    assert [start in error for start in starts] == [True] * 3 and "data: 3 files are refused" in error
+    assert [start in error for start in starts] == [True] * 3 and "data: 3 files refused: data/b.csv, line 2" in error
     Path("data/a.csv").unlink()
-    with pytest.raises(RefusedFiles, match=r"data: 3 files are refused, the first because of: data/b.csv, line 2"):
+    with pytest.raises(InvalidInput, match=r"data: 3 files refused: data/b.csv, line 2") as told:
         scenario_from_data("mine", folder, "openacc")
+    assert len(told.value.__notes__) == 2
 
 
 def test_folder_without_recordings__says_what_each_file_lacks(tmp_path: Path) -> None:

@@ -77,7 +77,7 @@ def test_rows_of_streets__are_said_to_be_all(street: str, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("name", "old", "new", "right"),
     [
-        ("portal.csv", '"1,309"', '"1,3o9"', "portal.csv, line 4, column Preceding: '13o9' is not a number"),
+        ("portal.csv", '"1,309"', '"1,3o9"', "portal.csv, line 4, column Preceding: '1,3o9' is not a number"),
         ("api.csv", '"15.0"', '"15 ft"', "api.csv, line 2, column v_length: '15 ft' is not a number"),
         (
             "api.csv",

@@ -54,7 +54,7 @@ def test_pair__is_no_chain_of_three_and_the_message_names_a_scenario_for_pairs(
     if found:
         assert len(rows_of(scenario_from_data("mine", folder, "openacc", based_on="realistic-pair"))) == 1
     else:
-        right = r"no 3 vehicles follow .*; the longest queue has 2: --based-on NAME .*, such as realistic-pair for 2"
+        right = r"no 3 vehicles follow .*; the longest queue has 2: --based-on takes .*, as realistic-pair of 2"
         with pytest.raises(InvalidInput, match=right):
             scenario_from_data("mine", folder, "openacc")
 
@@ -98,6 +98,6 @@ def test_gap_of_0_or_less__of_a_standing_car_is_left_out_of_moving_ones_one_in_a
 
 def test_column_twice__is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        InvalidInput, match="line 1: Time, Speed1, Speed2, speed2, IVS1: each column must be there once"
+        InvalidInput, match=r"a.csv: Time, Speed1, Speed2, speed2, IVS1: each column must be there once"
     ):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,speed2,IVS1", "20,20,20,15"), "openacc")

@@ -87,7 +87,7 @@ def scaled(text: str, lengths: float, speeds: float) -> str:
 REFUSED = {
     "a column is missing": (lambda t: t.replace("precedingId", "-"), "no column precedingId, as files of highD have"),
     "semicolons": (lambda t: t.replace(",", ";"), "columns are separated by commas"),
-    "a column twice": (lambda t: t.replace("ttc", "width"), "line 1: frame, id, .*: each column must be there once"),
+    "a column twice": (lambda t: t.replace("ttc", "width"), "csv: frame, id, .*: each column must be there once"),
     "text": (lambda t: t.replace("4.50", "long", 1), "line 2, column width: 'long' is not a number"),
     "nan": (lambda t: t.replace("4.50", "nan", 1), "line 2, column width: nan must be a finite number"),
     "no length": (lambda t: t.replace("4.50", "0.00", 1), r"line 2, column width: 0 m of length: must be in \(0, 40\]"),
