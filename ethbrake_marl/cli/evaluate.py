@@ -333,9 +333,9 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
         out.result(found.to_json(), Sheet("", ["Agent", Column("Policy", text=True), *map(Column, names)], rows))
         out.note("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
         why = found.unpaired_because
-        out.note("paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}")
-        if found.recordings:
-            out.note(evaluation.by_recording(found.recordings))
+        by = evaluation.Conditions(recordings=found.recordings).by_recording
+        how = "paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}"
+        out.note(f"{how}{by}")
         if found.exploits_line:
             out.note(found.exploits_line)
         for which, agents in zip(("first", "second"), found.left_over, strict=True):
@@ -369,7 +369,8 @@ def shield_command(
         out.result(rows.to_json(sample, task), *rows.sheets())
         _tell_left_out(out, rows[0].left_out, episodes)
         if sample.clusters is not None:
-            out.note(evaluation.by_recording(len({*sample.clusters.tolist()})))
+            number = len({*sample.clusters.tolist()})
+            out.note(evaluation.Conditions(recordings=number).by_recording.removeprefix("; "))
         moving = {f"{row.agent} ({row.mode})": row.horizon_ends for row in rows if row.mode != "none"}
         _tell_horizon(out, moving, episodes - len(rows[0].left_out), task.scenario.horizon_s)
 

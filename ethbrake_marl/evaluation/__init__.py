@@ -13,7 +13,7 @@ if TYPE_CHECKING:
         tally_list as tally_list,
     )
     from ethbrake_marl.evaluation.comparison import compare_results as compare_results
-    from ethbrake_marl.evaluation.conditions import Conditions as Conditions, by_recording as by_recording
+    from ethbrake_marl.evaluation.conditions import Conditions as Conditions
     from ethbrake_marl.evaluation.evaluation import Evaluation as Evaluation
     from ethbrake_marl.evaluation.exploits import Exploits as Exploits
     from ethbrake_marl.evaluation.groups import summarise_by as summarise_by

@@ -11,7 +11,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.exploits import MARK, Exploits
-from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, recordings_of, told_of
+from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, told_of
 from ethbrake_marl.evaluation.statistics import Texts, paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.physics.state import Floats
@@ -100,7 +100,7 @@ def compare_results(first: Result, second: Result) -> Comparison:
         agents = " and ".join(f"{', '.join(names)}" for names in left_over)
         raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
     worlds, because = _worlds_of_both(first, second, common)
-    recordings = recordings_of(first.about)
+    recordings = int(told_of(first.about, "recordings") or 0)
     differences = []
     for agent in common:
         one, other = first.rows[agent], second.rows[agent]

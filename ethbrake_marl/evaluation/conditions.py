@@ -118,9 +118,13 @@ class Conditions(dict[str, Any]):
 
     @property
     def by_recording(self) -> str:
-        """Caption on the recordings that intervals are by: ``; 95 % intervals by 55 recordings``; empty without any."""
+        """Caption on the recordings that intervals are by: ``; 95 % intervals by 55 recordings``; empty without any.
+
+        A single recording allows no interval.
+        """
         number = self.get("recordings", 0)
-        return f"; {by_recording(number)}" if number else ""
+        many = f"; 95 % intervals by {number:,} recordings" if number else ""
+        return "; no 95 % intervals: all worlds are of one recording" if number == 1 else many
 
     @property
     def quantities(self) -> str:
@@ -136,13 +140,6 @@ class Conditions(dict[str, Any]):
                 told = texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"
                 parts.append(f"{symbol}{_STAY}={_STAY}{told}{f'{_STAY}{unit}' if unit else ''}")
         return "; ".join(parts)
-
-
-def by_recording(recordings: int) -> str:
-    """Return a text for captions on how many recordings intervals are by; a single one allows no interval."""
-    if recordings == 1:
-        return "no 95 % intervals: all worlds are of one recording"
-    return f"95 % intervals by {recordings:,} recordings"
 
 
 def _plain(tells: Tells) -> Any:

@@ -63,13 +63,12 @@ def _left_out(row: SummaryRow) -> str:
 def _rejected(row: SummaryRow) -> str:
     """Return the note about draws of a table's rows that were rejected for an early impact; empty if there are none."""
     rejected = row.parameters.get("rejected_draws", 0)
-    if not rejected:
-        return ""
     draws = rejected + row.episodes + len(row.left_out)
-    return (
+    told = (
         f"Drawn again: {rejected:,} of {draws:,} draws ({100.0 * rejected / draws:.1f} %), which had an impact before a"
         " learner may act (early_impacts: reject). These results say nothing about such rows."
     )
+    return told if rejected else ""
 
 
 def _cut_off(rows: Sequence[SummaryRow]) -> str:

@@ -236,14 +236,14 @@ def read_result(path: Path) -> Result:
             raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
         if not 0 <= row["horizon_ends"] <= row["episodes"]:
             raise InvalidInput(f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be 0 to {row['episodes']:,}")
-        draws = recordings_of(row) or row["episodes"]
-        if not 1 <= draws <= row["episodes"]:
-            raise InvalidInput(f"{who}: recordings = {draws}: must be 1 to {row['episodes']:,}, or left out")
+        draws = told_of(row, "recordings") or f"{row['episodes']}"
+        if not (draws.isdecimal() and len(draws) < 14 and 1 <= int(draws) <= row["episodes"]):
+            raise InvalidInput(f"{who}: recordings = {draws:.40}: must be 1 to {row['episodes']:,}, or left out")
         shoved = row.get("vehicle_1_shoved_m")
         if shoved is not None and not (type(shoved) in (int, float) and abs(shoved) <= _MOST_HARM):
             raise InvalidInput(f"{who}: vehicle_1_shoved_m = {shoved!r:.40}: must be metres, or null")
         for harm in COMPARED[row["kind"]]:
-            if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), draws):
+            if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), int(draws)):
                 raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
     if len({tuple(told_of(row, key) for key in SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
@@ -264,17 +264,6 @@ def told_of(row: Mapping[str, Any], key: str) -> str | None:
     parameters = row.get("parameters")
     told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
     return None if told is None else str(told)
-
-
-def recordings_of(row: Mapping[str, Any]) -> int:
-    """Return the number of recordings that the intervals of an agent's JSON object are by; 0 without recordings.
-
-    Raises ``InvalidInput`` if it is no whole number.
-    """
-    told = told_of(row, "recordings") or "0"
-    if not (told.isdecimal() and len(told) <= len(str(_MOST_EPISODES))):
-        raise InvalidInput(f"recordings = {told:.40}: must be a whole number")
-    return int(told)
 
 
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:

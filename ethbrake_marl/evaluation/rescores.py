@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from ethbrake_marl.evaluation.conditions import by_recording
+from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, terminal_text
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
@@ -49,7 +49,7 @@ class Rescores(list[Rescored]):
         columns = [Column(f"Vehicle {i + 1}", interval="below") for i in vehicles]
         names = ["" if k and shown[k - 1].agent == row.agent else row.agent for k, row in enumerate(shown)]
         lines = [(name, row.objective, *row.each) for name, row in zip(names, shown, strict=True)]
+        by = Conditions(recordings=self.recordings).by_recording
         title = f"Objectives, {'first-impact' if harm_count == 'first' else 'total'} harm"
-        note = "Means per world in m²/s² (injury:CURVE: injuries in 1,000 lines), with their 95 % intervals."
-        note += f" {by_recording(self.recordings)}." if self.recordings else ""
+        note = f"Means per world in m²/s² (injury:CURVE: injuries in 1,000 lines), with their 95 % intervals{by}."
         return Sheet(title, ["Agent", "Objective", *columns], lines, note)

@@ -13,7 +13,7 @@ Miller 2015, "A practitioner's guide to cluster-robust inference", Journal of Hu
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 
@@ -138,7 +138,8 @@ class Moments:
         """
         n = self.count
         if self.clusters:
-            return _ratio_by_cluster(self._sums, [Fraction(size) for size, _ in self.clusters.values()])
+            ones = Moments(n, Fraction(n), clusters={name: (k, Fraction(k)) for name, (k, _) in self.clusters.items()})
+            return self.ratio_error(ones, Fraction())
         return root((n * self.squares - self.total**2) / (n * n * (n - 1)))
 
     @property
@@ -165,13 +166,10 @@ class Moments:
         p, clusters = self.mean, len(self.clusters)
         if clusters < 2:
             return Estimate(p, None)
-        error = self.standard_error
-        draws = clusters if p in (0.0, 1.0) else min(self.count, 1.0 + p * (1.0 - p) / max(error * error, 1e-300))
+        draws = (
+            clusters if p in (0.0, 1.0) else min(self.count, 1.0 + p * (1.0 - p) / max(self.standard_error, 1e-99) ** 2)
+        )
         return Estimate(p, wilson(p, draws * float(ndtri(_UPPER) / stdtrit(clusters - 1, _UPPER)) ** 2))
-
-    @property
-    def _sums(self) -> list[Fraction]:
-        return [total for _, total in self.clusters.values()]
 
     def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
@@ -186,10 +184,13 @@ class Moments:
             products: exact sum over all pairs of ``value * other``.
 
         """
+        n, x, y, xx, yy = self.independent, self.total, others.total, self.squares, others.squares
         if self.clusters:
-            return _ratio_by_cluster(self._sums, [others.clusters[name][1] for name in self.clusters])
-        n, x, y = self.count, self.total, others.total
-        residuals = self.squares * y * y - 2 * x * y * products + x * x * others.squares
+            sums = [(total, others.clusters[name][1]) for name, (_, total) in self.clusters.items()]
+            xx, products, yy = (
+                sum((sides[a] * sides[b] for sides in sums), Fraction()) for a, b in ((0, 0), (0, 1), (1, 1))
+            )
+        residuals = xx * y * y - 2 * x * y * products + x * x * yy
         return root(n * residuals / ((n - 1) * y**4))
 
     def decrease(self, baseline: Moments, products: Fraction) -> Estimate | None:
@@ -214,16 +215,6 @@ class Moments:
             return Estimate(value, None)
         half = float(stdtrit(self.independent - 1, _UPPER)) * error
         return Estimate(value, (value - half, value + half))
-
-
-def _ratio_by_cluster(x: Sequence[Fraction], y: Sequence[Fraction]) -> float:
-    """Return the standard error of ``r = sum(x) / sum(y)`` over the sums ``x`` and ``y`` of each cluster, [G].
-
-    It is ``sqrt(G / (G - 1) * sum((x - r y) ** 2)) / abs(sum(y))``.
-    """
-    whole, below, count = sum(x, Fraction()), sum(y, Fraction()), len(x)
-    residuals = sum(((own * below - other * whole) ** 2 for own, other in zip(x, y, strict=True)), Fraction())
-    return root(count * residuals / ((count - 1) * below**4))
 
 
 def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:

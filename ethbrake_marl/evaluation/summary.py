@@ -72,10 +72,8 @@ class SummaryTable(list[SummaryRow]):
     def _repr_html_(self) -> str:
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
         note += "".join(f" {warning}" for warning in warnings_of(self))
-        worlds = "no agent"
-        if self:
-            told = self[0].parameters
-            worlds = f"{told['scenario']}, {count_of(self[0].episodes, 'world')}{told.by_recording}"
+        told = self[0].parameters if self else Conditions()
+        worlds = f"{told['scenario']}, {count_of(self[0].episodes, 'world')}{told.by_recording}" if self else "no agent"
         sheet = replace(SummaryTable(self).sheet(), title=worlds, note=note)
         shown = {"Agent", "Knows"}.union(*(each.notebook for _, each in every_set()))
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()

@@ -156,7 +156,7 @@ def test_evaluation__has_the_recording_of_each_world_and_intervals_by_it(found) 
     assert rows[1].total_harm.interval[1] > 1.05 * mean(harm.total_harm).interval[1]
     assert rows[0].parameters["recordings"] == 8
     assert "400 worlds, seed 7; 95 % intervals by 8 recordings; d = " in in_one_line(rows)
-    assert "95 % intervals by 8 recordings." in in_one_line(found.rescore(["total"]))
+    assert "with their 95 % intervals; 95 % intervals by 8 recordings." in in_one_line(found.rescore(["total"]))
     assert found.rescore(["total"])[1].each[1] == mean(found.outcome("full_brake").total_harm, column)
     assert found.take(column == column[0]).recordings == 1
 
@@ -229,7 +229,7 @@ def test_comparison__of_results_that_were_read_again_is_by_recording(found, endi
 
 def test_result__with_an_impossible_number_of_recordings_is_refused(found, tmp_path: Path) -> None:
     told = results_to_json(eb.summarise(found))
-    for number, message in ((401, "recordings = 401: must be 1 to 400"), ("x", "recordings = x: must be a whole")):
+    for number, message in ((401, "recordings = 401: must be 1 to 400"), ("x", "recordings = x: must be 1 to 400")):
         for row in told:
             row["parameters"]["recordings"] = number
         (tmp_path / "results.json").write_text(json.dumps(told))
