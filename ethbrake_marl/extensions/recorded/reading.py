@@ -50,10 +50,6 @@ class Piece(NamedTuple):
     values: Floats
     lines: Floats
 
-    def of(self, rows: Bools) -> Piece:
-        """Return the piece with only those rows for which ``rows`` [rows] is true."""
-        return self._replace(values=self.values[rows], lines=self.lines[rows])
-
     def refuse(self, bad: Bools, k: int, right: str, shown: Floats | None = None) -> None:
         """Raise ``InvalidInput`` with file, line and column for the first row in which ``bad`` [rows] is true.
 
@@ -189,7 +185,7 @@ def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets:
     """Yield the cells of each line that is not blank, and not of one of the ``streets``."""
     elsewhere = seen = 0
     for number, line in lines:
-        if any(street in line for street in streets):
+        if streets and any(street in line for street in streets):
             elsewhere += 1
         elif line.strip():
             seen += 1

@@ -77,7 +77,8 @@ def keep_states(
         right = f"must be a multiple of {1 / entry.hertz:g} s from the first on"
         piece.refuse(~(abs(ticks - np.rint(ticks)) <= OFF), 0, right)
         taken = np.rint(ticks) % stride == 0.0
-        kept = _states(piece.of(taken), entry, np.rint(ticks[taken]) / stride, turned)
+        some = piece._replace(values=piece.values[taken], lines=piece.lines[taken])
+        kept = _states(some, entry, np.rint(ticks[taken]) / stride, turned)
         store.executemany(f"INSERT INTO state VALUES ({', '.join('?' * len(State._fields))})", kept.tolist())
         lengths = kept[:, State._fields.index("length")]
         cars, states = cars + int(((lengths > CAR_M[0]) & (lengths < CAR_M[1])).sum()), states + len(kept)
