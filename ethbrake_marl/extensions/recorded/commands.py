@@ -49,9 +49,9 @@ def from_data_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a scenario of recorded traffic: highD, exiD, NGSIM, OpenACC, or any table of trajectories.
+    """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
 
-    Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
+    Reads exiD, too, and any table of trajectories (--format table). Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.extensions.recorded.scenario import scenario_from_data
