@@ -51,7 +51,8 @@ def from_data_command(
 ) -> None:
     """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
 
-    Reads exiD, too, and any table of trajectories (--format table). Vehicles that follow each other in a lane become rows: speeds, and gaps from bumper to bumper.
+    Also reads exiD, and any table of trajectories (--format table). Vehicles that follow each other in a lane become
+    rows: speeds, and gaps from bumper to bumper.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.extensions.recorded.scenario import scenario_from_data
