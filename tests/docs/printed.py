@@ -173,7 +173,8 @@ TABLES: dict[str, How] = {
     "| you write | values": _by(BY_HAND),
     "| for | recipe | scenario | differs": _by(BY_HAND),
     "| Vehicle 2 minimises": _by(SEARCH),
-    "| level | joint optimum | selfish": _by(SEARCH),
+    "| | equal weights | the other weights": _by(SEARCH),
+    "| who learns, objective": _by(SEARCH),
 }
 
 PICTURES: dict[str, How] = {

@@ -39,10 +39,13 @@ def front_figures(found: Json) -> dict[str, Figure]:
 
 
 def sum_figure(found: Json) -> Figure:
-    """Draw the mean harm of the line against that of the vehicle that bears most, a point for each set of weights."""
+    """Draw the mean harm of the line against that of the vehicle that bears most, a point for each set of weights.
+
+    No point minimises either of the two, except that of equal weights, and maximin world by world.
+    """
     figure, (axes,) = new_panels((WIDTH_IN, 4.6))
     for name, harm, style in _series(found):
-        axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style)
+        axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style, fillstyle="none")
     if all((harm.max(axis=1) > 0.0).all() for _, harm, _ in _series(found)):
         axes.set_xscale("log")
         axes.set_yscale("log")
@@ -86,7 +89,7 @@ def ternary_figure(found: Json) -> Figure:
         x, y = _places(harm[some] / whole[some, np.newaxis])
         points = axes.scatter(
             x, y, s=34.0, c=whole[some], marker=style["marker"], cmap="viridis", edgecolors="white", linewidths=0.5,
-            vmin=sums.min(), vmax=sums.max(),
+            vmin=sums.min(), vmax=sums.max(), zorder=3 if name == "front" else 2,
         )  # fmt: skip
         axes.plot([], [], label=label_text(name, 34), **{**style, "color": GREY})  # in the legend, without a sum
     bar = figure.colorbar(points, ax=axes, shrink=0.7, location="bottom", pad=0.02)

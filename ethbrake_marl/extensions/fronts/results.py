@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -147,7 +148,7 @@ def front_sheet(found: Json) -> Sheet:
     columns: list[Column | str] = [
         Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(found["vehicles"]))),
         Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
-        *(Column(name, digits=3, short=name.partition("@")[0][:12]) for name in found["agents"]),
+        *(Column(name, digits=3, short=re.sub("@[^+]*", "", name)[:14]) for name in found["agents"]),
     ]  # fmt: skip
     rows: list[Row] = []
     for k, point in enumerate(found["points"]):
