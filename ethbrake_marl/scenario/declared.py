@@ -22,6 +22,7 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds, as_road_allows
 from ethbrake_marl.scenario.channel import V2X, Equipage, Equipped
 from ethbrake_marl.scenario.distributions import LEAVE_OUT, AnyQuantity, AnyTypeQuantity, Quantity, TableColumn, support
 from ethbrake_marl.scenario.fields import ALSO, MEANING, QUANTITY, RECORDING, Entry, columns_of_table, is_tabled
+from ethbrake_marl.scenario.follower import Follower
 from ethbrake_marl.scenario.member import Member
 from ethbrake_marl.scenario.roles import LEARNER, Role, Roles, ScriptSpec
 from ethbrake_marl.scenario.vehicle_types import (
@@ -95,6 +96,9 @@ class ScenarioFields(FileModel):
     )
     harm_weight: PerVehicle | None = Field(default=None, exclude_if=not_, description=MEANING["harm_weight"])
     alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=MEANING["alert_s"])
+    follower: Follower | None = Field(
+        default=None, exclude_if=not_, description="one more vehicle behind the line, at the speed of the last one"
+    )
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="what happens to worlds with an impact before the first learner may act"
     )

@@ -19,6 +19,7 @@ from ethbrake_marl.scenario.checks import check_whole
 from ethbrake_marl.scenario.declared import ScenarioFields
 from ethbrake_marl.scenario.distributions import DISTRIBUTIONS
 from ethbrake_marl.scenario.fields import QUANTITY
+from ethbrake_marl.scenario.follower import with_follower
 from ethbrake_marl.scenario.mixtures import WORDS, build_members, changed_content
 from ethbrake_marl.scenario.roles import LEARNER
 from ethbrake_marl.scenario.sample import Sample
@@ -265,6 +266,8 @@ def _build(scenario: Scenario, document: Document) -> None:
     members: tuple[Scenario, ...] = ()
     if "mixture" in document.content:
         document, members = build_members(document, Scenario.from_document)
+    if "follower" in document.content:
+        document = with_follower(document, Scenario.from_document)
     try:
         BaseModel.__init__(scenario, **document.content)
     except ValidationError as error:

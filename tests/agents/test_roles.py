@@ -13,7 +13,7 @@ from tests.fixtures.policies import make_policy
 
 SCENARIOS = (
     "paper-random", "paper-random-buildup", "paper-random-obstacle", "paper-delay-high", "mixture-trucks",
-    "realistic-truck-buildup", "standards-ccrm-follower", "cooperation-1-front", "cooperation-3-congested",
+    "realistic-truck-buildup", "standards-ccrm", "cooperation-1-front", "cooperation-3-congested",
     "cooperation-2-five",
 )  # fmt: skip
 SPECS = {

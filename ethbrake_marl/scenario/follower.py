@@ -1,0 +1,74 @@
+"""``Follower``: one more vehicle behind the line of a scenario, at the speed of the last one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+from pydantic import Field, ValidationError
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import FileModel
+from ethbrake_marl.files.yaml import Document
+from ethbrake_marl.scenario.fields import QUANTITY
+
+if TYPE_CHECKING:
+    from ethbrake_marl.scenario.declared import ScenarioFields
+
+AnyScenario = TypeVar("AnyScenario", bound="ScenarioFields")
+
+
+class Follower(FileModel):
+    """A vehicle behind the last one, at the same speed, that brakes fully after its latency.
+
+    Without values it is UN Regulation 157's competent driver: 0.75 s of latency, 0.774 g; its time gap, 0.6 s, is ours.
+    """
+
+    time_gap_s: float = Field(default=0.6, gt=0.0, le=60.0, description="its time gap behind the last vehicle")
+    braking_capacity_mps2: float = Field(default=7.59, gt=0.0, le=30.0, description="its hardest braking")
+    latency_s: float = Field(default=0.75, ge=0.0, le=60.0, description="time from the alert until it brakes")
+
+
+def with_follower(document: Document, build: Callable[[Document], AnyScenario]) -> Document:
+    """Return the document of the line with the vehicle that the key ``follower`` adds, and without that key.
+
+    Tables and lists are completed for it. An invalid follower gives the document unchanged; the schema refuses it
+    later. Raises ``InvalidInput`` for an invalid line, for vehicle types, and where the last vehicle's speed is drawn.
+
+    Args:
+        document: parsed file with a key ``follower``.
+        build: function that builds a scenario from a document.
+
+    """
+    content, where = dict(document.content), f"{document.where(('follower',))}: follower"
+    try:
+        follower = Follower.model_validate(content.pop("follower"))
+    except ValidationError:
+        return document
+    line = build(Document(document.file, content, document.lines))
+    if "vehicle_types" in content:
+        raise InvalidInput(
+            f"{where}: cannot stand beside vehicle_types; write out the line of {line.vehicles + 1} instead"
+        )
+    N, own = line.vehicles, {"braking_capacity_mps2": follower.braking_capacity_mps2, "latency_s": follower.latency_s}
+    for key, rule in QUANTITY.declared.items():
+        given = content.get(key)
+        if rule.per == "vehicle" and given is not None and (key in own or isinstance(given, list | tuple)):
+            values = given if isinstance(given, list | tuple) else [given] * N
+            content[key] = [*values, own.get(key, values[-1])]
+    low, high = line.bounds("speeds_mps")[-1]
+    if (("speeds_mps", N - 1)) in line.table_entries:
+        table = content["table"]
+        at = list(table["columns"]).index(QUANTITY.declared["speeds_mps"].column_of(N - 1))
+        rows = [[*row, follower.time_gap_s * row[at], row[at]] for row in table["rows"]]
+        columns = [*table["columns"], f"gap_{N}_m", f"speed_{N + 1}_mps"]
+        content["table"] = {**table, "columns": columns, "rows": rows}
+    elif low == high:
+        key, gap = (
+            ("time_gaps_s", follower.time_gap_s) if "time_gaps_s" in content else ("gaps_m", follower.time_gap_s * low)
+        )
+        gaps = content.get(key)
+        content[key] = [*(gaps if isinstance(gaps, list | tuple) else [gaps] * (N - 1)), gap]
+    else:
+        raise InvalidInput(f"{where}: the speed of vehicle_{N} is drawn; it must be a number, or stand in the table")
+    return Document(document.file, {**content, "vehicles": N + 1}, document.lines)

@@ -1,0 +1,84 @@
+"""The key ``follower``: one more vehicle behind the line. Values by hand."""
+
+from collections.abc import Callable
+
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.files.yaml import parse_yaml
+from ethbrake_marl.scenario.schema import Scenario
+from tests.refused import refused
+
+PAIR = {
+    "name": "pair",
+    "vehicles": 2,
+    "gaps_m": 12,
+    "speeds_mps": 20,
+    "braking_capacity_mps2": [6, 9],
+    "driving_capacity_mps2": 3,
+    "mass_t": [1.6, 2.0],
+    "latency_s": 0.2,
+}
+
+
+def test_follower__keeps_its_time_gap_at_the_speed_of_the_last_vehicle() -> None:
+    line = Scenario(**PAIR, follower={"time_gap_s": 0.9, "latency_s": 0.5})
+    worlds = line.sample(1, 7).worlds
+    assert line.vehicles == 3 and line.roles["vehicle_3"] == "full_brake"
+    assert worlds.gaps_m.tolist() == [[12.0, 18.0]] and worlds.speeds_mps.tolist() == [[20.0] * 3]
+    told = worlds.vehicles
+    assert told.braking_capacity_mps2.tolist() == [[6.0, 9.0, 7.59]] and told.latency_s.tolist() == [[0.2, 0.2, 0.5]]
+    assert told.mass_t.tolist() == [[1.6, 2.0, 2.0]] and told.driving_capacity_mps2.tolist() == [[3.0] * 3]
+    assert Scenario(**line.declared()) == line  # it does not grow again
+    assert line.replace(follower={}).vehicles == 4
+
+
+def test_follower__of_a_table_drives_at_the_speed_of_each_row() -> None:
+    table = {"columns": ["gap_1_m", "speed_1_mps", "speed_2_mps"], "rows": [[5, 20, 10], [7, 20, 15]]}
+    content = {key: value for key, value in PAIR.items() if key not in ("gaps_m", "speeds_mps")}
+    worlds = Scenario(**content, table=table, follower={"time_gap_s": 2.0}).sample(50, 7).worlds
+    rows = {(*gaps, *speeds) for gaps, speeds in zip(worlds.gaps_m.tolist(), worlds.speeds_mps.tolist(), strict=True)}
+    assert rows == {(5.0, 20.0, 20.0, 10.0, 10.0), (7.0, 30.0, 20.0, 15.0, 15.0)}
+
+
+def test_follower__of_time_gaps_has_one_too() -> None:
+    content = {key: value for key, value in PAIR.items() if key != "gaps_m"}
+    line = Scenario(**content, time_gaps_s={"uniform": [1, 2]}, follower={})
+    gaps = line.sample(20, 7).worlds.gaps_m
+    assert (gaps[:, 1] == 0.6 * 20.0).all() and len(set(gaps[:, 0])) == 20
+
+
+def test_follower__beside_a_mixture_stands_behind_each_of_its_lines() -> None:
+    both = [{"scenario": {**PAIR, "name": name, "speeds_mps": speed}} for name, speed in (("slow", 10), ("fast", 20))]
+    worlds = Scenario(name="both", mixture=both, follower={}).sample(30, 7).worlds
+    rows = set(zip(worlds.gaps_m[:, 1].tolist(), worlds.speeds_mps[:, 2].tolist(), strict=True))
+    assert rows == {(6.0, 10.0), (12.0, 20.0)}
+
+
+MISTAKES: dict[str, Callable[[], object]] = {
+    "bad.yaml, line 9: follower.time_gap_s = -1: must be greater than 0": lambda: written("follower: {time_gap_s: -1}"),
+    "bad.yaml, line 9: follower.gap: unknown key": lambda: written("follower: {gap: 5}"),
+    "bad.yaml, line 9: follower = 3": lambda: written("follower: 3"),
+    "bad.yaml, line 3: gaps_m = -1": lambda: written("follower: {}", gaps_m=-1),
+    "bad.yaml, line 9: follower: the speed of vehicle_2 is drawn; it must be a number, or stand in the table": (
+        lambda: written("follower: {}", speeds_mps="{uniform: [18, 22]}")
+    ),
+    "mixture[0] (stress-wide): follower: the speed of vehicle_3 is drawn": (
+        lambda: eb.load_scenario("mixture-paper").replace(follower={})
+    ),
+    "follower: cannot stand beside vehicle_types; write out the line of 4 instead": (
+        lambda: eb.load_scenario("realistic-mixed").replace(follower={})
+    ),
+}
+
+
+def written(last: str, **changed: object) -> Scenario:
+    """The scenario of a file of ``PAIR`` with other values and one more line."""
+    lines = [f"{key}: {changed.get(key, value)}" for key, value in PAIR.items()]
+    return Scenario.from_document(parse_yaml("\n".join([*lines, last]), "bad.yaml"))
+
+
+@pytest.mark.parametrize("told", MISTAKES)
+def test_follower__refusals_say_where_and_what_would_be_right(told: str) -> None:
+    with refused(told):
+        MISTAKES[told]()
