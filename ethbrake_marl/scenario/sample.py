@@ -17,7 +17,8 @@ _Texts = NDArray[np.str_]
 def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     """Return the name of each world's cluster, [n]; only clusters are independent. None: all worlds are.
 
-    A cluster is a recording; a world without one, in a mixture, is a cluster of its own.
+    A cluster is a recording, which is the text before the last ``": "``: vehicles of the same platoon, which stand
+    after it, depend on each other too. A world without a recording, in a mixture, is a cluster of its own.
 
     Args:
         kinds: columns of text by name, as ``Sample.kinds``.
@@ -25,7 +26,11 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
 
     """
     column = kinds.get(RECORDING)
-    return None if column is None else np.where(column == "", np.char.add(" ", index.astype(str)), column)
+    if column is None:
+        return None
+    before, _, after = np.char.rpartition(column, ": ").T
+    recording = np.where(before == "", after, before)
+    return np.where(recording == "", np.char.add(" ", index.astype(str)), recording)
 
 
 @dataclass(frozen=True, slots=True)

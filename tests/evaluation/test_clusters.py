@@ -26,6 +26,7 @@ from ethbrake_marl.evaluation.statistics import (
     unpaired_difference,
     wilson,
 )
+from ethbrake_marl.scenario.sample import clusters_of
 from ethbrake_marl.scenario.task import Task
 from tests.refused import refused
 
@@ -65,6 +66,11 @@ def test_rate__by_clusters_by_hand() -> None:
     # All recordings are alike: no interval is narrower than that of as many independent worlds.
     alike = share_of(np.tile([True, False], 30), np.repeat([f"{k}" for k in range(30)], 2)).interval
     assert alike[0] < rate(30, 60).interval[0] and rate(30, 60).interval[1] < alike[1]
+
+
+def test_vehicles_of_one_recording__are_one_cluster() -> None:
+    texts = np.array(["a.csv: 1-2-3", "a.csv: 4-5-6", "b/c: d.csv: 1-2-3", "alone", ""])
+    assert clusters_of({"recording": texts}, np.arange(5)).tolist() == ["a.csv", "a.csv", "b/c: d.csv", "alone", " 4"]
 
 
 @pytest.mark.parametrize("k", [1, 2, 50])

@@ -60,12 +60,13 @@ class Chains:
         last, before, before_by_id = math.nan, dict[float, Link](), dict[float, Any]()
         for tick, there in moments:
             by_id = {state.id: state for state in reversed(there)}
-            behind = self._links(there, by_id)
-            if tick - last == 1.0:
-                self._compare(behind, before, by_id, before_by_id)
+            row = tick == round(tick)  # else a moment that only checks
+            behind = self._links(there, by_id, row)
+            if tick - last == 1.0 or (not row and tick - last < 1.0):
+                self._compare(behind, before, by_id, before_by_id, (tick - last) * self.every_s)
             followers = {link.follower.id for link in behind.values()}
             for state in reversed(by_id.values()):
-                if state.id in followers:
+                if state.id in followers or not row:
                     continue
                 queue = [Link(0.0, 0.0, state)]
                 while queue[-1].follower.id in behind:
@@ -86,12 +87,13 @@ class Chains:
     def _name(self, number: float) -> str:
         return self.names.get(number) or f"{number:.0f}"
 
-    def _links(self, there: list[Any], by_id: dict[float, Any]) -> dict[float, Link]:
+    def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
         """Return by the id of each vehicle the one that follows it, at one moment; count faults.
 
         Args:
             there: states of all vehicles.
             by_id: the same by id, of a vehicle that is there twice the first.
+            row: whether the moment becomes rows; only then what is left out counts.
 
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: the vehicle ahead, if no file names it
@@ -114,14 +116,14 @@ class Chains:
             if fault:
                 place = place_of(self.file, state.line)
                 self._first_fault = self._first_fault or f"{place}: vehicle {self._name(state.id)} {fault}"
-                self._faults += 1
+                self._faults += row
             elif noise:
-                self.left_out["links of standing cars whose gap was recorded as 0 or less"] += 1
+                self.left_out["links of standing cars whose gap was recorded as 0 or less"] += row
             elif ahead and (ahead.lane != state.lane or slowest < 0.0):
-                self.left_out["links to another lane, or of a vehicle that rolls backwards"] += 1
+                self.left_out["links to another lane, or of a vehicle that rolls backwards"] += row
             elif ahead and gap < (behind[ahead.id].gap_m if ahead.id in behind else math.inf):
                 behind[ahead.id] = Link(gap, ahead.speed - state.speed, state)
-        self._states += len(there)
+        self._states += len(there) * row
         return behind
 
     def _line(self, state: Any) -> str:
@@ -133,17 +135,18 @@ class Chains:
         before: dict[float, Link],
         by_id: dict[float, Any],
         by_id_before: dict[float, Any],
+        passed_s: float,
     ) -> None:
-        """Add to the sums how gaps and positions changed between two moments, and how they should by the speeds."""
+        """Add to the sums how gaps and positions changed in ``passed_s`` seconds, and how they should by the speeds."""
         for each in behind.keys() & before.keys():
             now, then = behind[each], before[each]
             if now.follower.id == then.follower.id:
-                opened, said = now.gap_m - then.gap_m, (now.opens_mps + then.opens_mps) / 2.0 * self.every_s
+                opened, said = now.gap_m - then.gap_m, (now.opens_mps + then.opens_mps) / 2.0 * passed_s
                 self._gaps += opened * opened, said * said, opened * said
         for each in by_id.keys() & by_id_before.keys() if self.entry.by_lane else ():
             now, then = by_id[each], by_id_before[each]
             if now.lane == then.lane:
-                moved, said = now.front - then.front, (now.speed + then.speed) / 2.0 * self.every_s
+                moved, said = now.front - then.front, (now.speed + then.speed) / 2.0 * passed_s
                 self._ways[now.lane] += moved * moved, said * said, moved * said, said
 
     def _check(self) -> None:

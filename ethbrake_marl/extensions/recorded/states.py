@@ -24,11 +24,16 @@ FASTEST_MPS, LONGEST_M = 75.0, 40.0  # limits of a road vehicle: 270 km/h, and m
 
 CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3  # range of lengths of cars and vans, and their least share, to detect feet
 
+# A moment this long after each one that becomes rows is read too, to check gaps and positions against speeds: from one
+# row to the next, speeds may change too much.
+CHECK_S = 1.0
+
 OFF = 0.05  # largest accepted distance of a time from a tick, in ticks
 
 # A vehicle at a moment, in m and m/s. ``front`` and ``side`` are x and y of its front, ``dx`` and ``dy`` its direction
 # of travel: 1 and 0 where positions are along the road. ``preceding`` is the vehicle ahead, below 0 for none.
-# ``length`` is 0 if the data hold gaps. ``tick`` counts the moments that are looked at, ``line`` is that of the file.
+# ``length`` is 0 if the data hold gaps. ``tick`` is the time in intervals between two moments that become rows; only
+# whole ones do. ``line`` is that of the file.
 State = namedtuple("State", "tick id lane preceding front side dx dy length speed line")
 
 STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
@@ -76,7 +81,8 @@ def keep_states(
         ticks = (times - first) * entry.ticks
         right = f"must be a multiple of {1 / entry.hertz:g} s from the first on"
         piece.refuse(~(abs(ticks - np.rint(ticks)) <= OFF), 0, right)
-        taken = np.rint(ticks) % stride == 0.0
+        near = max(1, min(stride, int(CHECK_S * entry.hertz)))
+        taken = np.isin(np.rint(ticks) % stride, (0.0, near % stride))
         some = piece._replace(values=piece.values[taken], lines=piece.lines[taken])
         kept = _states(some, entry, np.rint(ticks[taken]) / stride, turned)
         store.executemany(f"INSERT INTO state VALUES ({', '.join('?' * len(State._fields))})", kept.tolist())

@@ -1,5 +1,6 @@
 """OpenACC by the numbers of its cars: holes, headings, gaps at or below 0, chains of any length."""
 
+import math
 from pathlib import Path
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.recorded.scenario import scenario_from_data
 from tests.extensions.recorded.made import openacc, rows_of, scenario_of
+from tests.fixtures.recordings import write_files
 
 HEADING = ["Date,26,02,2019", "Vehicle_order,A,B,C,D,E", "Number_of_vehicles,5", "ACC,1", "Distance_setting,shortest"]
 
@@ -101,3 +103,23 @@ def test_column_twice__is_refused(tmp_path: Path) -> None:
         InvalidInput, match=r"a.csv: Time, Speed1, Speed2, speed2, IVS1: each column must be there once"
     ):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,speed2,IVS1", "20,20,20,15"), "openacc")
+
+
+@pytest.mark.parametrize("every_s", [1.0, 10.0])
+def test_units__are_checked_between_moments_a_second_apart_however_far_rows_are_apart(
+    every_s: float, tmp_path: Path
+) -> None:
+    # The car ahead oscillates around 10 m/s with a period of 9 s, the other drives 10 m/s: the gap is known exactly.
+    times = [k / 10 for k in range(3000)]
+    rate = 2.0 * math.pi / 9.0
+    speeds = [10.0 + 4.0 * math.sin(rate * t) for t in times]
+    gaps = [40.0 + 4.0 / rate * (1.0 - math.cos(rate * t)) for t in times]
+    for metres in (1.0, 3.2808):
+        rows = (f"{t},{v:.4f},10,{metres * gap:.4f}" for t, v, gap in zip(times, speeds, gaps, strict=True))
+        folder = write_files(tmp_path / f"{metres}", {"a.csv": ["Time,Speed1,Speed2,IVS1", *rows]})
+        if metres == 1.0:
+            made = scenario_from_data("mine", folder, "openacc", based_on="realistic-pair", every_s=every_s)
+            assert len(rows_of(made)) == 300 / every_s
+        else:
+            with pytest.raises(InvalidInput, match=r"gaps change 3\.\d\d times as much as speeds say"):
+                scenario_from_data("mine", folder, "openacc", based_on="realistic-pair", every_s=every_s)
