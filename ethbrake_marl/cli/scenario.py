@@ -268,10 +268,17 @@ def scenario_new(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
-    """Write a commented NAME.yaml with every key."""
+    """Write a commented NAME.yaml with every key, and NAME.csv with the rows of a table."""
     with Out(force=force) as out:
-        file = output / f"{name}.yaml"
-        out.write(file, scenarios.new_scenario_text(name, based_on))
+        file, rows = output / f"{name}.yaml", output / f"{name}.csv"
+        text, table = (
+            scenarios.new_scenario_text(name, based_on, rows_file=rows.name),
+            scenarios.load_scenario(based_on).table,
+        )
+        out.check(file)
+        if table is not None:
+            out.write(rows, scenarios.rows_text(table), what="rows")
+        out.write(file, text)
         out.note(f"written: {file}; change it, then: ethbrake scenario validate {file}")
 
 

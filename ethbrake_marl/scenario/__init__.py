@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario.roles import ScriptSpec as ScriptSpec
     from ethbrake_marl.scenario.sample import Sample as Sample
     from ethbrake_marl.scenario.schema import Scenario as Scenario, scenario_json_schema as scenario_json_schema
+    from ethbrake_marl.scenario.tables import rows_text as rows_text
     from ethbrake_marl.scenario.task import Task as Task
 else:
     __getattr__ = front_door(__name__, __file__)

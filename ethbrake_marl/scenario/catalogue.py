@@ -16,7 +16,7 @@ from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.mixtures import member_content
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.scenario.tables import read_rows
+from ethbrake_marl.scenario.tables import WEIGHT, read_rows
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -262,11 +262,12 @@ def check_file_name(kind: str, name: str) -> None:
         )
 
 
-def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
+def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
     """Return a commented YAML file for a new scenario ``name`` with the values of the scenario ``based_on``.
 
     All keys are written out. A key for another way to declare gaps or speeds is included as a comment with an example.
-    Save the text as ``<name>.yaml``. Raises ``InvalidInput`` for an invalid name or an unknown ``based_on``.
+    Save the text as ``<name>.yaml``. With ``rows_file`` a table refers to this CSV file instead of holding its rows;
+    ``rows_text`` is the file's text. Raises ``InvalidInput`` for an invalid name or an unknown ``based_on``.
     """
     check_file_name("scenario", name)
     base = load_scenario(based_on)
@@ -278,6 +279,9 @@ def new_scenario_text(name: str, based_on: str = "paper-random") -> str:
         "description": "What this scenario is for.",
         "source": f"Values of {base.name}, to be changed.",
     }
+    if base.table is not None and rows_file:
+        weights = {} if base.table.weights is None else {"weights": WEIGHT}
+        values["table"] = {"file": rows_file, "columns": list(base.table.columns), **weights}
     if base.line_speed_mps is None:
         values.pop("speed_deviations_mps", None)
     if base.members:

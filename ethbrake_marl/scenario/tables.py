@@ -21,8 +21,11 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds, make_worlds, real
 from ethbrake_marl.scenario.declared import ScenarioFields, obstacle_gap, on_road
 from ethbrake_marl.scenario.distributions import support
 from ethbrake_marl.scenario.fields import QUANTITY, RECORDING, Entry, QuantityRule, columns_of_table
+from ethbrake_marl.scenario.vehicle_types import Table
 
 SIZE_LIMIT = 64 << 20  # largest size of a table in bytes
+
+WEIGHT = "weight"  # column of ``rows_text`` with the weight of each row
 
 _ALWAYS_IN_A_TABLE = ("gaps_m", "speeds_mps")
 
@@ -269,6 +272,15 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
     ]
     told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
     return told if weights is None else told | {"weights": [row[-1] for row in found]}
+
+
+def rows_text(table: Table) -> str:
+    """Return the rows of a scenario's table as CSV text; the weights of rows are its column ``weight``."""
+    rows, weights = table.rows or (), table.weights
+    listed = [[*row, weights[k]] for k, row in enumerate(rows)] if isinstance(weights, tuple) else rows
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([[*table.columns, *([] if weights is None else [WEIGHT])], *listed])
+    return text.getvalue()
 
 
 def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]) -> Worlds:

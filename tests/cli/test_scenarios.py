@@ -190,3 +190,17 @@ def test_how_to_own_data__its_table_is_read_and_its_distributions_are_valid(tmp_
     text = "\n".join(f"{key}: {flow_text(value)}" for key, value in {"name": "mine", **keys, **rows}.items())
     (tmp_path / "mine.yaml").write_text(text)
     assert load_runnable(tmp_path / "mine.yaml").sample(2, 7).worlds.speeds_mps.tolist() == [[20, 19, 18]] * 2
+
+
+def test_new__on_a_table_has_its_rows_beside_it(ethbrake: Command, tmp_path: Path) -> None:
+    weighed = "{columns: [gap_1_m, gap_2_m, recording], rows: [[9, 8, a], [7, 6, 'b, c']], weights: [1, 3]}"
+    base = tmp_path / "base.yaml"
+    base.write_text(f"name: base\ntable: {weighed}\nspeeds_mps: 20\nbraking_capacity_mps2: 6\n"
+                    "driving_capacity_mps2: 6\nmass_t: 2\nlatency_s: 0.5\n")  # fmt: skip
+    for name, based_on in (("mine", "recorded-openacc"), ("own", str(base))):
+        ethbrake("scenario", "new", name, "--based-on", based_on, "--output", str(tmp_path))
+        assert ethbrake("scenario", "validate", str(tmp_path / f"{name}.yaml")).status == 0
+        new, old = (eb.load_scenario(path) for path in (str(tmp_path / f"{name}.yaml"), based_on))
+        assert new.table == old.table.model_copy(update={"file": ""}) and (tmp_path / f"{name}.csv").is_file()
+    refused = ethbrake("scenario", "new", "own", "--based-on", str(base), "--output", str(tmp_path))
+    assert refused.status == 2 and "own.yaml" in refused.err

@@ -166,6 +166,11 @@ _TESTS = tuple(
 TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
     "| what | first-impact harm | of the best known": TRAINED,
+    "| who drives Vehicle 2 | collisions | first-impact harm": _by(
+        NIGHTLY,
+        "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal@shipped,best_harm"
+        " --json",
+    ),
     "| no. | label | the paper": _by(BY_HAND),
     "| `--draw` | full_brake": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
     "| agent in a host | here | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
@@ -193,6 +198,7 @@ PICTURES: dict[str, How] = {
     ),
     "sampled-convergence.png": _by(NIGHTLY, "python docs/studies/sampling.py sampled-convergence.png"),
     "price-of-not-knowing.png": _by(NIGHTLY, "python docs/studies/price.py price-of-not-knowing.png"),
+    "time-gaps.png": _by(NIGHTLY, "python docs/studies/time_gaps.py time-gaps.png"),
     "regimes.png": _by(NIGHTLY, "python docs/studies/regimes.py regimes.png"),
     "cooperation-ablation": _by(TRAINING),
     "learning-curves": _by(TRAINING),
