@@ -180,6 +180,7 @@ TABLES: dict[str, How] = {
     "| Vehicle 2 minimises": _by(SEARCH),
     "| | equal weights | the other weights": _by(SEARCH),
     "| who learns, objective": _by(SEARCH),
+    "| | processor time | hypervolume": _by(SEARCH),
 }
 
 PICTURES: dict[str, How] = {
