@@ -268,7 +268,10 @@ def scenario_new(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
-    """Write a commented NAME.yaml with every key, and NAME.csv with the rows of a table."""
+    """Write a commented NAME.yaml with every key.
+
+    The rows of a table stand in NAME.csv beside it.
+    """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
         text, table = (
