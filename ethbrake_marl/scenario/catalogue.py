@@ -277,7 +277,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
         "name": name,
         "title": "One line for lists and figures",
         "description": "What this scenario is for.",
-        "source": f"Values of {base.name}, to be changed.",
+        "source": f"Values of {base.name}, to be changed." + f" Its rows: {base.source}" * (base.table is not None),
     }
     if base.table is not None and rows_file:
         weights = {} if base.table.weights is None else {"weights": WEIGHT}

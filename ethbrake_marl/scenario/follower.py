@@ -21,7 +21,8 @@ AnyScenario = TypeVar("AnyScenario", bound="ScenarioFields")
 class Follower(FileModel):
     """A vehicle behind the last one, at the same speed, that brakes fully after its latency.
 
-    Without values it is UN Regulation 157's competent driver: 0.75 s of latency, 0.774 g; its time gap, 0.6 s, is ours.
+    Without values it has latency and hardest braking of UN Regulation 157's competent driver, 0.75 s and 0.774 g; its
+    time gap, 0.6 s, is ours. It brakes at once, without that driver's build-up. Its mass is that of the last vehicle.
     """
 
     time_gap_s: float = Field(default=0.6, gt=0.0, le=60.0, description="its time gap behind the last vehicle")

@@ -15,10 +15,13 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.recorded.formats import Format
 from ethbrake_marl.extensions.recorded.reading import place_of
 from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.scenario.fields import QUANTITY
 
 # Allowed ratio of a change (of gaps, of positions) to the change by the speeds (3.28 if units mix feet and metres), and
 # the least correlation of the two for the check of gaps.
 SLOPE, CORRELATED = (0.5, 2.0), 0.7
+
+FARTHEST_M = QUANTITY.usual["gaps_m"].high  # longest gap that a scenario may have
 
 LEAST_M2 = 100.0  # least sum of squares of ways in a lane, to check positions against speeds: one way of 10 m
 
@@ -121,6 +124,8 @@ class Chains:
                 self.left_out["links of standing cars whose gap was recorded as 0 or less"] += row
             elif ahead and (ahead.lane != state.lane or slowest < 0.0):
                 self.left_out["links to another lane, or of a vehicle that rolls backwards"] += row
+            elif ahead and gap > FARTHEST_M:
+                self.left_out[f"links of more than {FARTHEST_M:,.0f} m"] += row
             elif ahead and gap < (behind[ahead.id].gap_m if ahead.id in behind else math.inf):
                 behind[ahead.id] = Link(gap, ahead.speed - state.speed, state)
         self._states += len(there) * row

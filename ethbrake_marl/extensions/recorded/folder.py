@@ -6,6 +6,7 @@ ordered by time. So memory holds only one piece of a file, one moment, and the r
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sqlite3
 from collections import Counter
@@ -19,8 +20,9 @@ from typing import NamedTuple
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.chains import Chains
 from ethbrake_marl.extensions.recorded.formats import Format
-from ethbrake_marl.extensions.recorded.reading import NotARecording
+from ethbrake_marl.extensions.recorded.reading import LARGEST_BYTES, NotARecording
 from ethbrake_marl.extensions.recorded.states import STATE_TABLE, keep_states, moments
+from ethbrake_marl.files.plain import open_plain
 from ethbrake_marl.scenario.vehicle_types import MOST_NUMBERS
 
 
@@ -81,9 +83,11 @@ def read_rows(
             raise InvalidInput(f"{folder}: holds no recording of {entry.title}: {'; '.join(others.values())}")
         ((seen,),) = store.execute("SELECT COUNT(*) FROM chain")
         each_of = seen * numbers // MOST_NUMBERS + 1
-        kept = store.execute("SELECT * FROM chain WHERE rowid % ? = 0", (each_of,)).fetchall()
+        # Every k-th row of a trio, because k-th rows of a moment would be the same trios again and again.
+        counted = "SELECT *, rowid AS row, ROW_NUMBER() OVER (ORDER BY file, vehicles, rowid) AS at FROM chain"
+        kept = store.execute(f"SELECT * FROM ({counted}) WHERE at % ? = 0 ORDER BY row", (each_of,)).fetchall()
     left_out[f"chains: a table holds {MOST_NUMBERS:,} numbers, so one in {each_of} is kept"] = seen - len(kept)
-    lines, of = [list(row[:-2]) for row in kept], [row[-2:] for row in kept]
+    lines, of = [list(row[:-4]) for row in kept], [row[-4:-2] for row in kept]
     return Rows(lines, of, seen, longest, left_out, refused, [*others, *twice])
 
 
@@ -91,24 +95,42 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     """Find the files of a format in a folder and below it, each once, by their names.
 
     Return them by their printable path below the folder, the errors of folders that cannot be read, and names that
-    stand for a file that is there already: links, and a text without header beside its CSV. Names that begin with a dot
-    are left out, and links to folders are not followed.
+    stand for a file that is there already: links, copies, and a text without header beside its CSV. Names that begin
+    with a dot are left out, and links to folders are not followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
-    found, seen, refused, twice = dict[str, Path](), set[str](), list[str](), list[str]()
+    found, seen, refused, twice = dict[str, Path](), set[object](), list[str](), list[str]()
     walk = os.walk(folder, onerror=lambda error: refused.append(f"{error.filename}: cannot be read ({error.strerror})"))
     everything = {Path(top, name) for top, _, names in walk for name in names}
+    sizes = Counter(map(_size, everything))
     for file in sorted(everything):
-        below, real = file.relative_to(folder), os.path.realpath(file)
+        below = file.relative_to(folder)
         matches = any(fnmatch(file.name.lower(), pattern) for pattern in entry.files)
         if not matches or any(part.startswith(".") for part in below.parts):
             continue
         shown = plain_text(below.as_posix())
         again = entry.headless and file.suffix == ".txt" and file.with_suffix(".csv") in everything
-        if again or real in seen or shown in found:
+        content = _content(file) if sizes[_size(file)] > 1 else file
+        if again or shown in found or content in seen:
             twice.append(shown)
         else:
-            seen.add(real)
+            seen.add(content)
             found[shown] = file
     return found, refused, twice
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return -1
+
+
+def _content(file: Path) -> object:
+    """Return a value that only files of the same content share; for what is no readable file, its real path."""
+    try:
+        with open_plain(file, LARGEST_BYTES) as stream:
+            return hashlib.file_digest(stream, "sha256").digest()
+    except (InvalidInput, OSError):
+        return os.path.realpath(file)

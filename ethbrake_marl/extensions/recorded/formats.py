@@ -13,6 +13,8 @@ DataFormat = Literal["highd", "exid", "ngsim", "openacc", "table"]
 
 FOOT_M = 0.3048
 
+NUMBER = "<number>"  # in the name of a column: the number of a vehicle
+
 
 class Format(NamedTuple):
     """One format of recorded traffic; lengths and speeds become m and m/s by ``metres`` and ``mps``."""
@@ -20,7 +22,7 @@ class Format(NamedTuple):
     title: str  # name of the data set, for users
     files: tuple[str, ...]  # patterns of the names of its files, in lower case
     # Names of the columns to read, by what they hold (fields of ``states.State``; ``gap``: the gap behind a vehicle,
-    # recorded instead of positions and lengths). A name ending in # stands for one column per vehicle: Speed1, ...
+    # recorded instead of positions and lengths). A name with ``NUMBER`` stands for one column per vehicle: Speed1, ...
     columns: dict[str, str]
     units: str  # units of lengths and speeds, for messages
     licence: str  # sentence about its licence, for the scenario's ``source``
@@ -81,7 +83,7 @@ FORMATS: dict[DataFormat, Format] = {
         headless=_NGSIM_TEXT,
     ),
     "openacc": Format(
-        "OpenACC", ("*.csv",), {"tick": "Time", "speed": "Speed#", "gap": "IVS#"}, "m and m/s",
+        "OpenACC", ("*.csv",), {"tick": "Time", "speed": f"Speed{NUMBER}", "gap": f"IVS{NUMBER}"}, "m and m/s",
         "OpenACC is of the European Commission's Joint Research Centre, CC BY 4.0: name the source, and say that these"
         " rows are made from it.",
         ticks=10.0, impossible=0.01, standing_mps=0.5, mixed=True,

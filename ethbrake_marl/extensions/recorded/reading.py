@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, naming_extras
-from ethbrake_marl.extensions.recorded.formats import FORMATS, REFUSED, Format
+from ethbrake_marl.extensions.recorded.formats import FORMATS, NUMBER, REFUSED, Format
 from ethbrake_marl.files.plain import open_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Bools, Floats
@@ -102,8 +102,11 @@ def read_pieces(
         while some := list(islice(numbers, PIECE)):
             progress(stream.tell() >> 10, os.fstat(stream.fileno()).st_size >> 10)
             piece = Piece(file, head, np.array([values for _, values in some]), np.array([line for line, _ in some]))
-            for k in range(1 if entry.gaps else len(used)):
-                piece.refuse(~np.isfinite(piece.values[:, k]), k, "must be a finite number")
+            for k in range(len(used)):
+                value = piece.values[:, k]
+                piece.refuse(
+                    np.isinf(value) | (np.isnan(value) & (not entry.gaps or k == 0)), k, "must be a finite number"
+                )
             empty = False
             yield piece
         if empty:
@@ -236,7 +239,7 @@ def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[li
     """
     small = [_OTHER_NAMES.get(name.lower(), name.lower()) for name in shown]
     ordered = sorted((len(name), name, k) for k, name in enumerate(small))  # Speed2 before Speed10
-    patterns = [re.compile(re.escape(each.lower()).replace(r"\#", "[1-9][0-9]*")) for each in columns]
+    patterns = [re.compile(re.escape(each.lower()).replace(re.escape(NUMBER), "[1-9][0-9]*")) for each in columns]
     at = [[k for _, name, k in ordered if each.fullmatch(name)] for each in patterns]
     used, missing = [k for each in at for k in each], [name for name, each in zip(columns, at, strict=True) if not each]
     if not missing and len({small[k] for k in used}) < len(used):
@@ -255,4 +258,8 @@ def _unknown(file: Path, entry: Format, missing: list[str], have: Sequence[str])
             return InvalidInput(f"{file}: is not {entry.title}; this is {each.title}")
     hint = "; columns are separated by commas" * any(";" in name for name in have)
     text = f"{file}: has no column {', '.join(missing)}, as files of {entry.title} have{hint}"
-    return NotARecording(text) if entry.mixed and 2 * len(missing) > len(entry.columns) else InvalidInput(text)
+    return (
+        NotARecording(text)
+        if entry.mixed and not hint and 2 * len(missing) > len(entry.columns)
+        else InvalidInput(text)
+    )

@@ -16,9 +16,9 @@ COLUMNS, ROW = "Speed1,Speed2,Speed3,IVS1,IVS2", "20,20,20,15,16"
 
 
 def good(folder: Path, name: str = "a.csv") -> Path:
-    """A recording with one row, of that name."""
+    """A recording with one row, of that name; its heading differs from that of every other."""
     folder.mkdir(parents=True, exist_ok=True)
-    return openacc(folder, COLUMNS, ROW, name=name)
+    return openacc(folder, COLUMNS, ROW, name=name, heading=[f"Date,{(folder.name + name).encode().hex()}"])
 
 
 def bad(folder: Path, name: str) -> Path:
@@ -59,7 +59,7 @@ def test_refused_files__are_all_listed_and_add_no_row(
     wrong = (
         "data/late/a.csv, line 11: vehicle 2 overlaps vehicle 1 ahead by 15.00 m; 9 of 54 are like that, at most 1% may"
     )
-    starts = [f"data/{name}.csv, line 2, column Speed1: 'fast' is not a number" for name in "bc"] + [wrong]
+    starts = [f"data/{name}.csv, line 3, column Speed1: 'fast' is not a number" for name in "bc"] + [wrong]
     assert [text.startswith(start) for text, start in zip(made.refused, starts, strict=True)] == [True] * 3
     command = ["scenario", "from-data", "data", "--format", "openacc", "--output", "mine.yaml"]
     assert run_command([*command, "--json"]) == 0
@@ -67,9 +67,9 @@ def test_refused_files__are_all_listed_and_add_no_row(
     assert json.loads(out.out)["refused"] == made.refused and out.err.count("refused: data/") == 3
     assert run_command([*command, "--strict", "--force"]) == 2
     error = capsys.readouterr().err
-    assert [start in error for start in starts] == [True] * 3 and "data: 3 files refused: data/b.csv, line 2" in error
+    assert [start in error for start in starts] == [True] * 3 and "data: 3 files refused: data/b.csv, line 3" in error
     Path("data/a.csv").unlink()
-    with pytest.raises(InvalidInput, match=r"data: 3 files refused: data/b.csv, line 2") as told:
+    with pytest.raises(InvalidInput, match=r"data: 3 files refused: data/b.csv, line 3") as told:
         scenario_from_data("mine", folder, "openacc")
     assert len(told.value.__notes__) == 2
 
@@ -77,7 +77,7 @@ def test_refused_files__are_all_listed_and_add_no_row(
 def test_folder_without_recordings__says_what_each_file_lacks(tmp_path: Path) -> None:
     (tmp_path / "Veh.csv").write_text("Vehicle,Length\n")
     with pytest.raises(
-        InvalidInput, match=r"holds no recording of OpenACC: .*Veh.csv: has no column Time, Speed#, IVS#"
+        InvalidInput, match=r"holds no recording of OpenACC: .*Veh.csv: has no column Time, Speed<number>, IVS<number>"
     ):
         scenario_from_data("mine", tmp_path, "openacc")
     with pytest.raises(InvalidInput, match=r"must be a folder with \*_tracks.csv, the files of exiD"):
@@ -134,3 +134,20 @@ def test_ten_thousand_small_files__take_seconds(tmp_path: Path) -> None:
     made = scenario_from_data("mine", tmp_path, "openacc")
     assert made.found[1] == "rows of 10,000 different trios of vehicles in 10,000 recordings"
     assert time.process_time() - began < 120.0
+
+
+def test_copy_of_a_recording__counts_once(tmp_path: Path) -> None:
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "copy.csv").write_bytes((good(tmp_path / "a") / "a.csv").read_bytes())
+    good(tmp_path / "c")
+    made = scenario_from_data("mine", tmp_path, "openacc")
+    assert made.skipped == ["b/copy.csv"] and "in 2 recordings" in made.found[1]
+
+
+def test_thinning__keeps_rows_of_every_trio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Two pairs at each of 100 moments, in the same order: every second row would be the same pair.
+    openacc(tmp_path, "Speed1,Speed2,Speed3,Speed4,IVS1,IVS3", *["20,20,20,20,15,16"] * 100)
+    monkeypatch.setattr("ethbrake_marl.extensions.recorded.folder.MOST_NUMBERS", 400)
+    made = scenario_from_data("mine", tmp_path, "openacc", based_on="realistic-pair")
+    rows = [line.rpartition(": ")[2] for line in made.csv.splitlines()[1:]]
+    assert rows.count("1-2") == rows.count("3-4") == 50

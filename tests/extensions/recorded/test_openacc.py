@@ -69,7 +69,7 @@ def test_car_without_speed__has_no_link(tmp_path: Path) -> None:
 def test_no_link__is_said_with_the_columns(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=r"no car follows another: Speed1, Speed3, IVS1; .*Speed k\+1 and IVS k"):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed3,IVS1", "20,20,15"), "openacc")
-    with pytest.raises(InvalidInput, match="has no column IVS#, as files of OpenACC have"):
+    with pytest.raises(InvalidInput, match="has no column IVS<number>, as files of OpenACC have"):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,Lat1", "20,20,15"), "openacc")
 
 
@@ -80,7 +80,8 @@ def test_heading__has_up_to_ten_lines(lines: int, tmp_path: Path) -> None:
         assert rows_of(scenario_from_data("mine", folder, "openacc")) == ["15.0,16.0,20.0,20.0,20.0"]
     else:
         with pytest.raises(
-            InvalidInput, match=r"holds no recording of OpenACC: .*a.csv: has no column Time, Speed#, IVS#"
+            InvalidInput,
+            match=r"holds no recording of OpenACC: .*a.csv: has no column Time, Speed<number>, IVS<number>",
         ):
             scenario_from_data("mine", folder, "openacc")
 
@@ -123,3 +124,23 @@ def test_units__are_checked_between_moments_a_second_apart_however_far_rows_are_
         else:
             with pytest.raises(InvalidInput, match=r"gaps change 3\.\d\d times as much as speeds say"):
                 scenario_from_data("mine", folder, "openacc", based_on="realistic-pair", every_s=every_s)
+
+
+@pytest.mark.parametrize(
+    ("gap", "right"),
+    [("100000", "at most 10000"), ("1e308", "at most"), ("-1e300", "at most"), ("inf", "finite number")],
+)
+def test_gap__beyond_what_a_scenario_may_have_refuses_its_file_only(gap: str, right: str, tmp_path: Path) -> None:
+    openacc(tmp_path, "Speed1,Speed2,IVS1", "20,20,15")
+    openacc(tmp_path, "Speed1,Speed2,IVS1", f"20,20,{gap}", name="b.csv")
+    made = scenario_from_data("mine", tmp_path, "openacc", based_on="realistic-pair")
+    assert rows_of(made) == ["15.0,20.0,20.0"]
+    (text,) = made.refused
+    assert "b.csv, line 2, column IVS1: " in text and right in text
+
+
+def test_file_with_semicolons__is_refused_with_a_hint(tmp_path: Path) -> None:
+    openacc(tmp_path, "Speed1,Speed2,IVS1", "20,20,15")
+    (tmp_path / "b.csv").write_text("Time;Speed1;Speed2;IVS1\n0;20;20;15\n")
+    (text,) = scenario_from_data("mine", tmp_path, "openacc", based_on="realistic-pair").refused
+    assert "columns are separated by commas" in text

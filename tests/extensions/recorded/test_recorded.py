@@ -70,7 +70,7 @@ def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) 
     cells = (folder / "platoon.csv").read_text().splitlines()[6].split(",")
     assert rows_of(made)[0] == ",".join(f"{float(cells[k])}" for k in (16, 17, 1, 4, 7))
     assert "CC BY 4.0" in made.text and len(rows_of(scenario_from_data("mine", folder, "openacc", every_s=0.1))) == 300
-    (folder / "later.csv").write_text((folder / "platoon.csv").read_text())
+    (folder / "later.csv").write_text("Date,later\n" + (folder / "platoon.csv").read_text())
     assert scenario_from_data("mine", folder, "openacc").found[0].startswith("60 chains")
     with pytest.raises(InvalidInput, match=r"gaps change 0\.31 times as much as speeds say .*OpenACC has m and m/s"):
         scenario_from_data("mine", write_openacc(tmp_path / "feet", 100, unit=0.3048), "openacc")

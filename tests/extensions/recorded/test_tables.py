@@ -215,3 +215,17 @@ def test_ind_and_round__are_refused_by_name(name: str, tmp_path: Path) -> None:
 def test_other_format__is_named(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=r"03_tracks.csv: is not highD; this is exiD"):
         scenario_from_data("mine", exid(tmp_path, 0.0), "highd")
+
+
+def test_frames_of_video__keep_their_rate_and_names_of_columns_are_literal(tmp_path: Path) -> None:
+    # 29.97 pictures in a second: 600 of them are 20.02 s, and a second is 30 pictures.
+    cars = [
+        (who, frame, 1, x + 20.0 * frame / 29.97, 5.0, 20.0) for frame in range(601) for who, x in (("a", 20), ("b", 0))
+    ]
+    lines = [",".join(map(str, row)) for row in [["veh#", *HEAD[1:]], *cars]]
+    folder = write_files(tmp_path, {"a.csv": lines})
+    columns = "time=t/29.97,vehicle=veh#,lane=lane,front=x,length=l,speed=v,units=m"
+    made = made_of(folder, columns, based_on="realistic-pair")
+    assert rows_of(made) == ["15.0,20.0,20.0"] * 21
+    with pytest.raises(InvalidInput, match=r"every = 0\.05 s: must be a multiple of 0\.0333"):
+        made_of(folder, columns, based_on="realistic-pair", every_s=0.05)
