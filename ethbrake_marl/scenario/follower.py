@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeVar
+from typing import Any
 
 from pydantic import Field, ValidationError
 
@@ -11,11 +11,6 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import FileModel
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.scenario.fields import QUANTITY
-
-if TYPE_CHECKING:
-    from ethbrake_marl.scenario.declared import ScenarioFields
-
-AnyScenario = TypeVar("AnyScenario", bound="ScenarioFields")
 
 
 class Follower(FileModel):
@@ -30,7 +25,7 @@ class Follower(FileModel):
     latency_s: float = Field(default=0.75, ge=0.0, le=60.0, description="time from the alert until it brakes")
 
 
-def with_follower(document: Document, build: Callable[[Document], AnyScenario]) -> Document:
+def with_follower(document: Document, build: Callable[[Document], Any]) -> Document:
     """Return the document of the line with the vehicle that the key ``follower`` adds, and without that key.
 
     Tables and lists are completed for it. An invalid follower gives the document unchanged; the schema refuses it
