@@ -180,8 +180,9 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
         yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"
     if scenario.table is not None:
         rows, columns = len(scenario.table.rows or ()), ", ".join(scenario.table.columns)
-        named = scenario.recordings
-        of = "" if named is None else f" of {len(set(named.rows.tolist())):,} recordings, by which intervals are"
+        column, of = scenario.recordings, ""
+        if column is not None:
+            of = f" of {len({*scenarios.recording_of(column.rows).tolist()}):,} recordings, by which intervals are"
         yield f"Each world takes one of {rows:,} rows of a table{of}: {columns}."
     for name, kind in (scenario.vehicle_types or {}).items():
         own = {scenarios.QUANTITY.declared[key].label: getattr(kind, key) for key in scenarios.QUANTITY.of_a_type}
@@ -274,10 +275,8 @@ def scenario_new(
     """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
-        text, table = (
-            scenarios.new_scenario_text(name, based_on, rows_file=rows.name),
-            scenarios.load_scenario(based_on).table,
-        )
+        text = scenarios.new_scenario_text(name, based_on, rows_file=rows.name)
+        table = scenarios.load_scenario(based_on).table
         out.check(file)
         if table is not None:
             out.write(rows, scenarios.rows_text(table), what="rows")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario.distributions import Uniform as Uniform
     from ethbrake_marl.scenario.fields import QUANTITY as QUANTITY
     from ethbrake_marl.scenario.roles import ScriptSpec as ScriptSpec
-    from ethbrake_marl.scenario.sample import Sample as Sample
+    from ethbrake_marl.scenario.sample import Sample as Sample, recording_of as recording_of
     from ethbrake_marl.scenario.schema import Scenario as Scenario, scenario_json_schema as scenario_json_schema
     from ethbrake_marl.scenario.tables import rows_text as rows_text
     from ethbrake_marl.scenario.task import Task as Task

@@ -53,18 +53,20 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
             values = given if isinstance(given, list | tuple) else [given] * N
             content[key] = [*values, own.get(key, values[-1])]
     low, high = line.bounds("speeds_mps")[-1]
-    if (("speeds_mps", N - 1)) in line.table_entries:
-        table = content["table"]
-        at = list(table["columns"]).index(QUANTITY.declared["speeds_mps"].column_of(N - 1))
-        rows = [[*row, follower.time_gap_s * row[at], row[at]] for row in table["rows"]]
-        columns = [*table["columns"], f"gap_{N}_m", f"speed_{N + 1}_mps"]
-        content["table"] = {**table, "columns": columns, "rows": rows}
-    elif low == high:
-        key, gap = (
-            ("time_gaps_s", follower.time_gap_s) if "time_gaps_s" in content else ("gaps_m", follower.time_gap_s * low)
-        )
-        gaps = content.get(key)
-        content[key] = [*(gaps if isinstance(gaps, list | tuple) else [gaps] * (N - 1)), gap]
-    else:
+    speed, gaps = (QUANTITY.declared[key].column_of(N - k) for k, key in ((1, "speeds_mps"), (2, "gaps_m")))
+    columns = list(content["table"]["columns"]) if "table" in content else []
+    if speed not in columns and low != high:
         raise InvalidInput(f"{where}: the speed of vehicle_{N} is drawn; it must be a number, or stand in the table")
+    if speed in columns or gaps in columns:
+        rows = []
+        for row in content["table"]["rows"]:
+            own_speed = [row[columns.index(speed)]] if speed in columns else []
+            rows.append([*row, follower.time_gap_s * (own_speed or [low])[0], *own_speed])
+        columns += [f"gap_{N}_m", *[f"speed_{N + 1}_mps"] * (speed in columns)]
+        content["table"] = {**content["table"], "columns": columns, "rows": rows}
+    else:
+        by_time = "time_gaps_s" in content
+        key, gap = ("time_gaps_s", follower.time_gap_s) if by_time else ("gaps_m", follower.time_gap_s * low)
+        given = content[key]
+        content[key] = [*(given if isinstance(given, list | tuple) else [given] * (N - 1)), gap]
     return Document(document.file, {**content, "vehicles": N + 1}, document.lines)

@@ -14,6 +14,13 @@ from ethbrake_marl.scenario.fields import RECORDING
 _Texts = NDArray[np.str_]
 
 
+def recording_of(texts: _Texts) -> _Texts:
+    """Return the recording that each text of the column ``recording`` names, [n]: what stands before its last ": "."""
+    before, _, after = np.char.rpartition(texts, ": ").T
+    names: _Texts = np.where(before == "", after, before)
+    return names
+
+
 def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     """Return the name of each world's cluster, [n]; only clusters are independent. None: all worlds are.
 
@@ -28,8 +35,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
     column = kinds.get(RECORDING)
     if column is None:
         return None
-    before, _, after = np.char.rpartition(column, ": ").T
-    recording = np.where(before == "", after, before)
+    recording = recording_of(column)
     return np.where(recording == "", np.char.add(" ", index.astype(str)), recording)
 
 

@@ -41,6 +41,13 @@ def test_follower__of_a_table_drives_at_the_speed_of_each_row() -> None:
     assert rows == {(5.0, 20.0, 20.0, 10.0, 10.0), (7.0, 30.0, 20.0, 15.0, 15.0)}
 
 
+def test_follower__of_a_table_of_gaps_stands_in_it_too() -> None:
+    table = {"columns": ["gap_1_m", "recording"], "rows": [[5, "a: 1-2"], [7, "b: 1-2"]]}
+    content = {key: value for key, value in PAIR.items() if key != "gaps_m"}
+    gaps = Scenario(**content, table=table, follower={}).sample(50, 7).worlds.gaps_m
+    assert {tuple(each) for each in gaps.tolist()} == {(5.0, 12.0), (7.0, 12.0)}
+
+
 def test_follower__of_time_gaps_has_one_too() -> None:
     content = {key: value for key, value in PAIR.items() if key != "gaps_m"}
     line = Scenario(**content, time_gaps_s={"uniform": [1, 2]}, follower={})
