@@ -62,17 +62,17 @@ if TYPE_CHECKING:
     from ethbrake_marl.policies.shipped import load_shipped as load_shipped
 
     # Shields: for any interface, and one for each
-    from ethbrake_marl.shield.wrappers import shield as shield
-    from ethbrake_marl.shield.reasons import ShieldReason as ShieldReason
-    from ethbrake_marl.shield.contract import ShieldMode as ShieldMode
-    from ethbrake_marl.shield.options import ShieldOptions as ShieldOptions
-    from ethbrake_marl.shield.wrappers import (
+    from ethbrake_marl.shields.wrappers import shield as shield
+    from ethbrake_marl.shields.reasons import ShieldReason as ShieldReason
+    from ethbrake_marl.shields.contract import ShieldMode as ShieldMode
+    from ethbrake_marl.shields.options import ShieldOptions as ShieldOptions
+    from ethbrake_marl.shields.wrappers import (
         HybridShield as HybridShield,
         ShieldedEnv as ShieldedEnv,
         ShieldedVectorEnv as ShieldedVectorEnv,
         shielded_aec as shielded_aec,
     )
-    from ethbrake_marl.shield.sb3 import ShieldedVecEnv as ShieldedVecEnv
+    from ethbrake_marl.shields.sb3 import ShieldedVecEnv as ShieldedVecEnv
 
     # Training
     from ethbrake_marl.training.recipe import TrainingRecipe as TrainingRecipe, load_recipe as load_recipe
@@ -130,7 +130,6 @@ def _import_public(name: str) -> Any:
     register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)
-    value = sys.modules.get(f"{__name__}.{name}", value)  # a callable folder: ``shield``
     globals()[name] = value
     return value
 
@@ -140,7 +139,7 @@ if not TYPE_CHECKING:  # a type checker that sees __getattr__ accepts any name
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_usable(), "__all__"})
+    return sorted(["__version__", *_usable()])
 
 
 # The command line registers the environments only when a command runs: importing Gymnasium would slow down --help.

@@ -15,9 +15,9 @@ from ethbrake_marl.physics.forecast import forecast
 from ethbrake_marl.physics.left_out import leaving_out_failed
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.certify import Backup, certify
-from ethbrake_marl.shield.running import begin_running
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.certify import Backup, certify
+from ethbrake_marl.shields.running import begin_running
+from ethbrake_marl.shields.step import StepShield
 from tests.failing_worlds import plant, planted_list, without
 
 PAPER = load_scenario("paper-random")

@@ -148,9 +148,9 @@ def digest_in(package: Path, name: str) -> str:
     [
         ("physics/advance.py", "physics/advance.py", True),  # its own file
         ("physics/advance.py", "physics/impact.py", True),  # what it calls
-        ("shield/members.py", "physics/impact.py", True),  # through several files
-        ("shield/options.py", "errors.py", False),  # a file without kernels or constants
-        ("physics/advance.py", "shield/options.py", False),  # kernels that it does not call
+        ("shields/members.py", "physics/impact.py", True),  # through several files
+        ("shields/options.py", "errors.py", False),  # a file without kernels or constants
+        ("physics/advance.py", "shields/options.py", False),  # kernels that it does not call
         ("physics/impact.py", "physics/advance.py", False),  # its callers
         ("physics/advance.py", "physics/state.py", False),  # types
     ],

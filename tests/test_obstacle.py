@@ -18,7 +18,7 @@ from ethbrake_marl.policies.manifest import ObservationSchema
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_state
-from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.refused import refused
 
 ALL = load_scenario("cooperation-4-all")

@@ -22,7 +22,7 @@ def train(N: int, steps: int) -> str:
     from stable_baselines3.common.vec_env import VecEnvWrapper
 
     from ethbrake_marl.envs.sb3 import make_sb3_vec_env
-    from ethbrake_marl.shield.sb3 import ShieldedVecEnv
+    from ethbrake_marl.shields.sb3 import ShieldedVecEnv
     from tests.shield.attacks import line
 
     class PaidForHarm(VecEnvWrapper):

@@ -16,9 +16,9 @@ from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shield.certify import certify
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.certify import certify
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.step import StepShield
 
 SCENARIO = load_scenario("paper-random")
 

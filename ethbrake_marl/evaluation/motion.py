@@ -15,7 +15,7 @@ from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.physics.trace import segment_pieces
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
 _SAME = 1e-9  # tolerance (m, m/s) within which a piece continues the piece before it, so both are joined
 

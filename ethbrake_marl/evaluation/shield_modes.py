@@ -19,10 +19,10 @@ from ethbrake_marl.physics.left_out import LeftOutRows, measured_without_failed
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.episodes import Shielded
-from ethbrake_marl.shield.evidence import SAME_HARM, VERDICTS, review
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.episodes import Shielded
+from ethbrake_marl.shields.evidence import SAME_HARM, VERDICTS, review
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
 # ``step-alert``: rollouts of the policy only at the alert; ``step-cap``: no vehicle bears more harm than its cap.
 Mode = Literal["none", "episode", "step", "step-alert", "step-cap"]

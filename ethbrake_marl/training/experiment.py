@@ -29,8 +29,8 @@ from ethbrake_marl.policies.teams import Trained
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.drivers import shielded
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.drivers import shielded
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.session import TrainResult, train

@@ -23,8 +23,8 @@ from ethbrake_marl.evaluation.motion import follow_episodes
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")

@@ -22,9 +22,9 @@ from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.channel import PRESETS
-from ethbrake_marl.shield.comparison import seen_columns
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.rollouts import Proposer, proposed_action
+from ethbrake_marl.shields.comparison import seen_columns
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.rollouts import Proposer, proposed_action
 from tests.fixtures.asked import Acts
 from tests.fixtures.knowledge import alter_unreceived
 from tests.fixtures.policies import make_policy

@@ -14,7 +14,7 @@ from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import policy_sha256
 from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.game.observations import ObservationSpec, observe
-from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.fixtures.asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")

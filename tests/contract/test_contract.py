@@ -34,7 +34,7 @@ from tests.contract.interfaces import (
     rows_of,
 )
 
-pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shield.MovingAtHorizon")
+pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.shields.MovingAtHorizon")
 each_interface = pytest.mark.parametrize("name", INTERFACES)
 each_bare = pytest.mark.parametrize("name", BARE)
 each_scenario = pytest.mark.parametrize(

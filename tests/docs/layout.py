@@ -27,7 +27,7 @@ This page is made from the code: `python -m tests.docs.layout`.
 | How does one step of an episode go? | `engine/engine.py`, `step`; [the game](game.md) |
 | What does one impact cost? | `physics/impact.py`, `record_impacts`; summed in `game/harm.py` |
 | Where does a number in a table come from? | `evaluation/`: `measure_sets.py` (columns), `outcome.py`, `rollout.py` |
-| Why did the shield replace an action? | `shield/certify.py`, `decide_world`; the proof is in `shield/step.py` |
+| Why did the shield replace an action? | `shields/certify.py`, `decide_world`; the proof is in `shields/step.py` |
 | What is a reward term? | `game/`: `step_outcome.py` (formulas), `rewards.py` (weights), `measures.py` (names) |
 | Which agents are there? | `pyproject.toml`, `agents/scripts.py`; [add one](extending.md#an-agent) |
 | What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (quantities); [scenarios](scenarios.md) |

@@ -14,7 +14,7 @@ from ethbrake_marl.evaluation.motion import EpisodeMotion, follow_episodes, stat
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.tables import worlds_from_state
-from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shields.drivers import ShieldedDriver
 
 IMPACT_S = 0.5 + 0.25 / 3.0  # see PAIR
 BRAKE = make_agent("full_brake")

@@ -13,9 +13,9 @@ from ethbrake_marl.evaluation.shield_modes import ShieldModes, compare_modes
 from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.evidence import review
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.evidence import review
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from tests.failing_worlds import plant, without
 
 PAPER, PAIR = (load_scenario(name) for name in ("paper-random", "cooperation-3-pair"))

@@ -17,7 +17,7 @@ from ethbrake_marl.game.harm import empty_ledger
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.step import StepShield
 from tests.physics.random_worlds import Draws, driving_lines
 from tests.shield.attacks import line
 

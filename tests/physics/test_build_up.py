@@ -21,7 +21,7 @@ from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.physics.random_worlds import Draws, line
 from tests.reference.small_steps import run
 

@@ -22,8 +22,8 @@ from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Ints, Worlds, make_worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.certify import plan_harm
-from ethbrake_marl.shield.running import begin_running
+from ethbrake_marl.shields.certify import plan_harm
+from ethbrake_marl.shields.running import begin_running
 from tests.physics.random_worlds import Draws
 from tests.physics.test_build_up import Pieces, by_small_steps
 

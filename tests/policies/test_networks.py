@@ -33,7 +33,7 @@ from ethbrake_marl.policies.manifest import content_sha256
 from ethbrake_marl.policies.network_spec import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.policies.shipped import load_named_policy, shipped_name, shipped_policies
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from tests.docs.site import DOCS
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]

@@ -26,7 +26,7 @@ import numpy as np
 import z3
 
 from ethbrake_marl.physics import impact, motion, rows
-from ethbrake_marl.shield import certify
+from ethbrake_marl.shields import certify
 from tests.programmes import Cases, Given, Told
 
 # ---------------------------------------------------------------- symbolic execution

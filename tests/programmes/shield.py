@@ -25,8 +25,8 @@ from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.physics.messages import LOOK_AHEAD, PIECES
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shield.certify import plan_harm
-from ethbrake_marl.shield.running import begin_running
+from ethbrake_marl.shields.certify import plan_harm
+from ethbrake_marl.shields.running import begin_running
 from tests.extensions.certified.estimates import ABOVE, INSIDE, LISTS, WAYS, shielded
 from tests.programmes import Cases, Given, Told
 from tests.shield.attacks import (

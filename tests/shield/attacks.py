@@ -19,10 +19,10 @@ from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.physics.advance import advance
 from ethbrake_marl.physics.episode import CLOCK
 from ethbrake_marl.physics.state import Floats, Worlds
-from ethbrake_marl.shield.certify import Decision, certify
-from ethbrake_marl.shield.comparison import seen_columns
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.certify import Decision, certify
+from ethbrake_marl.shields.comparison import seen_columns
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.step import StepShield
 
 # ---------------------------------------------------------------- lines
 

@@ -18,9 +18,9 @@ import numpy as np
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import episode_engine
 from ethbrake_marl.agents.protocol import Team
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.guard import MovingAtHorizon
-from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.guard import MovingAtHorizon
+from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.shield.attacks import line
 
 ROWS = 5  # worlds of the batched interfaces

@@ -16,10 +16,10 @@ from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.engine.compiled_step import STEP
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.guard import MovingAtHorizon
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
-from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.guard import MovingAtHorizon
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
 from tests.fixtures.asked import Acts, Asked
 from tests.shield.attacks import above_later
 from tests.shield.plays import reported

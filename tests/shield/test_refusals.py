@@ -19,14 +19,14 @@ from ethbrake_marl.envs.sb3 import make_sb3_vec_env
 from ethbrake_marl.envs.vector import EthBrakeVectorEnv
 from ethbrake_marl.errors import UncertifiedStep, UnknownName
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shield.certify import certify, plan_harm
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.evidence import review
-from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
-from ethbrake_marl.shield.sb3 import ShieldedVecEnv
-from ethbrake_marl.shield.step import StepShield
-from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.shields.certify import certify, plan_harm
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.evidence import review
+from ethbrake_marl.shields.options import ShieldOptions
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.sb3 import ShieldedVecEnv
+from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.fixtures.lines import line as one_line
 from tests.refused import refused
 from tests.shield.attacks import begun

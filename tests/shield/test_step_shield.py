@@ -10,24 +10,24 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield import episodes as episodes_module
-from ethbrake_marl.shield.certify import Backup, certify, plan_harm
-from ethbrake_marl.shield.comparison import ends_under
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.episodes import Shielded, drive_shielded
-from ethbrake_marl.shield.first_plan import joint_constants
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
-from ethbrake_marl.shield.reasons import ShieldReason
-from ethbrake_marl.shield.rollouts import Proposer, certify_rollouts
-from ethbrake_marl.shield.running import begin_running
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields import episodes as episodes_module
+from ethbrake_marl.shields.certify import Backup, certify, plan_harm
+from ethbrake_marl.shields.comparison import ends_under
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.episodes import Shielded, drive_shielded
+from ethbrake_marl.shields.first_plan import joint_constants
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.reasons import ShieldReason
+from ethbrake_marl.shields.rollouts import Proposer, certify_rollouts
+from ethbrake_marl.shields.running import begin_running
+from ethbrake_marl.shields.step import StepShield
 from tests.fixtures.asked import Acts
 from tests.shield.attacks import ADVERSARIES, LEAKS, TEAM_ADVERSARIES, TEAMS, all_infos, attack, begun, line, search
 from tests.shield.plays import reported
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
-    "ignore::ethbrake_marl.shield.MovingAtHorizon",
+    "ignore::ethbrake_marl.shields.MovingAtHorizon",
 )
 
 STEPS = 81

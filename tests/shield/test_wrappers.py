@@ -173,12 +173,6 @@ def test_shield__chooses_the_wrapper_of_the_interface(make, kind):
     assert "own_harm" in told and np.all(told["proposed_action"] == 1.0)
 
 
-def test_shield__is_the_folder_and_the_function_whichever_is_asked_for_first():
-    import ethbrake_marl.shield.options as options
-
-    assert eb.shield.options is options and callable(eb.shield)
-
-
 @pytest.mark.parametrize(
     ("name", "mode"), [("paper-random", "step"), ("paper-random", "episode"), ("cooperation-3-pair", "step")]
 )

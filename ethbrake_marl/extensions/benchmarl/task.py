@@ -26,8 +26,8 @@ from ethbrake_marl.game.observed import observation_for
 from ethbrake_marl.game.rewards import Reward
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.attach import guard_of
-from ethbrake_marl.shield.options import ShieldOptions
+from ethbrake_marl.shields.attach import guard_of
+from ethbrake_marl.shields.options import ShieldOptions
 
 GROUP = "learners"
 

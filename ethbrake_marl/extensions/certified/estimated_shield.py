@@ -29,11 +29,11 @@ from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.certify import Decision, plan_harm
-from ethbrake_marl.shield.comparison import seen_columns, worlds_at
-from ethbrake_marl.shield.rollouts import Proposer
-from ethbrake_marl.shield.running import put
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.certify import Decision, plan_harm
+from ethbrake_marl.shields.comparison import seen_columns, worlds_at
+from ethbrake_marl.shields.rollouts import Proposer
+from ethbrake_marl.shields.running import put
+from ethbrake_marl.shields.step import StepShield
 
 PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # attributes [n, ...]
 

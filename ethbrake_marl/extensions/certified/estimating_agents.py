@@ -15,7 +15,7 @@ from ethbrake_marl.extensions.certified.estimated import Ranges, Told
 from ethbrake_marl.physics.messages import LATENCY
 from ethbrake_marl.physics.state import Floats, Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
 
 class Odometer(NamedTuple):

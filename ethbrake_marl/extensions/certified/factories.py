@@ -11,8 +11,8 @@ from ethbrake_marl.extensions.certified.estimating_agents import Believing, Beli
 from ethbrake_marl.extensions.certified.options import RobustOptions, mode_uncertainty
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
-from ethbrake_marl.shield.factories import shield_episodes
+from ethbrake_marl.shields.drivers import ShieldedDriver, shielded
+from ethbrake_marl.shields.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:

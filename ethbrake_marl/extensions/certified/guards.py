@@ -14,8 +14,8 @@ import numpy as np
 from ethbrake_marl.engine.engine import Engine, Ruling
 from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
-from ethbrake_marl.shield.contract import Guarded, ShieldGuard, why
-from ethbrake_marl.shield.guard import StepGuard
+from ethbrake_marl.shields.contract import Guarded, ShieldGuard, why
+from ethbrake_marl.shields.guard import StepGuard
 
 
 class RobustMode(IntEnum):

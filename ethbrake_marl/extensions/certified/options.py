@@ -16,8 +16,8 @@ from ethbrake_marl.extensions.certified.guards import BelievedGuard, RobustGuard
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty, parse_uncertainty
 from ethbrake_marl.scenario.schema import Scenario, as_scenario
-from ethbrake_marl.shield.contract import ShieldGuard, ShieldMode
-from ethbrake_marl.shield.options import ShieldOptions, check_mode, misplaced, one_learner, shielded_vehicle
+from ethbrake_marl.shields.contract import ShieldGuard, ShieldMode
+from ethbrake_marl.shields.options import ShieldOptions, check_mode, misplaced, one_learner, shielded_vehicle
 
 
 @dataclass(frozen=True)

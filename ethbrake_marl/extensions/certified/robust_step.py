@@ -20,11 +20,11 @@ from ethbrake_marl.extensions.certified.uncertainty import Uncertainty
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.certify import Backup, Decision, certify
-from ethbrake_marl.shield.reasons import NO_CERTIFICATE
-from ethbrake_marl.shield.running import Running
-from ethbrake_marl.shield.step import StepShield
-from ethbrake_marl.shield.step_memory import StepMemory
+from ethbrake_marl.shields.certify import Backup, Decision, certify
+from ethbrake_marl.shields.reasons import NO_CERTIFICATE
+from ethbrake_marl.shields.running import Running
+from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.shields.step_memory import StepMemory
 
 
 class RobustShield(StepShield):

@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.studies.trainings import Timed, train_all
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.progress import OnProgress
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.episodes import drive_shielded
+from ethbrake_marl.shields.episodes import drive_shielded
 from ethbrake_marl.training.team import load_team
 
 

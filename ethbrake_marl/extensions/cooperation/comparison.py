@@ -18,7 +18,7 @@ from ethbrake_marl.extensions.cooperation.joint_optimum import Goal, Harms, Meas
 from ethbrake_marl.extensions.cooperation.levels import TOLERANCE, Json
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.shield.episodes import Shielded
+from ethbrake_marl.shields.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:

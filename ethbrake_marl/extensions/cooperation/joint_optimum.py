@@ -36,7 +36,7 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.episodes import Shielded, drive_shielded
+from ethbrake_marl.shields.episodes import Shielded, drive_shielded
 from ethbrake_marl.training.team import load_team
 from ethbrake_marl.training.training import Training
 

@@ -47,7 +47,7 @@ from ethbrake_marl.physics.paper_map import held_speeds
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.step import StepShield
 
 STANDS_MPS = 1e-3  # below this speed a vehicle of a host with a fixed step counts as standing
 

@@ -23,7 +23,7 @@ from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from ethbrake_marl.training.run_folder import RunDirectory
 
 FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"

@@ -8,7 +8,7 @@ impacts fall on one moment, and the last bit decides which of them is first.
 import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.shield.attacks import Hostile
 
 WAYS = ("coast", "drive", "chance")

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.enclosure import Boxes
 from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
+from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.extensions.certified.estimates import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, shielded
 from tests.shield.attacks import all_infos
 from tests.shield.plays import reported

@@ -29,9 +29,9 @@ from ethbrake_marl.extensions.certified.paths import go_on, may_meet_unseen, mee
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.touching import backwards, bounce, stray
 from ethbrake_marl.extensions.certified.uncertainty import Uncertainty, parse_uncertainty
-from ethbrake_marl.shield.certify import plan_harm
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.running import begin_running
+from ethbrake_marl.shields.certify import plan_harm
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.running import begin_running
 from tests.extensions.certified.test_uncertainty import STANDING
 
 STEPS = 81

@@ -8,8 +8,8 @@ from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.evidence import review
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.evidence import review
 from tests.shield.test_step_shield import wavering
 
 SCENARIO = load_scenario("paper-random")

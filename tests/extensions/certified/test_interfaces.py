@@ -14,7 +14,7 @@ from ethbrake_marl.extensions.certified.guards import RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.evaluation.test_shield_modes import WORLDS
 from tests.shield import test_wrappers as wrappers
 from tests.shield.attacks import line

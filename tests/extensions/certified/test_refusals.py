@@ -21,8 +21,8 @@ from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import Interval, Uncertainty, parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.wrappers import HybridShield, ShieldedEnv
+from ethbrake_marl.shields.options import ShieldOptions
+from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv
 from tests.fixtures.commands import Refuse
 from tests.fixtures.lines import line as one_line
 from tests.refused import refused

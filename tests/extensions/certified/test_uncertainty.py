@@ -17,9 +17,9 @@ from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.certify import plan_harm
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.reasons import ShieldReason
+from ethbrake_marl.shields.certify import plan_harm
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.reasons import ShieldReason
 from tests.fixtures.lines import line as one_line
 from tests.golden.test_golden import decisions_hash
 from tests.physics.random_worlds import Draws

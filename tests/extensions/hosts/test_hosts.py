@@ -11,8 +11,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.hosts.protocol import HostFailed, HostState, drive_host
 from ethbrake_marl.physics.left_out import Impacts
 from ethbrake_marl.physics.paper_map import advance_sampled
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.step import StepShield
 from tests.docs.site import DOCS
 
 PAPER = eb.load_scenario("paper-random")

@@ -9,8 +9,8 @@ from ethbrake_marl.agents.protocol import policy_sha256
 from ethbrake_marl.agents.spec import AgentSpec, parse_spec
 from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.extensions.search.around import Searched
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from tests.agents.test_drive import check_holds, check_rows
 from tests.agents.test_policy import check_bound, check_file, train_ppo
 from tests.engine.test_engine import check_restore, with_script

@@ -14,7 +14,7 @@ from ethbrake_marl.extensions.search.around import Searched
 from ethbrake_marl.extensions.search.planner import Planner
 from ethbrake_marl.extensions.search.refine import refine
 from ethbrake_marl.game.harm import HARM_COUNTS
-from ethbrake_marl.shield.drivers import ShieldedDriver
+from ethbrake_marl.shields.drivers import ShieldedDriver
 from tests.fixtures.asked import Asked
 from tests.shield.test_step_shield import Remembering
 

@@ -41,7 +41,7 @@ from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.sample import Sample
-from ethbrake_marl.shield.episodes import Shielded
+from ethbrake_marl.shields.episodes import Shielded
 from ethbrake_marl.training.callback import RunCallback
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.training import Training

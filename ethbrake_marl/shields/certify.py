@@ -19,7 +19,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.physics.episode import CLOCK, at_rest
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Bools, Floats, Ints
-from ethbrake_marl.shield.members import (
+from ethbrake_marl.shields.members import (
     Members,
     all_members,
     borne_by,
@@ -30,7 +30,7 @@ from ethbrake_marl.shield.members import (
     worst_of_plan,
     worst_so_far,
 )
-from ethbrake_marl.shield.reasons import (
+from ethbrake_marl.shields.reasons import (
     CONSTANT,
     ENDED,
     NO_CERTIFICATE,
@@ -39,7 +39,7 @@ from ethbrake_marl.shield.reasons import (
     SAME_AS_PLAN,
     ShieldReason,
 )
-from ethbrake_marl.shield.running import Running, put
+from ethbrake_marl.shields.running import Running, put
 
 APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of the decision of one vehicle
 

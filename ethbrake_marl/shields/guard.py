@@ -14,9 +14,9 @@ from ethbrake_marl.agents.protocol import Agent
 from ethbrake_marl.engine.engine import Engine, Ruling
 from ethbrake_marl.errors import InvalidInput, UncertifiedStep, count_of
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.shield.comparison import difference, seen_columns
-from ethbrake_marl.shield.contract import Guarded, ShieldGuard, ShieldMode, why
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.comparison import difference, seen_columns
+from ethbrake_marl.shields.contract import Guarded, ShieldGuard, ShieldMode, why
+from ethbrake_marl.shields.step import StepShield
 
 
 class MovingAtHorizon(UserWarning):

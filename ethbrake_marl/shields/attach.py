@@ -13,8 +13,8 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.game.observations import ObservationSpec
 from ethbrake_marl.physics.state import Floats
-from ethbrake_marl.shield.contract import Guarded, ShieldGuard
-from ethbrake_marl.shield.options import ShieldOptions
+from ethbrake_marl.shields.contract import Guarded, ShieldGuard
+from ethbrake_marl.shields.options import ShieldOptions
 
 
 def proposing_agent(policy: object, where: str) -> Agent:

@@ -21,9 +21,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats
 from ethbrake_marl.scenario.catalogue import load_scenario
-from ethbrake_marl.shield.attach import Attached, Proposing
-from ethbrake_marl.shield.drivers import ShieldedDriver, shielded
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.attach import Attached, Proposing
+from ethbrake_marl.shields.drivers import ShieldedDriver, shielded
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
 Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rewards, terminated, truncated, infos
 
@@ -276,7 +276,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
         return ShieldedEnv(env, policy, **settings)  # type: ignore[arg-type]
     vec_env = getattr(sys.modules.get("stable_baselines3.common.vec_env"), "VecEnv", None)
     if vec_env is not None and isinstance(env, vec_env):
-        from ethbrake_marl.shield.sb3 import ShieldedVecEnv  # torch: only where there is such an environment
+        from ethbrake_marl.shields.sb3 import ShieldedVecEnv  # torch: only where there is such an environment
 
         return ShieldedVecEnv(env, policy, **settings)
     if isinstance(env, ParallelEnv):

@@ -12,8 +12,8 @@ from ethbrake_marl.agents.protocol import Driver
 from ethbrake_marl.errors import renumbered
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.drivers import ShieldedDriver
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.drivers import ShieldedDriver
+from ethbrake_marl.shields.step import StepShield
 
 CHUNK = 500  # worlds advanced together; limits memory, and does not change results
 

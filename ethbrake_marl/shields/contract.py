@@ -37,8 +37,8 @@ from ethbrake_marl.engine.engine import Engine, Ruling
 from ethbrake_marl.engine.memory import Memory, begin_script, renew_memory, take_memory
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.shield.reasons import ShieldReason
-from ethbrake_marl.shield.rollouts import Proposer, proposed_actions
+from ethbrake_marl.shields.reasons import ShieldReason
+from ethbrake_marl.shields.rollouts import Proposer, proposed_actions
 
 
 class ShieldMode(IntEnum):

@@ -15,8 +15,8 @@ from ethbrake_marl.game.actions import command_to_action
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Floats, Worlds
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.certify import CONSTANTS, bettered_plan, descend_constants, plan_harm
-from ethbrake_marl.shield.running import Running
+from ethbrake_marl.shields.certify import CONSTANTS, bettered_plan, descend_constants, plan_harm
+from ethbrake_marl.shields.running import Running
 
 LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions tried at the alert if a world has several possible worlds
 

@@ -13,7 +13,7 @@ from ethbrake_marl.envs.pettingzoo import SeededInside
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools
-from ethbrake_marl.shield.attach import Attached, Proposing
+from ethbrake_marl.shields.attach import Attached, Proposing
 
 
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):

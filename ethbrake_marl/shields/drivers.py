@@ -11,9 +11,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
-from ethbrake_marl.shield.checks import check_scenario
-from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.paper_hybrid import HybridAgent
+from ethbrake_marl.shields.checks import check_scenario
+from ethbrake_marl.shields.options import ShieldOptions
+from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
 
 class ShieldedDriver(ByPolicy):

@@ -18,11 +18,11 @@ from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.scenario.schema import Scenario, as_scenario
-from ethbrake_marl.shield.checks import check_amount
-from ethbrake_marl.shield.contract import ShieldGuard
-from ethbrake_marl.shield.guard import StepGuard
-from ethbrake_marl.shield.paper_hybrid import Bound, EpisodeGuard, HybridAgent
-from ethbrake_marl.shield.step import Cap, StepShield
+from ethbrake_marl.shields.checks import check_amount
+from ethbrake_marl.shields.contract import ShieldGuard
+from ethbrake_marl.shields.guard import StepGuard
+from ethbrake_marl.shields.paper_hybrid import Bound, EpisodeGuard, HybridAgent
+from ethbrake_marl.shields.step import Cap, StepShield
 
 
 @dataclass(frozen=True)

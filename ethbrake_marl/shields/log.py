@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.physics.state import Floats, Ints
-from ethbrake_marl.shield.certify import Backup, Decision
-from ethbrake_marl.shield.running import Running
+from ethbrake_marl.shields.certify import Backup, Decision
+from ethbrake_marl.shields.running import Running
 
 
 class Intervention(NamedTuple):

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.physics.state import Bools, Floats, Ints
-from ethbrake_marl.shield.certify import Backup
-from ethbrake_marl.shield.running import Running, put
+from ethbrake_marl.shields.certify import Backup
+from ethbrake_marl.shields.running import Running, put
 
 
 class StepMemory(NamedTuple):

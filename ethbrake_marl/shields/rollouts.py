@@ -24,10 +24,10 @@ from ethbrake_marl.physics.messages import Messages
 from ethbrake_marl.physics.motion import has_acted
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.certify import Backup, Decision, certify, from_now, plan_harm
-from ethbrake_marl.shield.comparison import ends_under, worlds_at
-from ethbrake_marl.shield.reasons import NO_CERTIFICATE, NOT_A_NUMBER, ShieldReason
-from ethbrake_marl.shield.running import Running
+from ethbrake_marl.shields.certify import Backup, Decision, certify, from_now, plan_harm
+from ethbrake_marl.shields.comparison import ends_under, worlds_at
+from ethbrake_marl.shields.reasons import NO_CERTIFICATE, NOT_A_NUMBER, ShieldReason
+from ethbrake_marl.shields.running import Running
 
 
 class Proposer(NamedTuple):

@@ -8,8 +8,8 @@ import numpy as np
 
 from ethbrake_marl.physics.columns import Packed
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.shield.certify import ends_of_plans
-from ethbrake_marl.shield.running import Running
+from ethbrake_marl.shields.certify import ends_of_plans
+from ethbrake_marl.shields.running import Running
 
 SLACK = 1e-9  # tolerance (m, m/s) around the range that several possible worlds predict; one alone must match exactly
 

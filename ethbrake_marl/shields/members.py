@@ -18,7 +18,7 @@ from ethbrake_marl.physics.episode import CLOCK, GOES_ON, grid_of, harm_so_far, 
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import ROW, place_rates, rows_for
 from ethbrake_marl.physics.state import Bools, Floats, Ints
-from ethbrake_marl.shield.running import Running
+from ethbrake_marl.shields.running import Running
 
 # Rows of ``Members.lines``: command of the unshielded vehicles (m/s2), latency (s), mass (t), speed limit (m/s), rates
 # at which brakes build up and are released (m/s3), and the largest harm that each vehicle may bear (m2/s2). The last

@@ -16,8 +16,8 @@ from ethbrake_marl.errors import InvalidInput, count_of, renumbered
 from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.shield.rollouts import proposed_action
-from ethbrake_marl.shield.step import StepShield
+from ethbrake_marl.shields.rollouts import proposed_action
+from ethbrake_marl.shields.step import StepShield
 
 SAME_HARM = 1e-9  # harms (m2/s2) that differ by less than this count as equal
 

@@ -51,15 +51,15 @@ from ethbrake_marl.physics.episode import Decisions
 from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.certify import CONSTANTS, Backup, Decision, certify, from_now, plan_harm
-from ethbrake_marl.shield.checks import check_amount, check_scenario
-from ethbrake_marl.shield.comparison import SLACK, ends_under
-from ethbrake_marl.shield.first_plan import best_constants, joint_constants
-from ethbrake_marl.shield.log import Intervention, interventions
-from ethbrake_marl.shield.reasons import ShieldReason
-from ethbrake_marl.shield.rollouts import Proposer, certify_by_policy, rolled_out
-from ethbrake_marl.shield.running import Running, begin_running
-from ethbrake_marl.shield.step_memory import StepMemory
+from ethbrake_marl.shields.certify import CONSTANTS, Backup, Decision, certify, from_now, plan_harm
+from ethbrake_marl.shields.checks import check_amount, check_scenario
+from ethbrake_marl.shields.comparison import SLACK, ends_under
+from ethbrake_marl.shields.first_plan import best_constants, joint_constants
+from ethbrake_marl.shields.log import Intervention, interventions
+from ethbrake_marl.shields.reasons import ShieldReason
+from ethbrake_marl.shields.rollouts import Proposer, certify_by_policy, rolled_out
+from ethbrake_marl.shields.running import Running, begin_running
+from ethbrake_marl.shields.step_memory import StepMemory
 
 Cap = Literal["baseline"]  # plan under which a vehicle's harm is its cap, the largest harm that it may bear
 

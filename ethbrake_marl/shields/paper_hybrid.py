@@ -27,8 +27,8 @@ from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.messages import refuse_untold
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.shield.checks import check_scenario
-from ethbrake_marl.shield.contract import Guarded, ShieldGuard, ShieldMode
+from ethbrake_marl.shields.checks import check_scenario
+from ethbrake_marl.shields.contract import Guarded, ShieldGuard, ShieldMode
 
 Bound = Literal["coupled", "pairwise"]  # source of H* and a*: the engine's physics, or the paper's closed form
 

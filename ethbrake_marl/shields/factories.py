@@ -5,9 +5,9 @@ from __future__ import annotations
 from ethbrake_marl.agents.protocol import Agent, Driver, Source
 from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shield.drivers import shielded
-from ethbrake_marl.shield.options import ShieldOptions
-from ethbrake_marl.shield.paper_hybrid import Bound, HybridAgent
+from ethbrake_marl.shields.drivers import shielded
+from ethbrake_marl.shields.options import ShieldOptions
+from ethbrake_marl.shields.paper_hybrid import Bound, HybridAgent
 
 
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> HybridAgent:
