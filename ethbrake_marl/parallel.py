@@ -55,8 +55,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
     """
     if ray is None and jobs in (None, 1):
-        for function, *given in calls:
-            yield function(*given)
+        for function, *arguments in calls:
+            yield function(*arguments)
         return
     with naming_extras():
         from joblib import Parallel, delayed, parallel_config
@@ -87,8 +87,8 @@ def _answer(call: bytes) -> Any:
     """
     _end_with_parent()
     with redirect_stdout(sys.stderr):
-        function, *given = pickle.loads(call)
-        return function(*given)
+        function, *arguments = pickle.loads(call)
+        return function(*arguments)
 
 
 @cache

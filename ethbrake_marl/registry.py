@@ -58,11 +58,11 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
     ``group``: its name without the prefix ``ethbrake_marl.``, for example ``agents``.
     """
-    found: dict[str, list[EntryPoint]] = {}
+    by_name: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
     for point in in_order:
-        found.setdefault(point.name, []).append(point)
-    return found
+        by_name.setdefault(point.name, []).append(point)
+    return by_name
 
 
 def giver(point: EntryPoint) -> str:
@@ -124,19 +124,19 @@ class Registry(Mapping[str, T]):
         An entry point usually defines the one part; it may define several by a dictionary. Raises ``UnknownName`` if
         there is none, and ``InvalidInput`` or ``MissingExtra`` if it cannot be loaded.
         """
-        given = points(self.group).get(name, [])
-        givers = [OURS] * (name in self._built_in) + [giver(point) for point in given]
+        candidates = points(self.group).get(name, [])
+        givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
         if len(givers) > 1:
             raise InvalidInput(
                 f"{self.kind} {name!r}: the installed packages {' and '.join(givers)} give it; uninstall all but one"
             )
         if name in self.loaded or name in self._loading:
             return [name]
-        if not given:
+        if not candidates:
             raise self.unknown(name)
         self._loading.add(name)
         try:
-            return self._load(name, given[0])
+            return self._load(name, candidates[0])
         finally:
             self._loading.discard(name)
 
@@ -144,17 +144,17 @@ class Registry(Mapping[str, T]):
         where = f"{self.kind} {name!r}, {point.value} of the installed package {giver(point)}"
         try:
             with naming_extras():
-                found = point.load()
+                value = point.load()
         except MissingExtra as error:
             raise MissingExtra(f"{self.kind} {name!r} {error}") from None
         except (Exception, SystemExit) as error:
             raise InvalidInput(f"{where}: cannot be imported: {describe_error(error)}") from error
         try:
             # An entry point that defines several parts is a dictionary of them.
-            parts = found if isinstance(found, dict) else {name: found}
+            parts = value if isinstance(value, dict) else {name: value}
             for each, part in parts.items():
-                given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
-                self._register(each, *given, **settings)
+                arguments, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
+                self._register(each, *arguments, **settings)
         except (EthBrakeError, TypeError) as error:
             raise InvalidInput(f"{where}: {error}") from error
         if point.dist is not None and giver(point) != OURS:

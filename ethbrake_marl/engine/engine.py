@@ -277,8 +277,10 @@ class Engine:
                     self.remember(self.guard.begin(self.guarded, alert, rows))
                 watched = {w: w.begun(memory, alert, rows) for w, memory in self._now.watched.items()}
                 self._now = self._now._replace(watched=watched)
-                begun = {i: begin_script(s, alert, i, self._now.stream.known) for i, s in self._remembering.items()}
-            self._change(memories=renew_memory(memories, rows, begun) if memories else begun)
+                first_memories = {
+                    i: begin_script(s, alert, i, self._now.stream.known) for i, s in self._remembering.items()
+                }
+            self._change(memories=renew_memory(memories, rows, first_memories) if memories else first_memories)
         (motion, params, _, wanted, potential, *_), rules = self.state, self._now.rules
         if self._own_grid.scripts:
             at_alert = self._now.kept(Packed.of(start.alert)).state
@@ -629,8 +631,8 @@ class Engine:
             raise InvalidInput(f"place: {worlds.n} worlds of {worlds.N} vehicles; {n} of {N} needed")
         ledger = empty_ledger(worlds) if ledger is None else ledger
         motion, clock = self._now.kept(packed_with(worlds, ledger)).state, state.clock.copy()
-        made = Decisions(clock[:, START], self.scenario.time_step_s).latest(worlds.time_s)
-        clock[:, STEP] = np.maximum(made, 0)
+        latest = Decisions(clock[:, START], self.scenario.time_step_s).latest(worlds.time_s)
+        clock[:, STEP] = np.maximum(latest, 0)
         clock[:, ENDED] = worlds.time_s >= self.scenario.horizon_s if ended is None else ended
         self._now = self._now._replace(state=state._replace(motion=motion, clock=clock), ruling=None)
 

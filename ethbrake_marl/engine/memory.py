@@ -125,10 +125,10 @@ def _check_kept(before: Memory, after: Memory, who: str) -> None:
     Such a change would make it impossible to restart single rows. ``before`` and ``after`` are the memory before and
     after the call. ``who`` begins the message.
     """
-    began, told = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
-    if began != told:
+    began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
+    if began != kinds:
         raise InvalidInput(
-            f"{who}: act gave a memory of another form ({told}) than it was given ({began}); keys, shapes and dtypes"
+            f"{who}: act gave a memory of another form ({kinds}) than it was given ({began}); keys, shapes and dtypes"
             " are those of begin"
         )
 
@@ -197,15 +197,15 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
     except Exception as error:
         raise _named(error, script, "act", worlds, vehicle) from error
     command, memory = answer if remembers else (answer, None)
-    given = np.asarray(command)
-    if given.shape != (worlds.n,) or given.dtype.kind not in "fiub":
-        short = given.ndim > 0 and len(given) < worlds.n
-        row = len(given) if short else 0
+    commands = np.asarray(command)
+    if commands.shape != (worlds.n,) or commands.dtype.kind not in "fiub":
+        short = commands.ndim > 0 and len(commands) < worlds.n
+        row = len(commands) if short else 0
         raise AgentFailed(
             getattr(script, "name", type(script).__name__),
             row if worlds.n else None,
-            f"vehicle_{vehicle + 1} at {worlds.time_s[row : row + 1].min(initial=np.inf):.2f} s: gave {given.dtype} of"
-            f" shape {given.shape}; one number per world is needed, shape ({worlds.n},)",
+            f"vehicle_{vehicle + 1} at {worlds.time_s[row : row + 1].min(initial=np.inf):.2f} s: gave {commands.dtype}"
+            f" of shape {commands.shape}; one number per world is needed, shape ({worlds.n},)",
         )
     return command, memory
 

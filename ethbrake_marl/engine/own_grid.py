@@ -136,13 +136,13 @@ class OwnGrid:
         reward, harm = np.zeros((n, N)), np.zeros((2, n))
         stopped, failed = np.zeros(n, np.bool_), np.zeros(n, np.int64)
         first_s = params[:, column.latency : column.mass][:, vehicles].T
-        made = np.maximum(Decisions(first_s, step_s).before(motion[:, column.time]), 0.0)
-        due = np.where(running, np.maximum(Decisions(first_s, step_s).before(until_s), 0.0), made)
-        while (made < due).any():
-            next_s = np.where(made < due, first_s + made * step_s, np.inf)
+        times = np.maximum(Decisions(first_s, step_s).before(motion[:, column.time]), 0.0)
+        due = np.where(running, np.maximum(Decisions(first_s, step_s).before(until_s), 0.0), times)
+        while (times < due).any():
+            next_s = np.where(times < due, first_s + times * step_s, np.inf)
             moment = next_s.min(axis=0)
             asked = next_s <= moment + ROUNDING * step_s
-            asked &= made < due
+            asked &= times < due
             now = motion[:, column.time]
             moment = np.where((moment < np.inf) & (moment > now + ROUNDING * step_s), moment, now)
             ahead, reward_ahead, outcome = self._look_ahead(state, rules, moment, until_s, actions)
@@ -154,7 +154,7 @@ class OwnGrid:
                     command = np.where(here, command, 0.0)
                     wanted[here, vehicle] = within_capacity(command, worlds, vehicle, script, here)[here]
                     memories = memories | {vehicle: renew_memory(after, idle, take_memory(before, idle))}
-            changed = (wanted != wanted_so_far)[:, vehicles] & (made > 0.0).T  # the first waits for the latency anyway
+            changed = (wanted != wanted_so_far)[:, vehicles] & (times > 0.0).T  # the first waits for the latency anyway
             stopping = (moment > now) & changed.any(axis=1) & (outcome[FAILED] == 0.0)
             failed[:] = np.where(outcome[FAILED] != 0.0, outcome[FAILED], failed)
             if stopping.any():
@@ -164,8 +164,8 @@ class OwnGrid:
                 harm[:, stopping] += outcome[: len(harm), stopping]
                 stopped[stopping] = True
             wanted_so_far[:] = wanted
-            made += asked
-            made = np.where(failed != 0, due, made)
+            times += asked
+            times = np.where(failed != 0, due, times)
         return Way(reward, harm, stopped, failed, np.empty(0), memories, tuple(stops))
 
     def _look_ahead(

@@ -151,26 +151,26 @@ class ProfileProblem(NamedTuple):
         """
         if (self.clock[:, CLOCK.AIM] == WHOLE).all():
             return dict(zip(HARM_COUNTS, self.follow(profiles), strict=True))
-        found: dict[HarmCount, Floats] = {}
+        harms: dict[HarmCount, Floats] = {}
         for harm_count, pairs in zip(HARM_COUNTS, self.follow_pairs(profiles), strict=True):
             shares = np.zeros(self.mass.shape)
             shares[:, :-1] = self.weights[:, 0, :-1] * pairs
             shares[:, 1:] += self.weights[:, 1, :-1] * pairs
             largest = self.clock[:, CLOCK.AIM] == LARGEST
-            found[harm_count] = np.where(largest, shares.max(axis=1), sum_rows(shares))
-        return found
+            harms[harm_count] = np.where(largest, shares.max(axis=1), sum_rows(shares))
+        return harms
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
         """Return the harm that each vehicle bears under one profile per world, count of harm -> [n, N] m2/s2.
 
         There is no column for an obstacle. It equals the engine's to the bit. Raises what ``follow`` raises.
         """
-        obstacle, found = int(np.isinf(self.mass[:, 0]).any()), {}
+        obstacle, harms = int(np.isinf(self.mass[:, 0]).any()), {}
         for harm_count, pairs in zip(HARM_COUNTS, self.follow_pairs(profiles), strict=True):
-            found[harm_count] = split(np.ascontiguousarray(pairs[:, obstacle:]), self.mass[:, obstacle:].copy())
+            harms[harm_count] = split(np.ascontiguousarray(pairs[:, obstacle:]), self.mass[:, obstacle:].copy())
             if obstacle:
-                found[harm_count][:, 0] += pairs[:, 0]
-        return found
+                harms[harm_count][:, 0] += pairs[:, 0]
+        return harms
 
     def follow_pairs(self, profiles: Profiles) -> tuple[Floats, Floats]:
         """Return the harm of each pair, first-impact and total, under one profile per world, each [n, P] m2/s2.
@@ -253,7 +253,7 @@ def profile_problem(
     command[:, chosen] = 0.0
     obstacle = worlds.obstacle_ahead
     if obstacle.any() or written_out:
-        found = profile_problem(
+        problem = profile_problem(
             worlds.with_post_ahead(np.full(worlds.n, horizon_s)).with_obstacle(),
             [i + 1 for i in chosen.tolist()],
             harm_count=harm_count,
@@ -264,11 +264,11 @@ def profile_problem(
         )
         if not obstacle.all():  # the identity of a world must not depend on the other worlds
             free = np.flatnonzero(~obstacle)
-            found.identity[free] = profile_problem(
+            problem.identity[free] = profile_problem(
                 worlds.take(free), vehicles, harm_count=harm_count, horizon_s=horizon_s, time_step_s=time_step_s,
                 others_mps2=command[free], deciders=deciders,
             ).identity  # fmt: skip
-        return found
+        return problem
     decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
     first = worlds.first_decision_s(decide.tolist())
     if not (first < horizon_s).all():

@@ -152,14 +152,14 @@ class Stream:
         alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
         if self._pool is not None:
             alert = Worlds.concatenate([self._pool.part(self._next, self._drawn - first).alert, alert])
-        start, kept, failed = leaving_out_failed(lambda rows: self.prepare(alert.take(rows)), np.arange(alert.n))
+        start, starts, failed = leaving_out_failed(lambda rows: self.prepare(alert.take(rows)), np.arange(alert.n))
         if start is None:
             raise PhysicsError(failed)
         for row, reason in failed.items():
             warnings.warn(FailedWorld(f"world {first + row} of seed {self.seed}: {reason}; left out"), stacklevel=2)
         if failed:
-            later = np.searchsorted(kept, np.arange(alert.n)) % len(kept)
-            start = self.prepare(alert.take(kept[later]))
+            later = np.searchsorted(starts, np.arange(alert.n)) % len(starts)
+            start = self.prepare(alert.take(starts[later]))
         self._pool, self._next = start, 0
         self._drawn += size
 

@@ -33,25 +33,25 @@ def describe_worlds(engine: Engine) -> Columns:
     Raises ``InvalidInput`` for worlds whose draw is unknown. These are worlds that the caller passed, after a snapshot
     was restored, and a world that could not be advanced to its first decision, so that another world replaced it.
     """
-    numbers, given = engine.roster.numbers, engine.roster.given
+    numbers, placed = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
-    own, found = numbers < 0, dict[str, NDArray[Any]]()
+    own, columns = numbers < 0, dict[str, NDArray[Any]]()
     if own.any():
-        if given is None:
+        if placed is None:
             raise InvalidInput(
                 "describe_worlds: these episodes go on from a snapshot, which does not keep worlds that were given;"
                 " ask again once they have ended, or after a reset"
             )
-        found = QUANTITY.columns(given)
+        columns = QUANTITY.columns(placed)
     if not own.all():
         sample = _drawn_again(engine, numbers[~own])
-        drawn, started = {**sample.kinds, **QUANTITY.columns(sample.worlds)}, found
-        found = {name: np.zeros(engine.n, column.dtype) for name, column in drawn.items()}
+        drawn, started = {**sample.kinds, **QUANTITY.columns(sample.worlds)}, columns
+        columns = {name: np.zeros(engine.n, column.dtype) for name, column in drawn.items()}
         for name, column in drawn.items():
-            found[name][~own] = column
+            columns[name][~own] = column
             if name in started:
-                found[name][own] = started[name][own]
-    return {**found, **named}
+                columns[name][own] = started[name][own]
+    return {**columns, **named}
 
 
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:

@@ -179,7 +179,7 @@ class Report(NamedTuple):
             stepped: [n] worlds in which values about the last step are given; they are 0 in the others.
 
         """
-        columns: dict[str, NDArray[Any]] = {name: told[:, vehicle] for name, told in self.columns().items()}
+        columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}
         columns["collided"] = columns["collided"] == 1.0
         columns["chosen_action"] = columns["chosen_action"].astype(np.float32)[:, np.newaxis]
         columns["cost"] = np.where(stepped, self.cost, 0.0)

@@ -130,8 +130,8 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | Non
         name = names[vehicle]
         if actions.get(name) is None:
             if engine.guard is not None:
-                given = {i: actions[names[i]] for i in engine.learners if actions.get(names[i]) is not None}
-                return {i: checked_action(each, (1,), names[i], count) for i, each in given.items()}
+                chosen = {i: actions[names[i]] for i in engine.learners if actions.get(names[i]) is not None}
+                return {i: checked_action(each, (1,), names[i], count) for i, each in chosen.items()}
             raise InvalidInput(f"step: no action for the learner {name}")
         action = actions[name]
         is_plain = type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind in "fiu"

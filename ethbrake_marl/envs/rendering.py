@@ -116,14 +116,14 @@ class Scene(NamedTuple):
             lines.append(f"vehicle_{i + 1:<3} {learns:6}  {words}".rstrip())
         for struck in self.struck:
             road[column(self.front_m[max(struck.pair + 1, 0)])] = "*"
-        told = [
+        facts = [
             f"{self.title}  {self.time_s:.2f} s after the alert{'  (ended)' if self.ended else ''}",
             "".join(road),
             *reversed(lines),
             f"harm {self.first_harm:.2f} m2/s2 by first impacts, {self.total_harm:.2f} in total",
             *(f"impact: {struck.who} at {struck.speed}, {struck.time_s:.2f} s" for struck in self.struck),
         ]
-        return "\n".join([*told, self.shield_words] if self.shield is not None else told) + "\n"
+        return "\n".join([*facts, self.shield_words] if self.shield is not None else facts) + "\n"
 
     def frame(self) -> Frame:
         """Return the scene as a picture [H, W, 3] uint8; the same scene gives the same bytes."""
@@ -294,10 +294,10 @@ def _write_road(text: ImageDraw.ImageDraw, scene: Scene) -> None:
         free = math.inf if high else middle - half
     if scene.struck:  # name the hardest current impact of each pair, at most the two hardest
         hardest = {struck.pair: struck for struck in sorted(scene.struck, key=lambda struck: struck.closing_mps)}
-        told = sorted(hardest.values(), key=lambda struck: -struck.closing_mps)[:2]
-        words = "impact of " + ", ".join(f"{struck.who} at {struck.speed}" for struck in told)
+        hits = sorted(hardest.values(), key=lambda struck: -struck.closing_mps)[:2]
+        words = "impact of " + ", ".join(f"{struck.who} at {struck.speed}" for struck in hits)
         half = _font(15).getlength(words) / 2
-        middle = sum(_contact(scene, struck) for struck in told) / len(told)
+        middle = sum(_contact(scene, struck) for struck in hits) / len(hits)
         middle = min(max(middle, _MARGIN + half), WIDTH - _MARGIN - half)
         text.rectangle((middle - half - 5, 34, middle + half + 5, 54), fill=_FLASH)
         text.text((middle, 44), words, _INK, _font(15), anchor="mm")

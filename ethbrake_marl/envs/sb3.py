@@ -212,9 +212,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
         if len(ended):
             self._close_episodes(ended, step, infos)
             engine.renew(ended)
-            told = Report.of(engine, rows=ended)
-            self._begun[ended] = told.values
-            self._begun_shield = renew_memory(self._begun_shield, ended, told.shield) if told.shield else {}
+            report = Report.of(engine, rows=ended)
+            self._begun[ended] = report.values
+            self._begun_shield = renew_memory(self._begun_shield, ended, report.shield) if report.shield else {}
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
@@ -276,10 +276,12 @@ class EthBrakeVecEnv(Begun, VecEnv):
         ``step`` is the last step; ``infos``, one dictionary per row, is changed in place.
         """
         rows, final = self._rows(ended), self._observe(ended)
-        told = Report.of(self.engine, step, ended).plain_infos(self._learners)
+        plain = Report.of(self.engine, step, ended).plain_infos(self._learners)
         truncated = self._by_row(step.truncated[ended]).tolist()
         gained, steps = self._return.take(rows).tolist(), self._steps.take(rows).tolist()
-        for row, info, cut, seen, gain, count in zip(rows.tolist(), told, truncated, final, gained, steps, strict=True):
+        for row, info, cut, seen, gain, count in zip(
+            rows.tolist(), plain, truncated, final, gained, steps, strict=True
+        ):
             info["TimeLimit.truncated"] = cut and not self.horizon_is_end
             info["terminal_observation"] = seen.copy()
             info["episode"] = {"r": gain, "l": count, "t": 0.0}
@@ -296,8 +298,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """Infos at the start of the running episodes, one dictionary per row, computed at each access."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
-        begun = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
-        return begun.plain_infos(self._learners)
+        report = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
+        return report.plain_infos(self._learners)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:

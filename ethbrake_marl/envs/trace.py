@@ -82,8 +82,8 @@ class Motion:
             impacts = _rows(world, command, until)
             first = (front_m + (post.obstacle_gap_m - moved.obstacle_gap_m))[:, np.newaxis]
             fronts = np.concatenate([first, first - np.cumsum(moved.gaps_m + BODY_M, axis=1)], axis=1)
-            told = zip(impacts.pair.tolist(), impacts.closing_speed_mps.tolist(), impacts.time_s.tolist(), strict=True)
-            struck += [Struck(*each) for each in told]
+            hits = zip(impacts.pair.tolist(), impacts.closing_speed_mps.tolist(), impacts.time_s.tolist(), strict=True)
+            struck += [Struck(*each) for each in hits]
             by_then = impacts.time_s <= np.append(now, until)[:, np.newaxis]
             each_harm = impacts.closing_speed_mps * impacts.closing_speed_mps
             counted = [(by_then * (each_harm * impacts.first)).sum(axis=1), (by_then * each_harm).sum(axis=1)]

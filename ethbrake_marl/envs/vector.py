@@ -164,8 +164,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
             self._restart(seed, options)
         else:
             self._renew(rows, seed, options or {})
-        told = Report.of(self.engine).batch_info(self.learner, rows, np.zeros(self.num_envs, np.bool_))
-        return self.engine.observe(self.learner), told
+        info = Report.of(self.engine).batch_info(self.learner, rows, np.zeros(self.num_envs, np.bool_))
+        return self.engine.observe(self.learner), info
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [n, 1] in [-1, 1].

@@ -142,8 +142,8 @@ def explain(document: Document, error: ValidationError, wording: Wording) -> Inv
     path = path_of(shown)
     absent = shown["type"] == "missing" and len(path) == 1
     where = document.file if absent else document.where(path)
-    told = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
-    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{told}")
+    more_mistakes = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
+    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{more_mistakes}")
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -234,10 +234,10 @@ def _show(detail: ErrorDetails) -> str:
 
     A float instead of a whole number keeps its decimal point.
     """
-    given = detail["input"]
-    if isinstance(given, BaseModel) or not detail["loc"]:
+    value = detail["input"]
+    if isinstance(value, BaseModel) or not detail["loc"]:
         return ""
-    return repr(given) if detail["type"] == "int_type" and isinstance(given, float) else flow_text(given, 60)
+    return repr(value) if detail["type"] == "int_type" and isinstance(value, float) else flow_text(value, 60)
 
 
 def _place(path: YamlPath, wording: Wording) -> str:
@@ -248,8 +248,8 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 def _unquote(detail: ErrorDetails) -> str:
     """Return advice for a number that stands in quotes and so is a text; empty for any other mistake."""
-    given = detail["input"]
-    quoted = detail["type"] == "float_type" and isinstance(given, str) and parse_numeral(given) is not None
+    value = detail["input"]
+    quoted = detail["type"] == "float_type" and isinstance(value, str) and parse_numeral(value) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""
 
 

@@ -40,16 +40,16 @@ class Override:
         Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated key, and a value that is not valid
         YAML.
         """
-        found: list[Override] = []
+        overrides: list[Override] = []
         for text in texts:
             key, equals, value = text.partition("=")
             path = tuple(part.strip() for part in key.split("."))
             if not equals or not all(path):
                 raise InvalidInput(f"--set {text!r}: must be KEY=VALUE or KEY.KEY=VALUE, for instance gamma=0.99")
-            if any(each.path == path for each in found):
+            if any(each.path == path for each in overrides):
                 raise InvalidInput(f"--set {'.'.join(path)}: is given twice")
-            found.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
-        return found
+            overrides.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
+        return overrides
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:

@@ -50,10 +50,10 @@ def files_run() -> dict[str, str]:
 
     If several files have the same name, their hashes are joined by commas.
     """
-    found = {name: set(several) for name, several in _READ.items()}
+    files = {name: set(several) for name, several in _READ.items()}
     for path, (sha256, _) in _RUN.items():
-        found.setdefault(path.name, set()).add(sha256)
-    return {name: ", ".join(sorted(several)) for name, several in found.items()}
+        files.setdefault(path.name, set()).add(sha256)
+    return {name: ", ".join(sorted(several)) for name, several in files.items()}
 
 
 def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:

@@ -56,11 +56,11 @@ class Estimate:
 
         A missing estimate becomes None under both keys.
         """
-        found: dict[str, Any] = {}
+        cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
-            told = {"value": None, "interval": None} if estimate is None else estimate.to_json()
-            found |= {name: told["value"], f"{name}_interval": told["interval"]}
-        return found
+            cell = {"value": None, "interval": None} if estimate is None else estimate.to_json()
+            cells |= {name: cell["value"], f"{name}_interval": cell["interval"]}
+        return cells
 
 
 class Shown(NamedTuple):
@@ -168,9 +168,9 @@ class Sheet:
 
     def only(self, columns: Iterable[int]) -> Sheet:
         """Return the table with only these columns, by index from 0."""
-        kept = list(columns)
-        rows = [row if isinstance(row, str) else [row[k] for k in kept if k < len(row)] for row in self.rows]
-        return replace(self, columns=[self.columns[k] for k in kept], rows=rows)
+        names = list(columns)
+        rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
+        return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
         """Return the indices of the columns in which some row has a value; without rows, all indices."""
@@ -194,8 +194,8 @@ class Sheet:
             title=Text(self.title, "table.title") if self.title else None, title_justify="left",
         )  # fmt: skip
         columns = self._columns()
-        kept = [k for k, column in enumerate(columns) if width >= WIDE or not column.wide]
-        for column in (columns[k] for k in kept):
+        shown = [k for k, column in enumerate(columns) if width >= WIDE or not column.wide]
+        for column in (columns[k] for k in shown):
             heading = Text(plain_text(column.short or column.heading, keep="\n"))
             if column.text:
                 table.add_column(heading, overflow="fold")
@@ -207,7 +207,7 @@ class Sheet:
                 table.add_row(Text(plain_text(row), style="dim"))
                 continue
             cells = []
-            for k in kept:
+            for k in shown:
                 how, (value, interval) = columns[k].interval, row[k]
                 below = f"\n{interval}" if interval and how == "below" else ""
                 first, line, rest = ((row[k].in_words if how == "beside" else value) + below).partition("\n")
@@ -265,15 +265,15 @@ class Sheet:
 
     def json(self) -> list[dict[str, Any]]:
         """Return one object per row, without sections: cells by column name, estimates with their intervals."""
-        columns, found = self._columns(), []
+        columns, rows = self._columns(), []
         for row in self.rows:
             cells = {} if isinstance(row, str) else dict(zip(columns, row, strict=False))
-            told: dict[str, Any] = {}
+            values: dict[str, Any] = {}
             for column, cell in cells.items():
                 estimate = isinstance(cell, Estimate)
-                told |= Estimate.side_by_side({column.name: cell}) if estimate else {column.name: cell}
-            found += [told] if cells else []
-        return found
+                values |= Estimate.side_by_side({column.name: cell}) if estimate else {column.name: cell}
+            rows += [values] if cells else []
+        return rows
 
     def csv(self) -> str:
         """Return CSV text, one line per row.

@@ -25,15 +25,16 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str, count:
     exceed the bounds by one float32 step; such a value counts as -1 or 1. ``names`` names the vehicles in the message.
     With a ``count``, ``action`` holds indices of ``count`` discrete actions instead (``index_to_action``).
     """
-    given = _numbers(action, names) if count is None else index_to_action(action, count, names)
-    if given.shape != shape and _longer_axes(given.shape) != _longer_axes(shape):
-        raise InvalidInput(f"action of {names}: shape {given.shape}; {shape} is needed")
-    good = (given >= -LARGEST) & (given <= LARGEST)
+    number = _numbers(action, names) if count is None else index_to_action(action, count, names)
+    if number.shape != shape and _longer_axes(number.shape) != _longer_axes(shape):
+        raise InvalidInput(f"action of {names}: shape {number.shape}; {shape} is needed")
+    good = (number >= -LARGEST) & (number <= LARGEST)
     if not good.all():
         raise InvalidInput(
-            f"action of {names}: {float(given[~good].flat[0])!r}; must be in [-1, 1], from full braking to full driving"
+            f"action of {names}: {float(number[~good].flat[0])!r}; must be in [-1, 1], from full braking to full"
+            " driving"
         )
-    return given.reshape(shape).clip(-1.0, 1.0)
+    return number.reshape(shape).clip(-1.0, 1.0)
 
 
 def own_actions(actions: ArrayLike, names: str, count: int | None = None) -> NDArray[Any]:

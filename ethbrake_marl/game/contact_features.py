@@ -67,7 +67,7 @@ def observe_contacts(
         1 if state.shape[1] > of.obstacle else 0,
     )  # vehicle i is column at + i; an obstacle is column 0
     line, table = np.zeros((ROW.OF_BUILD_UP, N + at)), np.zeros((ROW.OF_BUILD_UP, N + at))
-    found, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
+    contacts, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
     no_pieces = np.zeros((N, 0))  # no vehicle knows the future pieces of another one
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
@@ -87,10 +87,10 @@ def observe_contacts(
                     table[ROW.COMMAND, at + i] = -params[k, of.braking + i]
                 elif c == 2:
                     table[ROW.COMMAND, at + i] = params[k, of.driving + i]
-                if forecast_contacts(table, params[k, of.restitution], FORECAST_S, found) != FLAG.DONE:
+                if forecast_contacts(table, params[k, of.restitution], FORECAST_S, contacts) != FLAG.DONE:
                     failed[k] = True
                     break
-                _tell(table, found, at + i, first, last, time_step, value)
+                _tell(table, contacts, at + i, first, last, time_step, value)
                 for f in range(_OF_COMMAND + _FAR if out.shape[2] > _NEAR else _OF_COMMAND):
                     column = c * _OF_COMMAND + f if f < _OF_COMMAND else _NEAR + c * _FAR + f - _OF_COMMAND
                     scaled = value[f] * features[0, column]
@@ -118,13 +118,13 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
     braking, latency, mass, limit, news = of.braking, of.latency, of.mass, of.limit, of.news
     by_link, time = params.shape[1] > of.own_latency, state[k, of.time]
     own_part = of.own_latency if by_link else latency
-    first, last, told = i, i, params[k, of.messages :]
+    first, last, messages = i, i, params[k, of.messages :]
     while first > 0 and time >= params[k, news + i * N + first - 1 if by_link else latency + i]:
-        if not knows_line(told, N, i, first - 1, time):
+        if not knows_line(messages, N, i, first - 1, time):
             break
         first -= 1
     while last < N - 1 and time >= params[k, news + i * N + last + 1 if by_link else latency + i]:
-        if not knows_line(told, N, i, last + 1, time):
+        if not knows_line(messages, N, i, last + 1, time):
             break
         last += 1
     for j in range(N):

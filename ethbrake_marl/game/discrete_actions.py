@@ -40,11 +40,11 @@ def checked_indices(indices: ArrayLike, count: int, names: str) -> Ints:
         real_numbers(indices)
     except ValueError as error:
         raise InvalidInput(f"action of {names}: {indices!r} {error}; {right}") from None
-    given = np.asarray(indices)
-    if given.dtype.hasobject:
-        given = np.array(given.tolist())
-    good = (given >= 0) & (given < count) & (np.floor(given) == given)
-    wrong = given[~good] if not good.all() else given[given.dtype.kind not in "iu"]
+    numbers = np.asarray(indices)
+    if numbers.dtype.hasobject:
+        numbers = np.array(numbers.tolist())
+    good = (numbers >= 0) & (numbers < count) & (np.floor(numbers) == numbers)
+    wrong = numbers[~good] if not good.all() else numbers[numbers.dtype.kind not in "iu"]
     if wrong.size:
         raise InvalidInput(f"action of {names}: {wrong.ravel().tolist()[0]!r}; {right}")
-    return given.astype(np.int64)
+    return numbers.astype(np.int64)

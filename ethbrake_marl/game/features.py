@@ -161,22 +161,22 @@ class RegisteredFeature:
 
         """
         name = self.feature.name
-        given = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
-        value = np.asarray(self.function(*given))
+        arguments = (worlds, vehicle) if neighbour is None else (worlds, vehicle, neighbour)
+        value = np.asarray(self.function(*arguments))
         if value.shape != (worlds.n,) or value.dtype.kind not in "fiub":
             raise InvalidInput(
                 f"feature {name!r}: gave {value.dtype} of shape {value.shape}; must be numbers of shape ({worlds.n},),"
                 " one per world"
             )
-        told = np.where(counts, value, self.unknown)
-        if not np.isfinite(told).all():
-            world = int(np.argmin(np.isfinite(told)))
+        values = np.where(counts, value, self.unknown)
+        if not np.isfinite(values).all():
+            world = int(np.argmin(np.isfinite(values)))
             step = "" if steps is None else f" after step {int(steps[world])}"
             raise InvalidInput(
-                f"feature {name!r}: is {told[world]} for vehicle_{vehicle + 1} in world {world} at"
+                f"feature {name!r}: is {values[world]} for vehicle_{vehicle + 1} in world {world} at"
                 f" {worlds.time_s[world]:g} s{step}; must be finite"
             )
-        return self.scaled(told)
+        return self.scaled(values)
 
 
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
@@ -184,8 +184,8 @@ def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
 
     It is 0 if the present state is known. Both are indices from 0.
     """
-    told = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
-    return np.where(np.isfinite(told), told, 0.0)
+    ages = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
+    return np.where(np.isfinite(ages), ages, 0.0)
 
 
 def intent(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:

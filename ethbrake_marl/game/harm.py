@@ -198,11 +198,11 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
 @compiled
 def _powers(shares: Floats, exponent: float) -> Floats:
     """Return ``x^exponent`` of each x >= 0 in ``shares`` [k], limited to 1, [k]; the same bits on every processor."""
-    found = np.zeros(len(shares))
+    result = np.zeros(len(shares))
     for i in range(len(shares)):
         if shares[i] > 0.0:
-            found[i] = min(exp(exponent * log(shares[i])), 1.0)
-    return found
+            result[i] = min(exp(exponent * log(shares[i])), 1.0)
+    return result
 
 
 class InjuryCurve(NamedTuple):
@@ -250,5 +250,5 @@ def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"],
         raise unknown_name("injury curve", curve, INJURY_CURVES)
     if side not in ("front", "rear"):
         raise unknown_name("side", side, ("front", "rear"))
-    found = INJURY_CURVES[curve]
-    return (found.front if side == "front" else found.rear)(np.abs(np.asarray(speed_change_mps, np.float64)))
+    points = INJURY_CURVES[curve]
+    return (points.front if side == "front" else points.rear)(np.abs(np.asarray(speed_change_mps, np.float64)))

@@ -63,21 +63,21 @@ class EpisodeImpacts:
             some: worlds whose new impacts are added, a mask [n].
 
         """
-        parts, found = list(way), [self.rows]
+        parts, blocks = list(way), [self.rows]
         for k, (before, command_mps2, until_s) in enumerate(parts, 1):
             moving = until_s > before.time_s
             if k == len(parts):
                 moving |= until_s == 0.0  # an impact at the very alert
-            found.append(impacts_within(before, command_mps2, until_s, np.flatnonzero(some & moving)))
-        return EpisodeImpacts.of(self.worlds, found)
+            blocks.append(impacts_within(before, command_mps2, until_s, np.flatnonzero(some & moving)))
+        return EpisodeImpacts.of(self.worlds, blocks)
 
     def renewed(self, rows: Ints, alert: Worlds) -> EpisodeImpacts:
         """Return the impacts after new episodes have begun in some rows; these have no impacts yet.
 
         ``rows``: indices of the new episodes, [k]; ``alert``: their k worlds at the alert.
         """
-        kept = ~np.isin(self.rows.world, rows)
-        return EpisodeImpacts.of(self.worlds.assign(rows, alert), [_some(self.rows, kept)])
+        others = ~np.isin(self.rows.world, rows)
+        return EpisodeImpacts.of(self.worlds.assign(rows, alert), [_some(self.rows, others)])
 
     def take(self, rows: Ints) -> EpisodeImpacts:
         """Return the impacts of the episodes at the indices ``rows`` [k]; an index may occur several times."""
@@ -133,6 +133,6 @@ def impacts_within(before: Worlds, command_mps2: Floats, until_s: Floats, rows: 
         rows: indices of the worlds to simulate, [k].
 
     """
-    found = advance(before.take(rows), command_mps2[rows], until_s=until_s[rows], record=True)[1].rows
-    assert found is not None  # they were asked for
-    return replace(found, world=rows[found.world])
+    impacts = advance(before.take(rows), command_mps2[rows], until_s=until_s[rows], record=True)[1].rows
+    assert impacts is not None  # they were asked for
+    return replace(impacts, world=rows[impacts.world])

@@ -15,19 +15,19 @@ from ethbrake_marl.registry import Part
 
 
 def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> MeasureFunction:
-    def told(episodes: EpisodeImpacts) -> Floats:
-        rows, found = episodes.rows, np.zeros(episodes.worlds.speeds_mps.shape)
+    def measure(episodes: EpisodeImpacts) -> Floats:
+        rows, harm = episodes.rows, np.zeros(episodes.worlds.speeds_mps.shape)
         struck = rows.pair >= 0  # an obstacle ahead is no vehicle
         world = np.concatenate([rows.world, rows.world[struck]])
         vehicle = np.concatenate([rows.pair + 1, rows.pair[struck]])
         front, rear = np.abs(rows.rear_speed_change_mps), np.abs(rows.front_speed_change_mps[struck])
         p = np.concatenate([injury_probability(front, "front", curve), injury_probability(rear, "rear", curve)])
         if rule == "_every":
-            np.add.at(found, (world, vehicle), p)
+            np.add.at(harm, (world, vehicle), p)
         else:  # of several entries for one vehicle the last one stays, which is that of the largest change
             order = np.argsort(np.concatenate([front, rear]), kind="stable")
-            found[world[order], vehicle[order]] = p[order]
-        return 1_000.0 * (found if rule == "_vehicle" else found.sum(axis=1))
+            harm[world[order], vehicle[order]] = p[order]
+        return 1_000.0 * (harm if rule == "_vehicle" else harm.sum(axis=1))
 
     each = {
         "": "summed over the vehicles, each by its largest change of speed",
@@ -35,10 +35,10 @@ def _injury(curve: str, rule: Literal["", "_vehicle", "_every"]) -> MeasureFunct
         "_every": "summed over every impact, as if each met other people",
     }
     about = INJURY_CURVES[curve]
-    told.__doc__ = (
+    measure.__doc__ = (
         f"Injuries of {about.injury} in 1,000 lines, {each[rule]}: {about.formula}; dv in m/s ({about.source})."
     )
-    return told
+    return measure
 
 
 _RULES: tuple[Literal["", "_vehicle", "_every"], ...] = ("", "_vehicle", "_every")

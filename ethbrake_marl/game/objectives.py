@@ -141,8 +141,8 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     parsed = tuple(parse_objective(text) for text in each)
     for text, objective in zip(each, parsed, strict=True):
         if objective.weights and len(objective.weights) != vehicles:
-            given = len(objective.weights)
-            raise InvalidInput(f"objective {text!r}: {given} weights; {vehicles} vehicles need {vehicles}")
+            names = len(objective.weights)
+            raise InvalidInput(f"objective {text!r}: {names} weights; {vehicles} vehicles need {vehicles}")
     return parsed
 
 
@@ -158,8 +158,8 @@ def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[O
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
     no_sums = any(OBJECTIVES[each.kind].weights is None for each in objectives)  # only these may read changes of speed
     changes = ledger.speed_changes(harm_count) if no_sums else 2 * (np.full(ledger.mass_t.shape, np.nan),)
-    told = *harms, ledger.mass_t, *changes, ledger.harm_weight
-    harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in told))  # read-only views
+    arrays = *harms, ledger.mass_t, *changes, ledger.harm_weight
+    harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in arrays))  # read-only views
     return np.stack([OBJECTIVES[o.kind].amount(o, harm, i) for i, o in enumerate(objectives)], axis=1)
 
 
@@ -177,11 +177,11 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
 
     """
     sums = [OBJECTIVES[each.kind].weights is not None for each in objectives]
-    found = objective_harm(after.since(before), harm_count, objectives) if any(sums) else 0.0
+    harm = objective_harm(after.since(before), harm_count, objectives) if any(sums) else 0.0
     if all(sums):
-        return np.asarray(found)
+        return np.asarray(harm)
     whole = objective_harm(after, harm_count, objectives) - objective_harm(before, harm_count, objectives)
-    return np.where(sums, found, whole)
+    return np.where(sums, harm, whole)
 
 
 def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, bool]:
@@ -249,21 +249,21 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
     def amount(_: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
         try:
-            given = np.asarray(function(harm, vehicle))
+            harms = np.asarray(function(harm, vehicle))
         except Exception as error:
             raise InvalidInput(f"objective {name!r}: of vehicle_{vehicle + 1}: {describe_error(error)}") from error
         worlds = len(harm.whole)
-        if given.shape != (worlds,) or given.dtype.kind not in "fiub":
+        if harms.shape != (worlds,) or harms.dtype.kind not in "fiub":
             raise InvalidInput(
-                f"objective {name!r}: gave {given.dtype} of shape {given.shape}; must be numbers of shape ({worlds},),"
+                f"objective {name!r}: gave {harms.dtype} of shape {harms.shape}; must be numbers of shape ({worlds},),"
                 " one per world"
             )
-        if not np.isfinite(given).all():
-            world = int(np.argmin(np.isfinite(given)))
+        if not np.isfinite(harms).all():
+            world = int(np.argmin(np.isfinite(harms)))
             raise InvalidInput(
-                f"objective {name!r}: is {given[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
+                f"objective {name!r}: is {harms[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
             )
-        return given.astype(np.float64)
+        return harms.astype(np.float64)
 
     entry = Kind(name, " ".join((function.__doc__ or "").split()), amount, function)
     OBJECTIVES.add(name, entry, lambda kind: kind.function is function)

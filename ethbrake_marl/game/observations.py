@@ -272,13 +272,13 @@ class Plan(NamedTuple):
         if says:
             _hide_untold(state, params, vehicles, *self.scaling[:3], whole)
         if self.contacts is not None:
-            found = np.zeros((*shape, self.contacts.features.shape[1]), np.float32)
+            features = np.zeros((*shape, self.contacts.features.shape[1]), np.float32)
             failed = np.zeros(len(state), np.bool_)
-            observe_contacts(state, params, vehicles, *self.contacts, found, failed)
+            observe_contacts(state, params, vehicles, *self.contacts, features, failed)
             if failed.any():
                 reason = f"a forecast of contacts could not look {FORECAST_S:g} s ahead"
                 raise PhysicsError({k: reason for k in np.flatnonzero(failed).tolist()})
-            whole = np.concatenate([whole, found], axis=2)
+            whole = np.concatenate([whole, features], axis=2)
         if self.picked is None:
             return whole
         out: Observations = whole.take(self.picked, axis=2)
@@ -403,10 +403,10 @@ def _observe_rows(
                 value[c + 1] = N - 1 - i
                 c += _ROLE
             if with_obstacle:
-                told = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
+                knows = i == 0 or time >= params[k, news + i * N if by_link else latency + i]
                 for absent in range(c, c + _OBSTACLE):
                     value[absent] = 0.0
-                if told and some_obstacle and state[k, obstacle] < math.inf:
+                if knows and some_obstacle and state[k, obstacle] < math.inf:
                     gap = state[k, obstacle]
                     for p in range(i):
                         gap += state[k, gap_column + p]
@@ -430,23 +430,23 @@ def _hide_untold(
     of = columns(state)
     N, knows = of.vehicles, np.zeros(len(PIECES), np.bool_)
     for k in range(out.shape[0]):
-        told, time = params[k, of.messages :], state[k, of.time]
+        messages, time = params[k, of.messages :], state[k, of.time]
         for o in range(observers.shape[0]):
             i, c = observers[o], _OWN
             for offset in offsets:
                 if out[k, o, c] == 1.0:
                     for piece in range(len(PIECES)):
-                        knows[piece] = knows_piece(told, N, i, i + offset, piece, time)
+                        knows[piece] = knows_piece(messages, N, i, i + offset, piece, time)
                     stops = knows[PLACE] and knows[SPEED] and knows[BRAKING_CAPACITY] and knows[LATENCY]
-                    kept = (
+                    known = (
                         knows.any(), knows[PLACE], knows[SPEED], knows[ACCELERATION], knows[BRAKING_CAPACITY],
                         knows[MASS], knows[LATENCY], knows.any(), stops, stops,
                     )  # fmt: skip
                     for f in range(_NEIGHBOUR):
-                        out[k, o, c + f] = out[k, o, c + f] if kept[f] else 0.0
+                        out[k, o, c + f] = out[k, o, c + f] if known[f] else 0.0
                 c += _NEIGHBOUR
             c += _ROLE if role else 0
-            if with_obstacle and i > 0 and not knows_piece(told, N, i, 0, PLACE, time):
+            if with_obstacle and i > 0 and not knows_piece(messages, N, i, 0, PLACE, time):
                 out[k, o, c : c + _OBSTACLE] = 0.0
 
 

@@ -38,17 +38,17 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
     usual = ObservationSpec(role=scenario.has_obstacle, obstacle=scenario.has_obstacle)
     each = dict.fromkeys(names, usual)
-    for told in (said, given):
-        if isinstance(told, Mapping) and any(str(name).startswith("vehicle_") for name in told):
-            for name, listed in told.items():
+    for specification in (said, given):
+        if isinstance(specification, Mapping) and any(str(name).startswith("vehicle_") for name in specification):
+            for name, listed in specification.items():
                 if name not in each:
                     raise unknown_name("vehicle", name, names)
                 try:
                     each[name] = choose_observation(listed, step_s)
                 except InvalidInput as error:
                     raise type(error)(f"{name}: {error}") from None
-        elif told is not None:
-            each = dict.fromkeys(names, choose_observation(told, step_s))
+        elif specification is not None:
+            each = dict.fromkeys(names, choose_observation(specification, step_s))
     return tuple(each.values())
 
 

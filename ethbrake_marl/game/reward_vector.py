@@ -66,8 +66,8 @@ def vector_of(names: Sequence[str], harm: Ledger, harm_count: HarmCount, terms: 
 
     """
     borne, pairs = harm.vehicle_harm(harm_count), harm.pair_harm(harm_count)
-    found = {f"harm_{k + 1}": 0.0 - borne[:, k] for k in range(borne.shape[1])}
-    found |= {f"pair_{k + 1}_{k + 2}": 0.0 - pairs[:, k] for k in range(pairs.shape[1])}
-    found |= {"obstacle": 0.0 - harm.obstacle_harm(harm_count), **terms}
-    columns = (found[name] for name in names)
+    parts = {f"harm_{k + 1}": 0.0 - borne[:, k] for k in range(borne.shape[1])}
+    parts |= {f"pair_{k + 1}_{k + 2}": 0.0 - pairs[:, k] for k in range(pairs.shape[1])}
+    parts |= {"obstacle": 0.0 - harm.obstacle_harm(harm_count), **terms}
+    columns = (parts[name] for name in names)
     return np.stack([np.broadcast_to(each.T, borne.T.shape).T for each in columns], axis=2)

@@ -135,18 +135,18 @@ class RewardParams(FileModel):
 
         Harm weighs 1 by default, which must not happen unnoticed.
         """
-        given = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
-        beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in given]
+        names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
+        beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
         right = f"is left out, and would weigh 1 beside {''.join(beside[:1])}; say harm: 1, or 0 for none"
-        require(not beside or "harm" in given, ("harm",), UNSHOWN, right)
+        require(not beside or "harm" in names, ("harm",), UNSHOWN, right)
         right = "changes the term harm alone, whose weight is 0; give that a weight, or leave it out"
         require(self.objective is None or self.harm > 0.0, ("objective",), UNSHOWN, right)
         return self
 
     def weight(self, term: str) -> float:
         """Return the weight of the built-in term or registered measure ``term``; 0 if this reward does not have it."""
-        found: float = self.terms[term] if term in self.terms else self.__dict__.get(term, 0.0)
-        return found
+        weight: float = self.terms[term] if term in self.terms else self.__dict__.get(term, 0.0)
+        return weight
 
     @property
     def weights(self) -> dict[str, float]:
@@ -270,8 +270,8 @@ def reward_params(reward: Reward) -> RewardParams:
         return RewardParams(**reward)
     except ValidationError as error:
         first = first_mistake(error)
-        given = "" if isinstance(first.given, dict) else f" = {first.given!r}"  # the whole of it is to be read there
-        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{given}: {first.right}") from None
+        where = "" if isinstance(first.given, dict) else f" = {first.given!r}"  # the whole of it is to be read there
+        raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{where}: {first.right}") from None
 
 
 def setting_names() -> list[str]:

@@ -189,13 +189,13 @@ def _advance_part(arrays: tuple[NDArray[Any], ...], at: int, capacity: int, part
 
 
 def shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    given = checked_numbers(name, value)
-    if given.shape == shape:
-        return np.ascontiguousarray(given)
+    numbers = checked_numbers(name, value)
+    if numbers.shape == shape:
+        return np.ascontiguousarray(numbers)
     try:
-        return np.array(np.broadcast_to(given, shape), order="C")
+        return np.array(np.broadcast_to(numbers, shape), order="C")
     except ValueError:
-        raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
+        raise InvalidInput(f"{name}: shape {numbers.shape} does not fit {shape}") from None
 
 
 def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -> None:

@@ -17,7 +17,7 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Contact(NamedTuple):
-    """Row numbers of the forecast array ``found`` [WIDTH, N]; column p describes the next impact of pair p."""
+    """Row numbers of the forecast array ``contacts`` [WIDTH, N]; column p describes the next impact of pair p."""
 
     TIME: int = 0  # time from now to the pair's next impact (s); infinite: none
     CLOSING: int = 1  # closing speed of that impact (m/s); 0: none
@@ -28,8 +28,8 @@ CONTACT = _Contact()
 
 
 @compiled(apart=True)
-def forecast_contacts(table: Floats, restitution: float, duration: float, found: Floats) -> int:
-    """Simulate one world for ``duration`` (s) and write each pair's next impact into ``found``; return a status.
+def forecast_contacts(table: Floats, restitution: float, duration: float, contacts: Floats) -> int:
+    """Simulate one world for ``duration`` (s) and write each pair's next impact into ``contacts``; return a status.
 
     The status is ``FLAG.DONE``, or the check that failed. A pair that had an impact before the forecast can have
     another one here, but that one adds no first-impact harm.
@@ -39,12 +39,12 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, found:
             and harm rows are overwritten.
         restitution: coefficient of restitution of every impact, in [0, 1].
         duration: length of the forecast, s.
-        found: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is the
+        contacts: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is the
             time to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
 
     """
     for p in range(table.shape[1] - 1):
-        found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = math.inf, 0.0
+        contacts[CONTACT.TIME, p], contacts[CONTACT.CLOSING, p] = math.inf, 0.0
         table[ROW.FIRST_HARM, p] = 0.0
         table[ROW.TOTAL_HARM, p] = 0.0
         table[ROW.COUNT, p] = 0.0
@@ -58,7 +58,7 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, found:
         if status != FLAG.IMPACT:
             return status
         for p in range(table.shape[1] - 1):
-            if table[ROW.STRUCK, p] == 1.0 and found[CONTACT.TIME, p] == math.inf:
-                found[CONTACT.TIME, p], found[CONTACT.CLOSING, p] = now, table[ROW.CLOSING, p]
+            if table[ROW.STRUCK, p] == 1.0 and contacts[CONTACT.TIME, p] == math.inf:
+                contacts[CONTACT.TIME, p], contacts[CONTACT.CLOSING, p] = now, table[ROW.CLOSING, p]
         record_impacts(table, now, 0, no_rows, 0)
     return FLAG.STUCK

@@ -87,13 +87,13 @@ def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
 def power_of_two(k: int) -> float:
     """Return ``2^k`` exactly, for k from -1022 to 1023."""
     base, power = (2.0, k) if k >= 0 else (0.5, -k)
-    found = 1.0
+    result = 1.0
     while power > 0:
         if power % 2:
-            found *= base
+            result *= base
         base *= base
         power //= 2
-    return found
+    return result
 
 
 @compiled
@@ -201,19 +201,19 @@ def normal_probability(x: float) -> float:
 @compiled
 def exp_each(values: Floats) -> Floats:
     """Return ``e^x`` of each entry x of ``values`` [n], as ``exp`` computes it, [n]."""
-    found = np.empty(len(values))
+    result = np.empty(len(values))
     for i in range(len(values)):
-        found[i] = exp(values[i])
-    return found
+        result[i] = exp(values[i])
+    return result
 
 
 @compiled
 def normal_quantile_each(values: Floats) -> Floats:
     """Return the standard normal quantile of each probability in ``values`` [n], by ``normal_quantile``, [n]."""
-    found = np.empty(len(values))
+    result = np.empty(len(values))
     for i in range(len(values)):
-        found[i] = normal_quantile(values[i])
-    return found
+        result[i] = normal_quantile(values[i])
+    return result
 
 
 def logistic(values: Floats) -> Floats:

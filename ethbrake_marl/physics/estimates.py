@@ -46,31 +46,31 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
     for k in range(state.shape[0]):
         if params[k, head + CHANNEL.PERIOD] == 0.0:
             continue
-        told, time = params[k, head:], state[k, column.time]
-        says = has_contents(told, N)
-        place[observer], fresh[observer] = told[place_at(N) + observer], True
+        messages, time = params[k, head:], state[k, column.time]
+        says = has_contents(messages, N)
+        place[observer], fresh[observer] = messages[place_at(N) + observer], True
         for way in (-1, 1):
             last = place[observer]
             j = observer + way
             while 0 <= j < N:
                 link = link_at(observer, j, N)
-                known = time >= params[k, column.news + observer * N + j] and told[link + LINK.TOLD_S] >= 0.0
-                fresh[j] = known and told[link + LINK.TOLD_S] >= time
+                known = time >= params[k, column.news + observer * N + j] and messages[link + LINK.TOLD_S] >= 0.0
+                fresh[j] = known and messages[link + LINK.TOLD_S] >= time
                 out[k, speed + j], out[k, command + j], place[j] = 0.0, 0.0, last
                 if known:
-                    limit, age = params[k, column.limit + j], time - told[link + LINK.TOLD_S]
-                    then, force = told[link + LINK.TOLD_SPEED], told[link + LINK.TOLD_COMMAND]
-                    if says and not knows_piece(told, N, observer, j, ACCELERATION, time):
+                    limit, age = params[k, column.limit + j], time - messages[link + LINK.TOLD_S]
+                    then, force = messages[link + LINK.TOLD_SPEED], messages[link + LINK.TOLD_COMMAND]
+                    if says and not knows_piece(messages, N, observer, j, ACCELERATION, time):
                         force = 0.0
                     after, passed = moved_on(then, force, limit, age)
                     out[k, command + j] = force
-                    if says and not knows_piece(told, N, observer, j, SPEED, time):
+                    if says and not knows_piece(messages, N, observer, j, SPEED, time):
                         after = passed = 0.0
                     out[k, speed + j] = after
-                    if says and not knows_piece(told, N, observer, j, PLACE, time):
+                    if says and not knows_piece(messages, N, observer, j, PLACE, time):
                         fresh[j] = False
                     else:
-                        place[j] = told[link + LINK.TOLD_PLACE] + passed
+                        place[j] = messages[link + LINK.TOLD_PLACE] + passed
                         last = place[j]
                 j += way
         for p in range(N - 1):
@@ -79,8 +79,8 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
             if p != observer and p + 1 != observer:
                 out[k, gap + N - 1 + p] = 0.0
         if observer > 0 and state.shape[1] > obstacle:
-            out[k, obstacle] = max(told[CHANNEL.OBSTACLE_PLACE] - place[0], 0.0)
-            out[k, obstacle + 1] = told[link_at(observer, 0, N) + LINK.TOLD_HIT]
+            out[k, obstacle] = max(messages[CHANNEL.OBSTACLE_PLACE] - place[0], 0.0)
+            out[k, obstacle + 1] = messages[link_at(observer, 0, N) + LINK.TOLD_HIT]
 
 
 @compiled

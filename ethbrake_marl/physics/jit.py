@@ -104,22 +104,22 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     def _compile(self, sig: Any) -> Any:
         tell_compilation(not _loaded)
         super().compile(sig)
-        made = self.overloads[tuple(normalize_signature(sig)[0])]
+        compiled = self.overloads[tuple(normalize_signature(sig)[0])]
         if not _KNOWN:
-            return made.library.has_dynamic_globals, made._reduce()
-        library = made.library
-        for environment in made._find_referenced_environments():  # of the linked callees; its own is set already
+            return compiled.library.has_dynamic_globals, compiled._reduce()
+        library = compiled.library
+        for environment in compiled._find_referenced_environments():  # of the linked callees; its own is set already
             library.codegen.set_env(environment.env_name, environment)
-        parts = list(made._replace(type_annotation="")._reduce())
+        parts = list(compiled._replace(type_annotation="")._reduce())
         stub = "".join(f'define void @"{name}"() {{ ret void }}\n' for name in _symbols(library))
         parts[0] = (library.name, "object", (parts[0][2][0], parse_assembly(stub).as_bitcode()))
         return library.has_dynamic_globals, parts
 
     def _load(self, *parts: Any) -> None:
         self.targetctx.refresh()
-        made = CompileResult._rebuild(self.targetctx, *parts)
-        self.targetctx.insert_user_function(made.entry_point, made.fndesc, [made.library])
-        self.add_overload(made)
+        compiled = CompileResult._rebuild(self.targetctx, *parts)
+        self.targetctx.insert_user_function(compiled.entry_point, compiled.fndesc, [compiled.library])
+        self.add_overload(compiled)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Return what numba needs to type a call of this kernel from another kernel (numba's own protocol).
@@ -145,15 +145,15 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         flags.no_compile = flags.no_cpython_wrapper = flags.no_cfunc_wrapper = True
         library = _Linkable(self.targetctx.codegen(), self.__qualname__)
         with self._compiling_counter:
-            made = compile_extra(
+            compiled = compile_extra(
                 self.typingctx, self.targetctx, self.py_func, arguments, None, flags, self.locals, library=library
             )
-        self._link(made.signature, made.fndesc, library, made.environment)
-        made.fndesc.typemap = made.fndesc.calltypes = None
+        self._link(compiled.signature, compiled.fndesc, library, compiled.environment)
+        compiled.fndesc.typemap = compiled.fndesc.calltypes = None
         library._ensure_finalized()
         bitcode = library._final_module.as_bitcode()
-        environments = [made.environment, *made._find_referenced_environments()]
-        return library.has_dynamic_globals, (made.signature, made.fndesc, library.name, bitcode, environments)
+        environments = [compiled.environment, *compiled._find_referenced_environments()]
+        return library.has_dynamic_globals, (compiled.signature, compiled.fndesc, library.name, bitcode, environments)
 
     def _load_linked(self, signature: Any, fndesc: Any, name: str, bitcode: bytes, environments: Any) -> None:
         self.targetctx.refresh()
@@ -176,16 +176,16 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
         """
         name = self._name(way, kinds)
-        kept = load_kernel(name)
-        if kept is None:
+        stored = load_kernel(name)
+        if stored is None:
             with _alone(name):
-                kept = load_kernel(name)  # another process may have made it meanwhile
-                if kept is None:
-                    unkept, made = make()
+                stored = load_kernel(name)  # another process may have made it meanwhile
+                if stored is None:
+                    unkept, compiled = make()
                     if name and not unkept:
-                        keep_kernel(name, dumps(made))
+                        keep_kernel(name, dumps(compiled))
                     return
-        load(*pickle.loads(kept))
+        load(*pickle.loads(stored))
 
     def _name(self, way: str, kinds: tuple[Any, ...]) -> str:
         """Return the cache file name for argument types ``kinds``; empty if the code's sources are not fully known.
@@ -236,12 +236,12 @@ def load_kernel(name: str) -> bytes | None:
             about, content = os.fstat(file.fileno()), file.read()
     except OSError:
         return None
-    digest, kept = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    digest, stored = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     trusted = not hasattr(os, "getuid") or about.st_uid in (0, os.getuid())
-    if not trusted or _digest_of(name, kept) != digest:
+    if not trusted or _digest_of(name, stored) != digest:
         return None
     _loaded.append(name)
-    return kept
+    return stored
 
 
 def keep_kernel(name: str, content: bytes) -> None:
@@ -313,25 +313,25 @@ def kernel_sources(source: Path) -> list[Path]:
     These are the files with kernels that it imports, directly or through other such files, and the files from which any
     of them imports a constant (a name in capitals).
     """
-    found, follow = {source}, [source]
+    sources, follow = {source}, [source]
     while follow:
         for imported, has_kernels in _imports(follow.pop()):
-            if imported not in found:
-                found.add(imported)
+            if imported not in sources:
+                sources.add(imported)
                 follow += [imported] * has_kernels
-    return sorted(found)
+    return sorted(sources)
 
 
 @cache
 def _imports(source: Path) -> list[tuple[Path, bool]]:
     """Return (file, whether it has kernels) for the files with kernels or constants that ``source`` imports."""
-    found = []
+    modules = []
     for module, names in _IMPORT.findall(source.read_bytes()):
         for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):
             has_kernels = _MARK in imported.read_bytes()
             if has_kernels or any(_CONSTANT.fullmatch(name) for name in taken):
-                found.append((imported, has_kernels))
-    return found
+                modules.append((imported, has_kernels))
+    return modules
 
 
 def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
@@ -343,11 +343,11 @@ def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
     place = _PACKAGE.joinpath(*module.split(".")[1:])
     if place.with_suffix(".py").is_file():
         return [(place.with_suffix(".py"), names)]
-    found = [(place / f"{name}.py", set[str]()) for name in names if (place / f"{name}.py").is_file()]
+    files = [(place / f"{name}.py", set[str]()) for name in names if (place / f"{name}.py").is_file()]
     for home, offered in _IMPORT.findall((place / "__init__.py").read_bytes()):
         if taken := names & set(re.findall(r"\w+", offered.decode())):
-            found += _homes(home.decode(), taken)
-    return found
+            files += _homes(home.decode(), taken)
+    return files
 
 
 @overload

@@ -28,10 +28,10 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
         n: number of worlds.
 
     """
-    found, rows, failed = leaving_out_failed(measure, np.arange(n))
-    if found is None:
+    result, rows, failed = leaving_out_failed(measure, np.arange(n))
+    if result is None:
         raise PhysicsError(failed)
-    return found, rows, tuple(sorted(failed.items()))
+    return result, rows, tuple(sorted(failed.items()))
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:

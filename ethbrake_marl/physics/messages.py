@@ -129,60 +129,60 @@ def intent_at(vehicles: int) -> int:
 
 
 @compiled
-def has_contents(told: Floats, vehicles: int) -> bool:
+def has_contents(messages: Floats, vehicles: int) -> bool:
     """Return whether a row of message columns says what messages contain."""
-    return bool(told.shape[0] > 0 and told[link_at(0, 0, vehicles) + LINK.NUMBER] == 1.0)
+    return bool(messages.shape[0] > 0 and messages[link_at(0, 0, vehicles) + LINK.NUMBER] == 1.0)
 
 
 @compiled
-def ring_at(told: Floats, vehicles: int) -> int:
+def ring_at(messages: Floats, vehicles: int) -> int:
     """Return the first column of the ring buffer of samples, counted from the first column of the messages.
 
     ``vehicles`` is N.
     """
-    contents = vehicles * (CONTENTS + 1 + vehicles) if has_contents(told, vehicles) else 0
+    contents = vehicles * (CONTENTS + 1 + vehicles) if has_contents(messages, vehicles) else 0
     return contents_at(vehicles) + contents
 
 
 @compiled
-def sample_width(told: Floats, vehicles: int) -> int:
+def sample_width(messages: Floats, vehicles: int) -> int:
     """Return the number of columns of a sample in the ring buffer."""
-    return RING_HEAD + (4 if has_contents(told, vehicles) else 3) * vehicles
+    return RING_HEAD + (4 if has_contents(messages, vehicles) else 3) * vehicles
 
 
 @compiled
-def knows_piece(told: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
+def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
     """Return whether ``receiver`` knows a piece of ``sender``, whose message or sight has arrived by ``time`` (s).
 
-    ``told`` is a row of message columns, or empty. Place, speed and acceleration are measured once the sender is in
+    ``messages`` is a row of message columns, or empty. Place, speed and acceleration are measured once the sender is in
     sight. The intent comes by message alone. A piece that messages contain but sensors do not measure is known from the
     first message or sight on.
     """
-    if not has_contents(told, vehicles):
+    if not has_contents(messages, vehicles):
         return piece != INTENT
     link = link_at(receiver, sender, vehicles)
-    if piece <= ACCELERATION and told[link + LINK.SEEN_FROM] <= time:
+    if piece <= ACCELERATION and messages[link + LINK.SEEN_FROM] <= time:
         return True
-    heard = told[link + LINK.NUMBER] > 0.0 or told[link + LINK.NEXT_SENT] + told[CHANNEL.DELAY] <= time
-    said: bool = told[contents_at(vehicles) + CONTENTS * sender + piece] == 1.0
+    heard = messages[link + LINK.NUMBER] > 0.0 or messages[link + LINK.NEXT_SENT] + messages[CHANNEL.DELAY] <= time
+    said: bool = messages[contents_at(vehicles) + CONTENTS * sender + piece] == 1.0
     return said and (piece != INTENT or heard)
 
 
 @compiled
-def knows_line(told: Floats, vehicles: int, receiver: int, sender: int, time: float) -> bool:
+def knows_line(messages: Floats, vehicles: int, receiver: int, sender: int, time: float) -> bool:
     """Return whether ``receiver`` knows every piece of ``sender`` that is needed to foretell its motion."""
     known = True
     for piece in range(INTENT):
-        known = known and knows_piece(told, vehicles, receiver, sender, piece, time)
+        known = known and knows_piece(messages, vehicles, receiver, sender, piece, time)
     return known
 
 
 @compiled
-def _known_pieces(told: Floats, time: Floats, vehicles: int, receiver: int, known: NDArray[np.bool_]) -> None:
+def _known_pieces(messages: Floats, time: Floats, vehicles: int, receiver: int, known: NDArray[np.bool_]) -> None:
     for k in range(known.shape[0]):
         for j in range(vehicles):
             for piece in range(CONTENTS):
-                known[k, j, piece] = knows_piece(told[k], vehicles, receiver, j, piece, time[k])
+                known[k, j, piece] = knows_piece(messages[k], vehicles, receiver, j, piece, time[k])
 
 
 class Told(NamedTuple):
@@ -309,9 +309,9 @@ class Messages(NamedTuple):
         n, N = len(self.columns), self.vehicles
         if not self.says_contents:
             return np.zeros((n, N))
-        at, told = intent_at(N), intent_at(N) + N + vehicle * N
+        at, messages = intent_at(N), intent_at(N) + N + vehicle * N
         periodic = self.periodic[:, np.newaxis]
-        return np.where(periodic, self.columns[:, told : told + N], self.columns[:, at : at + N])
+        return np.where(periodic, self.columns[:, messages : messages + N], self.columns[:, at : at + N])
 
     def with_intents(self, intents_mps2: Floats) -> Floats:
         """Return the columns with these present intents [n, N] of the vehicles; the same without contents."""
@@ -327,8 +327,8 @@ class Messages(NamedTuple):
         All worlds must have columns of messages.
         """
         own, obstacle = self.columns[:, place_at(self.vehicles) + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
-        told = self.links[:, vehicle]
-        at_s, place, speed, command, hit = (told[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
+        newest = self.links[:, vehicle]
+        at_s, place, speed, command, hit = (newest[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
         return Told(at_s, place, speed, command, hit, own, obstacle)
 
     def age_s(self, time_s: Floats) -> Floats:
@@ -419,11 +419,11 @@ def hear_rows(
     table = np.zeros((rows_for(pieces.shape[1]), N + 1))
     no_rows = np.empty((0, LISTED.WIDTH))
     for k in range(moving.shape[0]):
-        told = params[k, head:]
-        if told[CHANNEL.PERIOD] == 0.0:
+        messages = params[k, head:]
+        if messages[CHANNEL.PERIOD] == 0.0:
             _choose(params[k], column, wanted[k], until_s[k])
             continue
-        if told[CHANNEL.TAKEN] == 0.0:
+        if messages[CHANNEL.TAKEN] == 0.0:
             _start(moving[k], params[k], column, wanted[k])
         while moving[k, column.time] < until_s[k]:
             left = math.ceil((decision_s[k] - moving[k, column.time]) / time_step_s - 1e-6) - 1.0
@@ -434,10 +434,10 @@ def hear_rows(
             if not _move(moving[k], params[k], column, wanted[k], end, pieces, table, no_rows):
                 break
             _choose(params[k], column, wanted[k], moving[k, column.time])
-            _sample(moving[k], told, column)
-            _receive(moving[k, column.time], told, N)
+            _sample(moving[k], messages, column)
+            _receive(moving[k, column.time], messages, N)
             if stops:
-                told[CHANNEL.TAKEN] -= 1.0
+                messages[CHANNEL.TAKEN] -= 1.0
 
 
 @compiled
@@ -455,19 +455,19 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
 
     """
     N, obstacle, gap, force = column.vehicles, column.obstacle, column.gap, column.command
-    told, place = params[column.messages :], place_at(N)
-    told[place] = 0.0
-    told[CHANNEL.OBSTACLE_PLACE] = state[obstacle] if state.shape[0] > obstacle else math.inf
+    messages, place = params[column.messages :], place_at(N)
+    messages[place] = 0.0
+    messages[CHANNEL.OBSTACLE_PLACE] = state[obstacle] if state.shape[0] > obstacle else math.inf
     for p in range(N - 1):
-        told[place + p + 1] = told[place + p] - state[gap + p]
+        messages[place + p + 1] = messages[place + p] - state[gap + p]
     for i in range(N):
         acts = command_acts(params[column.latency + i], state[column.time])
         state[force + i] = force_now(
             state[force + i], wanted[i] if acts else 0.0, params[column.brake_rate + i], params[column.release_rate + i]
         )
     _choose(params, column, wanted, state[column.time])
-    _sample(state, told, column)
-    _receive(state[column.time], told, N)
+    _sample(state, messages, column)
+    _receive(state[column.time], messages, N)
 
 
 @compiled
@@ -476,13 +476,13 @@ def _choose(params: Floats, column: Columns, wanted: Floats, time: float) -> Non
 
     A vehicle whose latency the channel extends does not know of the emergency before that, and has chosen nothing.
     """
-    told, N = params[column.messages :], column.vehicles
-    if not has_contents(told, N):
+    messages, N = params[column.messages :], column.vehicles
+    if not has_contents(messages, N):
         return
     for i in range(N):
         latency = params[column.latency + i]
         waits = latency > params[column.own_latency + i] and not command_acts(latency, time)
-        told[intent_at(N) + i] = 0.0 if waits else wanted[i]
+        messages[intent_at(N) + i] = 0.0 if waits else wanted[i]
 
 
 @compiled
@@ -544,75 +544,76 @@ def _move(
 
 
 @compiled
-def _sample(state: Floats, told: Floats, column: Columns) -> None:
+def _sample(state: Floats, messages: Floats, column: Columns) -> None:
     """Store a sample of every vehicle's state, over the oldest sample of the ring buffer.
 
-    ``state``: state row of one world, [S]; ``told``: its columns of messages, updated; ``column``: layout of the state.
+    ``state``: state row of one world, [S]; ``messages``: its message columns, updated; ``column``: layout of the state.
     """
     N, obstacle = column.vehicles, column.obstacle
-    width, first = sample_width(told, N), ring_at(told, N)
-    at = first + width * (int(told[CHANNEL.TAKEN]) % ((told.shape[0] - first) // width))
-    told[at] = state[column.time]
-    told[at + 1] = state[obstacle + 1] if state.shape[0] > obstacle else 0.0
+    width, first = sample_width(messages, N), ring_at(messages, N)
+    at = first + width * (int(messages[CHANNEL.TAKEN]) % ((messages.shape[0] - first) // width))
+    messages[at] = state[column.time]
+    messages[at + 1] = state[obstacle + 1] if state.shape[0] > obstacle else 0.0
     for i in range(N):
-        told[at + RING_HEAD + i] = told[place_at(N) + i]
-        told[at + RING_HEAD + N + i] = state[column.speed + i]
-        told[at + RING_HEAD + 2 * N + i] = state[column.command + i]
+        messages[at + RING_HEAD + i] = messages[place_at(N) + i]
+        messages[at + RING_HEAD + N + i] = state[column.speed + i]
+        messages[at + RING_HEAD + 2 * N + i] = state[column.command + i]
         if width > RING_HEAD + 3 * N:
-            told[at + RING_HEAD + 3 * N + i] = told[intent_at(N) + i]
-    told[CHANNEL.TAKEN] += 1.0
+            messages[at + RING_HEAD + 3 * N + i] = messages[intent_at(N) + i]
+    messages[CHANNEL.TAKEN] += 1.0
 
 
 @compiled
-def _receive(time: float, told: Floats, N: int) -> None:
+def _receive(time: float, messages: Floats, N: int) -> None:
     """Process every message of one world that can be used by ``time`` (s), and measure the vehicles in sight.
 
-    ``told``: columns of messages of the world, updated; ``N``: number of vehicles.
+    ``messages``: columns of messages of the world, updated; ``N``: number of vehicles.
     """
     for i in range(N):
         for j in range(N):
             link = link_at(i, j, N)
-            while told[link + LINK.NEXT_SENT] + told[CHANNEL.DELAY] <= time + _ON_GRID:
-                u, bad = chance(told[CHANNEL.KEY], i * N + j, told[link + LINK.NUMBER]), told[link + LINK.BAD] == 1.0
-                if told[link + LINK.NUMBER] > 0.0:  # message 0 always arrives
-                    bad = u >= told[CHANNEL.LOSS_ENDS] if bad else u < told[CHANNEL.LOSS_BEGINS]
-                    told[link + LINK.BAD] = 1.0 if bad else 0.0
+            while messages[link + LINK.NEXT_SENT] + messages[CHANNEL.DELAY] <= time + _ON_GRID:
+                u = chance(messages[CHANNEL.KEY], i * N + j, messages[link + LINK.NUMBER])
+                bad = messages[link + LINK.BAD] == 1.0
+                if messages[link + LINK.NUMBER] > 0.0:  # message 0 always arrives
+                    bad = u >= messages[CHANNEL.LOSS_ENDS] if bad else u < messages[CHANNEL.LOSS_BEGINS]
+                    messages[link + LINK.BAD] = 1.0 if bad else 0.0
                 if not bad:
-                    at = _take(told, link, j, told[link + LINK.NEXT_SENT], N)
-                    if at > 0 and has_contents(told, N):  # a later message carries a later intent
-                        told[intent_at(N) + N + i * N + j] = told[at + RING_HEAD + 3 * N + j]
-                told[link + LINK.NUMBER] += 1.0
-                told[link + LINK.NEXT_SENT] += told[CHANNEL.PERIOD]
-            if told[link + LINK.SEEN_FROM] <= time:
-                _take(told, link, j, time, N)
+                    at = _take(messages, link, j, messages[link + LINK.NEXT_SENT], N)
+                    if at > 0 and has_contents(messages, N):  # a later message carries a later intent
+                        messages[intent_at(N) + N + i * N + j] = messages[at + RING_HEAD + 3 * N + j]
+                messages[link + LINK.NUMBER] += 1.0
+                messages[link + LINK.NEXT_SENT] += messages[CHANNEL.PERIOD]
+            if messages[link + LINK.SEEN_FROM] <= time:
+                _take(messages, link, j, time, N)
 
 
 @compiled
-def _take(told: Floats, link: int, sender: int, sent_s: float, N: int) -> int:
+def _take(messages: Floats, link: int, sender: int, sent_s: float, N: int) -> int:
     """Receive one message: copy the sender's newest sample from the ring buffer to the link.
 
     It is the newest sample taken at ``sent_s`` or earlier. Nothing changes if the receiver already has a newer one.
     Return the first column of that sample; 0: none is left.
 
     Args:
-        told: columns of messages of one world; updated.
+        messages: columns of messages of one world; updated.
         link: first column of the link, see ``link_at``.
         sender: index of the sending vehicle, from 0.
         sent_s: time at which the message is sent, s.
         N: number of vehicles.
 
     """
-    width, first = sample_width(told, N), ring_at(told, N)
-    length: int = (told.shape[0] - first) // width
-    taken = int(told[CHANNEL.TAKEN])
+    width, first = sample_width(messages, N), ring_at(messages, N)
+    length: int = (messages.shape[0] - first) // width
+    taken = int(messages[CHANNEL.TAKEN])
     for back in range(min(length, taken)):
         at = first + width * ((taken - 1 - back) % length)
-        if told[at] <= sent_s + _ON_GRID:
-            if told[at] >= told[link + LINK.TOLD_S]:
-                told[link + LINK.TOLD_S] = told[at]
-                told[link + LINK.TOLD_HIT] = told[at + 1]
-                told[link + LINK.TOLD_PLACE] = told[at + RING_HEAD + sender]
-                told[link + LINK.TOLD_SPEED] = told[at + RING_HEAD + N + sender]
-                told[link + LINK.TOLD_COMMAND] = told[at + RING_HEAD + 2 * N + sender]
+        if messages[at] <= sent_s + _ON_GRID:
+            if messages[at] >= messages[link + LINK.TOLD_S]:
+                messages[link + LINK.TOLD_S] = messages[at]
+                messages[link + LINK.TOLD_HIT] = messages[at + 1]
+                messages[link + LINK.TOLD_PLACE] = messages[at + RING_HEAD + sender]
+                messages[link + LINK.TOLD_SPEED] = messages[at + RING_HEAD + N + sender]
+                messages[link + LINK.TOLD_COMMAND] = messages[at + RING_HEAD + 2 * N + sender]
             return at
     return 0

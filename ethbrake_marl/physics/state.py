@@ -149,8 +149,8 @@ class Vehicles:
         command, count = command_mps2, self.pieces.shape[2] // 2
         for piece in range(count):
             begins = self.latency_s + self.pieces[:, :, piece]
-            begun = (begins <= time_s[:, np.newaxis]) if piece else np.isfinite(begins)
-            command = np.where(begun, self.pieces[:, :, count + piece], command)
+            started = (begins <= time_s[:, np.newaxis]) if piece else np.isfinite(begins)
+            command = np.where(started, self.pieces[:, :, count + piece], command)
         return command
 
     def hide_from(self, vehicle: int) -> Bools:
@@ -212,8 +212,8 @@ class Worlds:
     road: Floats
 
     def __repr__(self) -> str:
-        found = f"gaps {_span(self.gaps_m)} m, speeds {_span(self.speeds_mps)} m/s, at {_span(self.time_s)} s"
-        return f"Worlds({count_of(self.n, 'world')} of {self.N} vehicles: {found})"
+        summary = f"gaps {_span(self.gaps_m)} m, speeds {_span(self.speeds_mps)} m/s, at {_span(self.time_s)} s"
+        return f"Worlds({count_of(self.n, 'world')} of {self.N} vehicles: {summary})"
 
     @property
     def n(self) -> int:
@@ -336,10 +336,10 @@ class Worlds:
         if not several and not self.vehicles.pieces.shape[2]:
             return self
         most = max(map(len, several.values()), default=0)
-        found = np.full((self.n, self.N, 2, most), np.inf)
+        commands = np.full((self.n, self.N, 2, most), np.inf)
         for i, each in several.items():
-            found[:, i, 0, : len(each)], found[:, i, 1, : len(each)] = each[:, 0], 0.0 - each[:, 1]
-        return replace(self, vehicles=replace(self.vehicles, pieces=found.reshape(self.n, self.N, 2 * most)))
+            commands[:, i, 0, : len(each)], commands[:, i, 1, : len(each)] = each[:, 0], 0.0 - each[:, 1]
+        return replace(self, vehicles=replace(self.vehicles, pieces=commands.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
         """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a sequence of commands.
@@ -639,11 +639,11 @@ def _full(
         finite: infinite entries are invalid.
 
     """
-    given = checked_numbers(name, value)
+    numbers = checked_numbers(name, value)
     try:
-        full = np.array(np.broadcast_to(given, shape), dtype=np.float64, order="C")
+        full = np.array(np.broadcast_to(numbers, shape), dtype=np.float64, order="C")
     except ValueError:
-        raise InvalidInput(f"{name}: shape {given.shape} does not fit {shape}") from None
+        raise InvalidInput(f"{name}: shape {numbers.shape} does not fit {shape}") from None
     good = (
         (np.isfinite(full) if finite else ~np.isnan(full))
         & (full <= high)

@@ -79,7 +79,7 @@ def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> lis
     latencies, restitutions = v.latency_s, v.restitution
     # columns of the vehicles, without the dummy obstacle
     wanted = [*range(N + 1), *(part * (N + 1) + i for part in (1, 2, 3) for i in range(1, N + 1))]
-    found = []
+    parts = []
     for k in range(worlds.n):
         start = float(worlds.time_s[k])
         table = np.zeros((rows_for(v.pieces.shape[2]), N + 1))
@@ -99,5 +99,5 @@ def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> lis
         pieces = rows[:count, wanted]
         pieces[:, 0] += start
         pieces[:, 1] = front_gaps[k] - pieces[:, 1]
-        found.append(pieces)
-    return found
+        parts.append(pieces)
+    return parts

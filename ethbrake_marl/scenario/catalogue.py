@@ -194,15 +194,15 @@ def _with_members(document: Document, folder: Path) -> Document:
     content = _with_rows(document, (), document.content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
     if isinstance(listed, list | tuple):
-        found = []
+        files = []
         for i, entry in enumerate(listed):
             member, at = entry.get("scenario") if isinstance(entry, dict) else None, ("mixture", i, "scenario")
             if isinstance(member, str):
                 entry = {**entry, "scenario": _member(member, document.where(at), i, folder)}
             elif isinstance(member, dict):
                 entry = {**entry, "scenario": _with_rows(document, at, member, folder)}
-            found.append(entry)
-        content = {**content, "mixture": found}
+            files.append(entry)
+        content = {**content, "mixture": files}
     return Document(document.file, content, document.lines)
 
 
@@ -224,8 +224,8 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
         raise InvalidInput(f"{where}: table.file = {table['file']}: must be a path from the scenario's folder on")
     with document.refusing_at((*at, "table", "file")):
         rows = read_rows(folder / path, table.get("columns"), table.get("weights"))
-        kept = {key: value for key, value in table.items() if key != "file"}  # the file's name does not matter
-        return {**content, "table": {**kept, **rows}}
+        entries = {key: value for key, value in table.items() if key != "file"}  # the file's name does not matter
+        return {**content, "table": {**entries, **rows}}
 
 
 def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:
@@ -271,9 +271,9 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
     """
     check_file_name("scenario", name)
     base = load_scenario(based_on)
-    given = base.declared() if base.members else base.model_dump(mode="json", exclude_none=True)
+    base_keys = base.declared() if base.members else base.model_dump(mode="json", exclude_none=True)
     values = {
-        **{key: value for key, value in given.items() if not base.members or key == "mixture"},
+        **{key: value for key, value in base_keys.items() if not base.members or key == "mixture"},
         "name": name,
         "title": "One line for lists and figures",
         "description": "What this scenario is for.",

@@ -172,7 +172,7 @@ def _pieces(value: Any) -> Tells | None:
     by_name = isinstance(value, Mapping)
     right = f"must be a list of {', '.join(PIECES)}, or such a list for each vehicle by name"
     require(isinstance(value, list | tuple) or (by_name and len(value) > 0), (), value, right)
-    told: dict[str, tuple[Piece, ...]] = {}
+    pieces: dict[str, tuple[Piece, ...]] = {}
     for name, listed in value.items() if by_name else [("", value)]:
         at = (name,) if by_name else ()
         require(isinstance(name, str) and isinstance(listed, list | tuple), at, listed, right)
@@ -180,8 +180,8 @@ def _pieces(value: Any) -> Tells | None:
             hint = suggestion(piece, PIECES) if isinstance(piece, str) else ""
             require(piece in PIECES, (*at, k), piece, f"{hint}; known: {', '.join(PIECES)}".removeprefix("; "))
         require(len(set(listed)) == len(listed), at, listed, "names a piece twice")
-        told[name] = tuple(piece for piece in PIECES if piece in listed)
-    return told if by_name else told[""]
+        pieces[name] = tuple(piece for piece in PIECES if piece in listed)
+    return pieces if by_name else pieces[""]
 
 
 class _TellsSchema:
@@ -300,9 +300,9 @@ class V2X(FileModel):
     @property
     def channel(self) -> Channel:
         """The preset's channel with the given settings replaced."""
-        given = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
+        values = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
         base = CHANNELS[self.preset]
-        return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **given)
+        return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **values)
 
     @property
     def by_link(self) -> bool:
@@ -362,8 +362,8 @@ class V2X(FileModel):
         latency = vehicles.latency_s.copy()
         if channel.timing != "latency":
             for i in range(1, N):
-                told = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
-                latency[:, i] = np.maximum(latency[:, i], told)
+                news = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
+                latency[:, i] = np.maximum(latency[:, i], news)
         known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
         known[:, np.arange(N), np.arange(N)] = latency  # a vehicle knows itself from its latency on
         return replace(vehicles, latency_s=latency, known_from_s=known)

@@ -38,19 +38,19 @@ def check_whole(scenario: ScenarioFields) -> None:
     for key in set(QUANTITY.of_a_type) - set(QUANTITY.usual):
         silent = [name for name, kind in kinds.items() if getattr(kind, key) is None]
         right = f"type {''.join(silent[:1])} does not declare it: give it there, or here for every type that does not"
-        told = getattr(scenario, key) is not None
-        require(told or len(silent) in (0, len(kinds)), (key,), UNSHOWN, right)
-        require(not (told and kinds) or len(silent) > 0, (key,), UNSHOWN, "every type declares it; leave it out")
+        is_set = getattr(scenario, key) is not None
+        require(is_set or len(silent) in (0, len(kinds)), (key,), UNSHOWN, right)
+        require(not (is_set and kinds) or len(silent) > 0, (key,), UNSHOWN, "every type declares it; leave it out")
     for usual, other in QUANTITY.alternatives.items():
-        given = [key for key in (usual, other) if getattr(scenario, key) is not None]
+        present = [key for key in (usual, other) if getattr(scenario, key) is not None]
         columns = [column.name for (key, _), column in scenario.table_entries.items() if key == usual]
         right = f"the table has {', '.join(columns)}: give {usual} for the rest, not {other}"
-        require(not (columns and other in given), (other,), getattr(scenario, other), right)
-        given += [usual] * (usual not in given and scenario.declares(usual))
-        if not given and usual not in QUANTITY.optional:
+        require(not (columns and other in present), (other,), getattr(scenario, other), right)
+        present += [usual] * (usual not in present and scenario.declares(usual))
+        if not present and usual not in QUANTITY.optional:
             raise PydanticCustomError("missing", "missing", {"at": (usual,)})
         right = f"give either {usual} or {other}, not both"
-        require(len(given) < 2, (other,), getattr(scenario, other), right)
+        require(len(present) < 2, (other,), getattr(scenario, other), right)
     horizon = f"horizon_s ({scenario.horizon_s:g} s)"
     in_time = scenario.time_step_s <= scenario.horizon_s
     require(in_time, ("time_step_s",), scenario.time_step_s, f"must not be above {horizon}")

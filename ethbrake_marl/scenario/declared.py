@@ -144,10 +144,10 @@ class ScenarioFields(FileModel):
         usual["v2x"] = None, given(V2X().model_dump(mode="json"))  # next to a mixture it would apply to all members
 
         def declared(scenario: Mapping[str, Any]) -> dict[str, Any]:
-            told = {key: given(value) for key, value in scenario.items() if given(value) not in usual.get(key, ())}
-            if "mixture" in told:
-                told["mixture"] = [{**each, "scenario": declared(each["scenario"])} for each in told["mixture"]]
-            return told
+            values = {key: given(value) for key, value in scenario.items() if given(value) not in usual.get(key, ())}
+            if "mixture" in values:
+                values["mixture"] = [{**each, "scenario": declared(each["scenario"])} for each in values["mixture"]]
+            return values
 
         return cls.model_validate(declared(content))
 
@@ -400,25 +400,25 @@ class ScenarioFields(FileModel):
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
             return tuple({0: each} for each in self.quantities(field))
-        found: list[dict[int, AnyTypeQuantity]] = []
+        quantities: list[dict[int, AnyTypeQuantity]] = []
         for i in range(self.vehicles):
             if (field, i) in self.table_entries:
-                found.append({0: self.table_entries[field, i]})
+                quantities.append({0: self.table_entries[field, i]})
                 continue
             own = {kind: getattr(line.kinds[kind], field) for kind in line.possible(i)}
-            found.append({kind: self.quantities(field)[i] if each is None else each for kind, each in own.items()})
-        return tuple(found)
+            quantities.append({kind: self.quantities(field)[i] if each is None else each for kind, each in own.items()})
+        return tuple(quantities)
 
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
         """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
 
         All vehicle types that are possible are considered.
         """
-        found = []
+        supports = []
         for each in self.possible_quantities(field):
             lows, highs = zip(*(support(quantity) for quantity in each.values()), strict=True)
-            found.append((min(lows), max(highs)))
-        return tuple(found)
+            supports.append((min(lows), max(highs)))
+        return tuple(supports)
 
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
         """Return the declaration of the quantity ``field``: a number or distribution for each vehicle, pair or world.
@@ -443,16 +443,16 @@ class ScenarioFields(FileModel):
             dry: do not limit braking and driving capacities by the friction of the road.
 
         """
-        found = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
+        bounds = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
         at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # for members that declare no rate
-        lows, highs = zip(*((each if dry else on_road(each)).get(field, at_once) for each in found), strict=True)
+        lows, highs = zip(*((each if dry else on_road(each)).get(field, at_once) for each in bounds), strict=True)
         return tuple(zip(np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist(), strict=True))
 
     @property
     def farthest_obstacle_m(self) -> float:
         """Largest possible distance (m) from Vehicle 1 to an obstacle that is declared by ``obstacle_margin_m``."""
-        found = on_road(world_quantities(self, _supports_of(self)))
-        low, high = ({key: bounds[[row]] for key, bounds in found.items()} for row in (0, 1))
+        positions = on_road(world_quantities(self, _supports_of(self)))
+        low, high = ({key: bounds[[row]] for key, bounds in positions.items()} for row in (0, 1))
         slowest = high | {key: low[key] for key in ("braking_capacity_mps2", "brake_rate_mps3") if key in low}
         farthest = obstacle_gap(self, slowest, lambda key: np.array([support(self.quantities(key)[0])[1]]))
         assert farthest is not None
@@ -471,17 +471,17 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
     """
     other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
-    found = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
+    quantities = {key: declared(key) for key in QUANTITY.usual if other.get(key) is None}
     if scenario.alert_s is not None:
-        found["latency_s"] = found["latency_s"] + declared("alert_s")
+        quantities["latency_s"] = quantities["latency_s"] + declared("alert_s")
     for key in ALSO:
         if scenario.declares(key):
-            found[key] = declared(key)
+            quantities[key] = declared(key)
     if scenario.line_speed_mps is not None:
-        found["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
+        quantities["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
     if scenario.time_gaps_s is not None:
-        found["gaps_m"] = declared("time_gaps_s") * found["speeds_mps"][:, 1:]
-    return {key: found[key] for key in (*QUANTITY.usual, *ALSO) if key in found}
+        quantities["gaps_m"] = declared("time_gaps_s") * quantities["speeds_mps"][:, 1:]
+    return {key: quantities[key] for key in (*QUANTITY.usual, *ALSO) if key in quantities}
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:

@@ -48,9 +48,9 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
         )
     N, own = line.vehicles, {"braking_capacity_mps2": follower.braking_capacity_mps2, "latency_s": follower.latency_s}
     for key, rule in QUANTITY.declared.items():
-        given = content.get(key)
-        if rule.per == "vehicle" and given is not None and (key in own or isinstance(given, list | tuple)):
-            values = given if isinstance(given, list | tuple) else [given] * N
+        value = content.get(key)
+        if rule.per == "vehicle" and value is not None and (key in own or isinstance(value, list | tuple)):
+            values = value if isinstance(value, list | tuple) else [value] * N
             content[key] = [*values, own.get(key, values[-1])]
     low, high = line.bounds("speeds_mps")[-1]
     speed, gaps = (QUANTITY.declared[key].column_of(N - k) for k, key in ((1, "speeds_mps"), (2, "gaps_m")))
@@ -67,6 +67,6 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
     else:
         by_time = "time_gaps_s" in content
         key, gap = ("time_gaps_s", follower.time_gap_s) if by_time else ("gaps_m", follower.time_gap_s * low)
-        given = content[key]
-        content[key] = [*(given if isinstance(given, list | tuple) else [given] * (N - 1)), gap]
+        value = content[key]
+        content[key] = [*(value if isinstance(value, list | tuple) else [value] * (N - 1)), gap]
     return Document(document.file, {**content, "vehicles": N + 1}, document.lines)

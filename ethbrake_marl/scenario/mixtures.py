@@ -61,8 +61,8 @@ def build_members(
     _check_members(document, members)
     mixture = [{**entry, "scenario": member_content(member)} for entry, member in zip(listed, members, strict=True)]
     own = {key: value for key, value in content.items() if key not in beside}
-    told = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
-    shared = {key: value for key, value in told[0].items() if all(each.get(key) == value for each in told)}
+    dumps = [member.model_dump(mode="json", include=set(_SHARED), exclude_none=True) for member in members]
+    shared = {key: value for key, value in dumps[0].items() if all(each.get(key) == value for each in dumps)}
     return Document(document.file, {**own, **shared, "mixture": mixture}, document.lines), members
 
 
@@ -106,9 +106,9 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
     """
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]
-    if (given := document.content.get("vehicles", first.vehicles)) != first.vehicles:
+    if (vehicles := document.content.get("vehicles", first.vehicles)) != first.vehicles:
         raise InvalidInput(
-            f"{where}: vehicles = {given}: its scenarios have {first.vehicles}, which nothing beside them can change"
+            f"{where}: vehicles = {vehicles}: its scenarios have {first.vehicles}, which nothing beside them can change"
         )
     for k, member in enumerate(members):
         if member.members:

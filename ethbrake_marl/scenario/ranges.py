@@ -51,10 +51,10 @@ class Ranges:
         streams = {of: np.full((n, width), _UNUSED) for of, width in widths.items()}
         for (of, column), u in zip(self.places, points.T, strict=True):
             streams[of][:, column] = u
-        found = sample_by(self.scenario, lambda _, of: streams[of], np.arange(n, dtype=np.int64))
+        worlds = sample_by(self.scenario, lambda _, of: streams[of], np.arange(n, dtype=np.int64))
         if self.scenario.early_impacts == "keep" or not self.scenario.learners:
-            return found, np.ones(n, np.bool_)
-        return found, ~early_impact(self.scenario, found.worlds)
+            return worlds, np.ones(n, np.bool_)
+        return worlds, ~early_impact(self.scenario, worlds.worlds)
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
@@ -119,7 +119,7 @@ def ranges(scenario: ScenarioFields) -> Ranges:
             f"scenario {scenario.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
             " (--set v2x=paper)"
         )
-    found = {**_of_types(scenario), **_of_quantities(scenario)}
-    if not found:
+    entries = {**_of_types(scenario), **_of_quantities(scenario)}
+    if not entries:
         raise InvalidInput(f"scenario {scenario.name!r}: draws nothing: all its worlds are the same")
-    return Ranges(scenario, tuple(found), tuple(found.values()))
+    return Ranges(scenario, tuple(entries), tuple(entries.values()))

@@ -82,8 +82,8 @@ class ScriptSpec(NamedTuple):
         """
         if self.name != _PROFILE:
             return ()
-        given = [part.split("=") for part in (self.argument or "").split(",")]
-        return checked_pieces([[parse_numeral(number) for number in piece] for piece in given])
+        fields = [part.split("=") for part in (self.argument or "").split(",")]
+        return checked_pieces([[parse_numeral(number) for number in piece] for piece in fields])
 
     @property
     def hardest_mps2(self) -> float | None:

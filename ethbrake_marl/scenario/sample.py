@@ -77,8 +77,8 @@ class Sample:
         order = np.argsort(index)
         joined: dict[str, _Texts] = {}
         for name in ("types", "scenarios", "recordings"):
-            given = [getattr(part, name) for part in parts if getattr(part, name) is not None]
-            joined |= {name: np.concatenate(given)[order]} if given else {}
+            values = [getattr(part, name) for part in parts if getattr(part, name) is not None]
+            joined |= {name: np.concatenate(values)[order]} if values else {}
         worlds = Worlds.concatenate([part.worlds for part in parts]).take(order)
         return Sample(worlds, index[order], rejected, **joined)
 
@@ -100,9 +100,9 @@ class Sample:
 
         For example ``"; vehicle_1_type: car 7, truck 3"``; of recordings only how many there are. Empty without any.
         """
-        told = ""
+        text = ""
         for kind, column in self.kinds.items():
             names, counts = np.unique(column, return_counts=True)
             each = ", ".join(f"{n or 'none'} {c}" for n, c in zip(names, counts, strict=True))
-            told += f"; {kind}: {each if kind != RECORDING else f'{len(names)} different'}"
-        return told
+            text += f"; {kind}: {each if kind != RECORDING else f'{len(names)} different'}"
+        return text

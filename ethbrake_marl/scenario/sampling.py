@@ -161,17 +161,17 @@ def drawn_quantities(
 
     def drawn(key: str) -> Floats:
         entries, rule = scenario.possible_quantities(key), QUANTITY.declared[key]
-        found = np.empty((len(streams[()]), len(entries)))
+        numbers = np.empty((len(streams[()]), len(entries)))
         for i, possible in enumerate(entries):
             for kind, entry in possible.items():
                 rows = slice(None) if typed is None or len(possible) == 1 else typed[0][:, i] == kind
                 u = at(ROW if isinstance(entry, TableColumn) else rule.place(i))[rows]
                 if isinstance(entry, WithLoad):
                     assert typed is not None
-                    found[rows, i] = entry.value(typed[1][rows, i], u)
+                    numbers[rows, i] = entry.value(typed[1][rows, i], u)
                 else:
-                    found[rows, i] = values(entry, u)
-        return found
+                    numbers[rows, i] = values(entry, u)
+        return numbers
 
     return drawn
 

@@ -143,10 +143,10 @@ class Scenario(ScenarioFields):
 
     def _repr_html_(self) -> str:
         """Return the declared values as HTML, for a notebook."""
-        told = {key: value for key, value in self.declared().items() if key not in ("name", "title")}
+        values = {key: value for key, value in self.declared().items() if key not in ("name", "title")}
         if self.mixture is not None:
-            told["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
-        rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in told.items()]
+            values["mixture"] = ", ".join(f"{e.weight:g} x {e.scenario['name']}" for e in self.mixture)
+        rows = [(key, value if isinstance(value, str) else flow_text(value)) for key, value in values.items()]
         return Sheet(f"Scenario {self.name}: {self.title or 'no title'}", ("Key", "Value"), rows).html()
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:

@@ -116,8 +116,8 @@ def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, 
         low, high = support(scenario.quantities(field if scenario.declares(field) else "obstacle_margin_m")[0])
         return obstacle_gap(scenario, on_road(full), lambda key: np.array([low])) if low == high else None
     by_time = field == "gaps_m" and scenario.time_gaps_s is not None
-    told = scenario.bounds(field, dry=True)[index]
-    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else told
+    fixed = scenario.bounds(field, dry=True)[index]
+    low, high = support(scenario.quantities("time_gaps_s")[index]) if by_time else fixed
     if low != high:
         return None
     return low * full["speeds_mps"][:, index + 1] if by_time else np.array([low])
@@ -242,8 +242,8 @@ def read_worlds(scenario: ScenarioFields, path: str | Path) -> Worlds:
     table = np.empty((len(rows), len(header)))
     for r, row in enumerate(rows):
         table[r] = [_cell_at(file, header, row, lines[r], name) for name in header]
-    given = {entry: table[:, c] for c, entry in enumerate(entries)}
-    return _worlds(given, scenario, _Naming(str(file), "file", lines))
+    columns = {entry: table[:, c] for c, entry in enumerate(entries)}
+    return _worlds(columns, scenario, _Naming(str(file), "file", lines))
 
 
 def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
@@ -266,12 +266,12 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
         if header.count(name) != 1:
             many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
             raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
-    found = [
+    cells = [
         [_cell_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
         for row, line in zip(rows, lines, strict=False)  # ignore blank lines at the end
     ]
-    told: dict[str, Any] = {"rows": [row[: len(columns)] for row in found]}
-    return told if weights is None else told | {"weights": [row[-1] for row in found]}
+    settings: dict[str, Any] = {"rows": [row[: len(columns)] for row in cells]}
+    return settings if weights is None else settings | {"weights": [row[-1] for row in cells]}
 
 
 def rows_text(table: Table) -> str:
@@ -292,15 +292,15 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
     Raises ``InvalidInput`` naming the column and the row (from 0).
     """
     entries = _known_columns(list(columns), scenario, "initial states")
-    given = {
+    by_entry = {
         entry: _numbers(f"initial states: {name}", column)
         for entry, (name, column) in zip(entries, columns.items(), strict=True)
     }
-    shapes = {column.shape for column in given.values()}
+    shapes = {column.shape for column in by_entry.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
         raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
-    return _worlds(given, scenario, _Naming("initial states", "table"))
+    return _worlds(by_entry, scenario, _Naming("initial states", "table"))
 
 
 def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]) -> Worlds:
@@ -311,7 +311,7 @@ def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]
     """
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
-    given: dict[Entry, Floats] = {}
+    columns: dict[Entry, Floats] = {}
     known = _quantities(scenario)
     for field, value in initial_state.items():
         if field not in known:
@@ -326,5 +326,5 @@ def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]
             right = "must be one number" if known[field].per == "world" else several
             raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
         for index, number in enumerate(np.broadcast_to(numbers, (count,))):
-            given[field, index] = np.array([number])
-    return _worlds(given, scenario, _Naming("initial_state", "state"))
+            columns[field, index] = np.array([number])
+    return _worlds(columns, scenario, _Naming("initial_state", "state"))

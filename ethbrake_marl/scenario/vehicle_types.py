@@ -131,9 +131,9 @@ class TypesOfLine:
     def __init__(self, kinds: Mapping[str, VehicleType], types: Types | None, vehicles: int) -> None:
         self.names = tuple(kinds)
         self.kinds = tuple(kinds.values())
-        given: Sequence[TypesHere]
-        given = types if isinstance(types, tuple) else (ANY if types is None else types,) * vehicles
-        self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in given])
+        of_vehicle: Sequence[TypesHere]
+        of_vehicle = types if isinstance(types, tuple) else (ANY if types is None else types,) * vehicles
+        self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in of_vehicle])
 
     def possible(self, vehicle: int) -> list[int]:
         """Return the indices of the types that are possible for ``vehicle`` (index from 0)."""
