@@ -39,8 +39,8 @@ def forecast_contacts(table: Floats, restitution: float, duration: float, contac
             and harm rows are overwritten.
         restitution: coefficient of restitution of every impact, in [0, 1].
         duration: length of the forecast, s.
-        contacts: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is the
-            time to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
+        contacts: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is
+            the time to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
 
     """
     for p in range(table.shape[1] - 1):
