@@ -61,12 +61,12 @@ class Actor:
             x: observations, [F, rows].
 
         """
-        found = self._actions[np.newaxis, np.maximum(number - len(self._among), 0)]
+        actions = self._actions[np.newaxis, np.maximum(number - len(self._among), 0)]
         for m, member in enumerate(self._among):
             rows = np.flatnonzero(number == m)
             if len(rows):
-                found[:, rows] = member._block(np.ascontiguousarray(x[:, rows]))
-        return found
+                actions[:, rows] = member._block(np.ascontiguousarray(x[:, rows]))
+        return actions
 
     def _block(self, x: Float32s) -> Float32s:
         """Return the actions [A, rows] for observations x [F, rows]."""

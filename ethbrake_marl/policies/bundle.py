@@ -27,10 +27,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     if not isinstance(path, str | os.PathLike):
         raise InvalidInput(f"policy {path!r:.60}: must be the path of a run or of a policy bundle")
     folder = _bundle_folder(Path(path))
-    found = {entry.name for entry in os.scandir(folder)}
-    for name in sorted({MANIFEST, WEIGHTS} - found):
+    entries = {entry.name for entry in os.scandir(folder)}
+    for name in sorted({MANIFEST, WEIGHTS} - entries):
         raise CorruptBundle(f"{folder / name}: is missing")
-    for name in sorted(found - {MANIFEST, WEIGHTS}):
+    for name in sorted(entries - {MANIFEST, WEIGHTS}):
         raise CorruptBundle(f"{folder / name}: does not belong into a bundle, which is {MANIFEST} and {WEIGHTS} only")
     place = folder / MANIFEST
     data = _read(place)
@@ -58,10 +58,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 def _bundle_folder(path: Path) -> Path:
     for folder in (path, path / "policy"):
         try:
-            found = (folder / MANIFEST).exists() or (folder / WEIGHTS).exists()
+            exists = (folder / MANIFEST).exists() or (folder / WEIGHTS).exists()
         except OSError as error:
             raise InvalidInput(f"{str(path)!r:.120}: cannot be read ({error.strerror})") from None
-        if found:
+        if exists:
             if folder.is_symlink():
                 raise CorruptBundle(f"{folder}: is a symbolic link; give the folder it points to")
             return folder

@@ -88,8 +88,8 @@ class NetworkSpec(FileModel):
     @property
     def actions(self) -> Float32s:
         """The actions that output ``choice`` scores, [choices], from -1 to 1."""
-        found: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
-        return found
+        levels: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
+        return levels
 
     @property
     def format_version(self) -> Literal[2, 3, 4, 5]:

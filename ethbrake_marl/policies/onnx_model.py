@@ -88,12 +88,12 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
     graph = helper.make_graph(nodes, "policy", given, found, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="ethbrake-marl")
     model.ir_version = 8  # supported by every runtime since 2022
-    told = {
+    metadata = {
         "algorithm": manifest.algorithm,
         "manifest_sha256": manifest.manifest_sha256,
         "features": ",".join(manifest.observation.features),
     }
-    helper.set_model_props(model, told)
+    helper.set_model_props(model, metadata)
     onnx.checker.check_model(model)
     data: bytes = model.SerializeToString()
     return data

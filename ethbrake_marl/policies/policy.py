@@ -48,10 +48,10 @@ class Policy:
     tensors: Mapping[str, Float32s]  # weights and biases by name, see ``NetworkSpec.tensors``
 
     def __repr__(self) -> str:
-        told, scenario = self.manifest, self.manifest.scenario.get("name")
+        manifest, scenario = self.manifest, self.manifest.scenario.get("name")
         return (
-            f"Policy({told.algorithm!r}, {self.observation.size} observations, {told.steps:,} steps on"
-            f" {scenario!r:.66}, sha256 {told.manifest_sha256[:12]})"
+            f"Policy({manifest.algorithm!r}, {self.observation.size} observations, {manifest.steps:,} steps on"
+            f" {scenario!r:.66}, sha256 {manifest.manifest_sha256[:12]})"
         )
 
     @cached_property
@@ -101,10 +101,10 @@ class Policy:
         """
         data = _serialise(tensors)
         seen = observation if isinstance(observation, ObservationSchema) else ObservationSchema.of(observation)
-        given = {"versions": installed_versions(), **manifest, "format_version": manifest["network"].format_version}
+        manifest_ = {"versions": installed_versions(), **manifest, "format_version": manifest["network"].format_version}
         try:
             weights = hashlib.sha256(data).hexdigest()
-            draft = Manifest(**given, observation=seen, weights_sha256=weights, manifest_sha256="0" * 64)
+            draft = Manifest(**manifest_, observation=seen, weights_sha256=weights, manifest_sha256="0" * 64)
             own = content_sha256(draft.model_dump(mode="json"))
             checked = draft.model_copy(update={"manifest_sha256": own})
             return cls(checked, checked_tensors(data, checked))
@@ -118,12 +118,12 @@ class Policy:
         """The policies that this policy's network chooses among (``NetworkSpec.among``); empty for most policies."""
         follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
         fields = self.manifest.model_dump(exclude=follows)
-        found = []
+        members = []
         for k, network in enumerate(self.manifest.network.among, start=1):
             start = f"among_{k}."
             tensors = {name.removeprefix(start): each for name, each in self.tensors.items() if name.startswith(start)}
-            found.append(Policy.make(tensors, network=network, observation=self.manifest.observation, **fields))
-        return tuple(found)
+            members.append(Policy.make(tensors, network=network, observation=self.manifest.observation, **fields))
+        return tuple(members)
 
     @staticmethod
     def stands_in(folder: Path) -> bool:

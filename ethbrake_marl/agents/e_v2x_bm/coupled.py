@@ -90,9 +90,9 @@ def optimise_coupled(
     total = impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm
     hit = np.flatnonzero(total > 0.0)
     if hit.size:
-        found = _minimise(worlds, told, command, vehicle, hit, harm_count, horizon_s)
+        optimum = _minimise(worlds, told, command, vehicle, hit, harm_count, horizon_s)
         harms = (first, total) if harm_count == "first" else (total, first)
-        for column, values in zip((best, *harms), found, strict=True):
+        for column, values in zip((best, *harms), optimum, strict=True):
             column[hit] = values
     return CoupledOptimum(best, first if harm_count == "first" else total, first, total)
 
@@ -127,20 +127,20 @@ def _minimise(
 
     def search(part: slice) -> tuple[Floats, Ints]:
         some = rows[part]
-        found, status = np.empty((3, some.size)), np.empty(some.size, np.int64)
-        _search_worlds(*lines, vehicle, some, harm_count == "total", horizon_s, found, status)
-        return found, status
+        result, status = np.empty((3, some.size)), np.empty(some.size, np.int64)
+        _search_worlds(*lines, vehicle, some, harm_count == "total", horizon_s, result, status)
+        return result, status
 
     parts = by_parts(search, rows.size, (os.cpu_count() or 1) if rows.size >= _MANY else 1)
-    found, status = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
+    result, status = (np.concatenate(each, axis=-1) for each in zip(*parts, strict=True))
     if (status != FLAG.DONE).any():
         with renumbered(rows):
             raise FLAG.failure(status, worlds.time_s[rows], np.full(rows.size, horizon_s))
     if rows.size >= _MANY:
-        _FOUND[key] = found.copy()
+        _FOUND[key] = result.copy()
         for old in list(_FOUND)[:-_REMEMBERED]:
             _FOUND.pop(old, None)
-    return found
+    return result
 
 
 @compiled

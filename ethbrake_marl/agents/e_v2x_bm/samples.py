@@ -111,16 +111,16 @@ def find_smallest(values: Floats, n: int, places: Ints) -> None:
 
     As many as ``places`` is long, which must be at most ``n``. Equal values keep their order.
     """
-    found = 0
+    count = 0
     for k in range(n):
-        if found == places.shape[0] and not values[k] < values[places[found - 1]]:
+        if count == places.shape[0] and not values[k] < values[places[count - 1]]:
             continue
-        to = found if found < places.shape[0] else found - 1
+        to = count if count < places.shape[0] else count - 1
         while to > 0 and values[places[to - 1]] > values[k]:
             places[to] = places[to - 1]
             to -= 1
         places[to] = k
-        found = min(found + 1, places.shape[0])
+        count = min(count + 1, places.shape[0])
 
 
 @compiled(bare=True)

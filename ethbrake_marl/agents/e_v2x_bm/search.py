@@ -148,18 +148,18 @@ def look_inside(line: Line, room: Room) -> int:
         if not (bounds[k] < best or grid.course[k] != grid.course[k + 1]):
             bounds[k] = math.inf
     find_smallest(bounds, GRID - 1, cells)
-    found = 0
-    while found < CELLS and bounds[cells[found]] < math.inf:
-        found += 1
-    _put_in_order(cells, found)
-    for c in range(found):
+    count = 0
+    while count < CELLS and bounds[cells[count]] < math.inf:
+        count += 1
+    _put_in_order(cells, count)
+    for c in range(count):
         low = grid.at[cells[c]]
         width = grid.at[cells[c] + 1] - low
         for k in range(INSIDE):
             new.at[INSIDE * c + k] = low + width * _SHARES_INSIDE[k]
-    status = simulate(line, new, _ZERO, INSIDE * found, math.inf)
-    number = GRID + CANDIDATES + INSIDE * found
-    merge(looked, GRID + CANDIDATES, new, INSIDE * found, grid)
+    status = simulate(line, new, _ZERO, INSIDE * count, math.inf)
+    number = GRID + CANDIDATES + INSIDE * count
+    merge(looked, GRID + CANDIDATES, new, INSIDE * count, grid)
     for k in range(number, _LOOKED):
         copy_sample(grid, number - 1, grid, k)
     return status
@@ -235,14 +235,14 @@ def narrow_minima(line: Line, room: Room) -> int:
 
     Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
     """
-    found, minima, last = room.two, room.minima, _NARROWED - 1
-    find_minima(found, _NARROWED, room.values, minima)
+    inner, minima, last = room.two, room.minima, _NARROWED - 1
+    find_minima(inner, _NARROWED, room.values, minima)
     for m in range(MINIMA):
         middle, to = minima[m], _NARROWED + m
-        copy_sample(found, middle, found, to)
+        copy_sample(inner, middle, inner, to)
         if room.values[middle] < math.inf:
-            low, high = found.at[max(middle - 1, 0)], found.at[min(middle + 1, last)]
-            status = _narrow(line, room.few, low, high, found, to)
+            low, high = inner.at[max(middle - 1, 0)], inner.at[min(middle + 1, last)]
+            status = _narrow(line, room.few, low, high, inner, to)
             if status != FLAG.DONE:
                 return status
     return FLAG.DONE

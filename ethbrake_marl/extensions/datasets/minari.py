@@ -163,13 +163,13 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
     """Return the infos that the environment gives to ``vehicle`` (0 = front), by name, each [T + 1, n, ...]."""
-    told = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
+    infos = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
     return {
-        **told,
-        "collided": told["collided"] == 1.0,
-        "chosen_action": told["chosen_action"].astype(np.float32)[:, :, np.newaxis],
+        **infos,
+        "collided": infos["collided"] == 1.0,
+        "chosen_action": infos["chosen_action"].astype(np.float32)[:, :, np.newaxis],
         "cost": cost,
         "world_seed": np.full(cost.shape, recording.task.seed),
         "world": np.stack([each.world for each in recording.reports]),
@@ -244,9 +244,11 @@ def write_dataset(
     chosen = check_dataset(path, scenario, format, force=force)
     spec = observation_for(scenario) if observation is None else choose_observation(observation)
     task = Task(scenario, int(seed), reward_params(reward), spec)
-    told = tell(task, agents, episodes)
+    metadata = tell(task, agents, episodes)
     sink = (
-        parquet_dataset(Path(path), told) if chosen == "parquet" else minari_folder(Path(path), task, told, force=force)
+        parquet_dataset(Path(path), metadata)
+        if chosen == "parquet"
+        else minari_folder(Path(path), task, metadata, force=force)
     )
     recorded, off_by, left_out, decisions = dict.fromkeys(agents, 0), dict.fromkeys(agents, 0.0), [], 0
     with sink as add:
@@ -270,8 +272,8 @@ def write_dataset(
                 on_progress(name, first + count)
         if not decisions:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in left_out})
-        told["left_out"] = [left._asdict() for left in left_out]
-        told["off_by"] = off_by
+        metadata["left_out"] = [left._asdict() for left in left_out]
+        metadata["off_by"] = off_by
     return DatasetSummary(Path(path), chosen, recorded, decisions, off_by, tuple(left_out))
 
 

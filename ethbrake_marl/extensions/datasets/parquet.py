@@ -90,7 +90,7 @@ def decision_columns(recording: Recording) -> Columns:
             **{f"reward_{name}_{i + 1}": each(term[1:, :, c]) for name, term in terms.items()},
         }
     return columns | {
-        "cost": each(np.stack([told.cost for told in recording.reports[1:]])),
+        "cost": each(np.stack([report.cost for report in recording.reports[1:]])),
         "terminated": each(stacked["terminated"]),
         "truncated": each(stacked["truncated"]),
         "first_impact_harm": whole(recording.ledger.world_harm("first")),

@@ -89,12 +89,12 @@ class Recording:
         Entry t + 1 belongs to step t; entry 0 is 0.
         """
         shape = (len(self.index), self.task.scenario.vehicles)
-        found = {}
+        terms = {}
         for name in self.reports[0].terms:
-            each = [told.terms[name] for told in self.reports]
+            each = [report.terms[name] for report in self.reports]
             whole = [np.broadcast_to(t[:, np.newaxis] if t.ndim == 1 else t, shape) for t in each]
-            found[name] = np.stack([term[:, list(self.learners)] for term in whole])
-        return found
+            terms[name] = np.stack([term[:, list(self.learners)] for term in whole])
+        return terms
 
 
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:

@@ -263,8 +263,8 @@ class _Run:
             self._move()
             self._end()
         guarded = self.engine.guarded
-        driven = {i: memory for i, memory in self.memories.items() if i in self.team.drivers}
-        outcome = outcome_of(self.team, Episodes(self.ledger, self.final, self.at_rest, guarded, driven))
+        memories = {i: memory for i, memory in self.memories.items() if i in self.team.drivers}
+        outcome = outcome_of(self.team, Episodes(self.ledger, self.final, self.at_rest, guarded, memories))
         shield = None if guarded is None else guarded.shield
         return Hosted(outcome, shield.memory.distrusted if isinstance(shield, StepShield) else None)
 
@@ -374,9 +374,9 @@ class _Run:
         Changes ``speeds_mps``, and returns the impacts.
 
         """
-        v, gaps, speeds, told = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
+        v, gaps, speeds, speeds_seen = self.alert.vehicles, self.gaps_m, self.speeds_mps, self.speeds_mps.copy()
         first, total, count = np.zeros(gaps.shape), np.zeros(gaps.shape), np.zeros(gaps.shape, np.int64)
-        pressing = np.diff(told - begin, axis=1) / np.maximum(step_s, SNAP)[:, np.newaxis]
+        pressing = np.diff(speeds_seen - begin, axis=1) / np.maximum(step_s, SNAP)[:, np.newaxis]
         for p in range(gaps.shape[1] - 1, -1, -1):
             closing = speeds[:, p + 1] - speeds[:, p]
             meets = (gaps[:, p] <= 0.0) & (closing > 0.0)
@@ -532,8 +532,8 @@ class _Motion:
         ``met`` [n, N]: vehicles that may have pushed one another.
         """
         # a host that handles latencies itself does not round them up to whole steps
-        begun = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
-        command = np.where(begun, step.wanted_mps2, 0.0)
+        acting = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
+        command = np.where(acting, step.wanted_mps2, 0.0)
         self.least_mps2, self.most_mps2 = np.minimum(self.least_mps2, command), np.maximum(self.most_mps2, command)
         least = np.where(met, self.least_mps2.min(axis=1, keepdims=True), self.least_mps2)
         most = np.where(met, self.most_mps2.max(axis=1, keepdims=True), self.most_mps2)

@@ -165,7 +165,7 @@ class FoundHost(NamedTuple):
         predicted (None without such a shield).
 
         """
-        found: dict[str, Hosted] = {}
+        results: dict[str, Hosted] = {}
         for spec, agent in agents.items():
             parts = []
             for first in range(0, sample.worlds.n, at_once):
@@ -174,12 +174,12 @@ class FoundHost(NamedTuple):
                 with renumbered(rows), AgentFailed.naming(spec), self.open(worlds) as host:
                     parts.append(drive_host(host, agent, scenario, worlds))
                 on_progress(spec, int(rows[-1]) + 1)
-            found[spec] = Hosted.join(parts)
-        outcomes = {spec: each.outcome for spec, each in found.items()}
+            results[spec] = Hosted.join(parts)
+        outcomes = {spec: each.outcome for spec, each in results.items()}
         whole = Evaluation(
             scenario, scenario.learners, sample.worlds, sample.index, seed, outcomes, kinds=sample.kinds, host=self.name
         )
-        return whole, {spec: each.distrusted for spec, each in found.items()}
+        return whole, {spec: each.distrusted for spec, each in results.items()}
 
 
 def find_host(spec: str) -> FoundHost:

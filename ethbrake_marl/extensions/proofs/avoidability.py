@@ -118,9 +118,9 @@ def largest_behind(
     """
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
-        found = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
-        if found[0] <= cap:
-            return found
+        meeting = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
+        if meeting[0] <= cap:
+            return meeting
         after_l, way_l, _ = solo_motion(v_l, -a_l, 0.0, math.inf, cap)
         gap = gap + (way_l - 0.5 * (v_f + limit) * cap)
         v_l, v_f = after_l, limit

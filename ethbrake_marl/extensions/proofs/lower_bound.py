@@ -442,21 +442,21 @@ def lower_bound(
     struck = at_onset.obstacle_hit & (harm_count == "first")  # a further impact with the obstacle is not counted
     unavoidable = has_front & has_rear & (reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
-    given: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)
+    arguments: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)
     kernel: Callable[..., None] = bound_worlds
     if slow.any():
         # the bound does not cover a neighbour that still drives because of an earlier command
         left_alone = np.delete(at_onset.command_mps2, vehicle, axis=1).max(axis=1) <= 0.0
-        given = (has_front, has_rear & left_alone, unavoidable & left_alone, out)
-        given, kernel = (ramped_states(at_onset, vehicle, horizon_s - start), *given), bound_ramped
+        arguments = (has_front, has_rear & left_alone, unavoidable & left_alone, out)
+        arguments, kernel = (ramped_states(at_onset, vehicle, horizon_s - start), *arguments), bound_ramped
     else:
         states = onset_states(at_onset, vehicle, time_step_s)
         ahead = states[:, LINE.OBSTACLE]
         states[:, LINE.WALL] = np.where(np.isfinite(ahead) & ~struck, ahead, 0.0)
         states[:, LINE.UNTIL] = horizon_s - start
-        given = (states, horizon_s - start, *given)
+        arguments = (states, horizon_s - start, *arguments)
     threads = min(os.cpu_count() or 1, worlds.n // LEAST_PART + 1)
-    by_parts(lambda part: kernel(*(array[part] for array in given)), worlds.n, threads)
+    by_parts(lambda part: kernel(*(array[part] for array in arguments)), worlds.n, threads)
     parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
     early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
     return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)

@@ -36,13 +36,13 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
     place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
     cap = time_to_limit(v, u, at[LINE.LIMIT_F])
     drive = u if cap > 0.0 else 0.0
-    driven = (v + 0.5 * drive * time) * time
+    travelled = (v + 0.5 * drive * time) * time
     beyond = 0.5 * drive * max(time - cap, 0.0) * max(time - cap, 0.0)
-    guard = _GUARD * (driven + place)
-    brake = math.sqrt(2.0 * max(driven - beyond - place + guard, 0.0) / a)
+    guard = _GUARD * (travelled + place)
+    brake = math.sqrt(2.0 * max(travelled - beyond - place + guard, 0.0) / a)
     top = v + drive * cap
     if time - brake < cap:
-        brake = math.sqrt(2.0 * max(driven - place + guard, 0.0) / (drive + a))
+        brake = math.sqrt(2.0 * max(travelled - place + guard, 0.0) / (drive + a))
         top = v + drive * (time - brake)
     if brake > time:
         brake, top = time, v

@@ -213,7 +213,7 @@ def behind_leader(
 
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
-    kept = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
+    rest = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
     # time by which the rear vehicle must have arrived: at the leader, or at the obstacle
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
@@ -225,7 +225,7 @@ def behind_leader(
     at_wall = until > struck
     if at_wall:
         until = early + walk(gap + at[LINE.WALL] - way_l, 0.0, plan, v_r, other, math.inf)[1]
-    least, low, brakes = slowest(at, early, late, kept * soft)
+    least, low, brakes = slowest(at, early, late, rest * soft)
     time, stand = until - late, low / brakes
     if not _SHORTEST_S < time < math.inf:
         return 0.0
@@ -244,7 +244,7 @@ def behind_leader(
             longest = max(longest, time - 2.0 * room / (low + math.sqrt(left)))
     elif goal < least + (low - 0.5 * brakes * min(time, stand)) * min(time, stand) - AHEAD_M:
         return LARGE
-    fastest = v_l + kept * hard + drive * (until - early)
+    fastest = v_l + rest * hard + drive * (until - early)
     for k in range(_FLIGHTS if at_wall else 1):
         flight = min(max(longest * (1.0 - k / _FLIGHTS), _SHORTEST_S), time)
         braked = min(time - flight, stand)
@@ -261,8 +261,8 @@ def behind_leader(
         since = min(walk(max(least - way_r + at[LINE.GAP_R], 0.0), low, plan, v_r, other, time)[1], time)
         v_r, way_r = follower(at, late + since)
         v_l, way_l = leader(at, late)
-        v_f, weak = v_l + kept * hard, max(at[LINE.A_F], at[LINE.A_R])
-        further = way_r - at[LINE.GAP_R] - at[LINE.GAP_L] - way_l - kept * hard * (late - early)
+        v_f, weak = v_l + rest * hard, max(at[LINE.A_F], at[LINE.A_R])
+        further = way_r - at[LINE.GAP_R] - at[LINE.GAP_L] - way_l - rest * hard * (late - early)
         further -= (v_f - 0.5 * weak * since) * since
         front, rear, pull, rear_pull = all_three(at)
         left = struck - late

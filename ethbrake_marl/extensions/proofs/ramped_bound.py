@@ -99,10 +99,10 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
             out[k, kind - RAMPED_FRONT] = 0.0
             if there:
                 time, closing, least = meet_ramped(kind, at, sign, plan, other)
-                found = least * least if kind == RAMPED_FRONT else closing * closing
+                bound = least * least if kind == RAMPED_FRONT else closing * closing
                 contact_s = min(contact_s, time)
-                if time < at[LINE.UNTIL] and found > TOUCH_HARM:
-                    out[k, kind - RAMPED_FRONT] = found
+                if time < at[LINE.UNTIL] and bound > TOUCH_HARM:
+                    out[k, kind - RAMPED_FRONT] = bound
         out[k, COMBINED_BOUND] = 0.0
         if both[k]:
             front, rear = out[k, FRONT_BOUND], out[k, REAR_BOUND]

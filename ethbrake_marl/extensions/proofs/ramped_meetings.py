@@ -255,10 +255,10 @@ def after_ramped(
     """
     sign = 1.0 if kind == RAMPED_FRONT else -1.0
     share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
-    kept = 1.0 - share * (1.0 + at[LINE.RESTITUTION])
-    if kind == RAMPED_FRONT and (kept < 0.0 or at[LINE.OBSTACLE] < math.inf):
+    rest = 1.0 - share * (1.0 + at[LINE.RESTITUTION])
+    if kind == RAMPED_FRONT and (rest < 0.0 or at[LINE.OBSTACLE] < math.inf):
         return 0.0  # the controlled vehicle may be thrown back
-    kept, span = max(kept, 0.0), late - early
+    rest, span = max(rest, 0.0), late - early
     high, rise, _, _ = range_of(sign, at)
     force = high
     if rise < math.inf:
@@ -273,11 +273,11 @@ def after_ramped(
         least = force_of(plan, early) if travel(plan, at[LINE.V_L], math.inf, late)[0] > 0.0 else 0.0
         fill_build_up(plan, late, force, high, rise)
         plan[FORCES, 0] = max(force, least)
-        found = meeting(
-            gap, kept * hard * span, v_l + kept * hard, plan, math.inf, v_r, other, math.inf, early, at[LINE.UNTIL]
+        impact = meeting(
+            gap, rest * hard * span, v_l + rest * hard, plan, math.inf, v_r, other, math.inf, early, at[LINE.UNTIL]
         )
     else:
-        v = v_r - kept * hard
+        v = v_r - rest * hard
         if v <= 0.0:
             return 0.0
         most = force_of(other, late)
@@ -287,8 +287,8 @@ def after_ramped(
             since, begins = late + begins / rise, 0.0
         fill_build_up(other, since, begins, -high, rise)
         other[FORCES, 0] = min(begins, most)
-        found = meeting(gap, kept * hard * span, v_l, plan, math.inf, v, other, math.inf, early, at[LINE.UNTIL])
-    return found[2] * found[2]
+        impact = meeting(gap, rest * hard * span, v_l, plan, math.inf, v, other, math.inf, early, at[LINE.UNTIL])
+    return impact[2] * impact[2]
 
 
 @compiled(apart=True)

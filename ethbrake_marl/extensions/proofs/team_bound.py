@@ -63,21 +63,21 @@ def _combined_bound_of_line(
     rows = np.flatnonzero((onset[:, 0] <= 0.0) & counts[:, 0] & counts[:, 1] & stops & ~now.obstacle_hit)
     # the first three vehicles of these worlds; Vehicle 2 may act at once
     some = now.take(rows)
-    given = some.vehicles
+    vehicles_ = some.vehicles
     braking, driving, latency, mass, limit = (
         np.ascontiguousarray(each[:, :3])
         for each in (
-            given.braking_capacity_mps2,
-            given.driving_capacity_mps2,
-            given.latency_s,
-            given.mass_t,
-            given.speed_limit_mps,
+            vehicles_.braking_capacity_mps2,
+            vehicles_.driving_capacity_mps2,
+            vehicles_.latency_s,
+            vehicles_.mass_t,
+            vehicles_.speed_limit_mps,
         )
     )
     latency[:, _MIDDLE] = np.minimum(latency[:, _MIDDLE], some.time_s)
     three = replace(
         some,
-        vehicles=Vehicles.at_once(braking, driving, latency, mass, limit, given.restitution),
+        vehicles=Vehicles.at_once(braking, driving, latency, mass, limit, vehicles_.restitution),
         gaps_m=some.gaps_m[:, :2].copy(),
         speeds_mps=some.speeds_mps[:, :3].copy(),
         pair_hit=some.pair_hit[:, :2].copy(),
@@ -93,10 +93,10 @@ def _combined_bound_of_line(
     if now.N == 3:  # nobody pushes the last vehicle
         full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
         since, power = onset[rows, _REAR], full if _REAR in chosen else np.zeros(len(rows))
-    found, out = np.zeros(now.n), np.empty(len(rows))
+    bounds, out = np.zeros(now.n), np.empty(len(rows))
     bound_threes(onset_states(three, _MIDDLE, steps), until[rows], pairs[rows], since, power, out)
-    found[rows] = out
-    return found
+    bounds[rows] = out
+    return bounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,16 +154,16 @@ def team_bound(
     # sort the controlled vehicles, and refuse what the bound does not cover
     if not isinstance(vehicles, Iterable):
         raise InvalidInput(f"team_bound: vehicles {vehicles!r}: must be a list of vehicles, for instance (1, 2)")
-    given = tuple(vehicles)
-    for vehicle in given:
+    team = tuple(vehicles)
+    for vehicle in team:
         check_whole_number("team_bound: a vehicle", vehicle, 0, worlds.N - 1)
-    if not given or len(set(given)) != len(given):
-        raise InvalidInput(f"team_bound: vehicles {given}: at least one is needed, each once")
+    if not team or len(set(team)) != len(team):
+        raise InvalidInput(f"team_bound: vehicles {team}: at least one is needed, each once")
     for index, script in (scripts or {}).items():
         check_whole_number("team_bound: a vehicle of scripts", index, 0, worlds.N - 1)
-        if index not in given and script != "full_brake":
+        if index not in team and script != "full_brake":
             raise InvalidInput(f"team_bound: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
-    chosen = np.array(sorted(given), np.int64)
+    chosen = np.array(sorted(team), np.int64)
     worlds.refuse_build_up("team_bound")
     now, start, early, counts = at_onset_of("team_bound", worlds, chosen, harm_count, horizon_s)
     onset = np.maximum(worlds.vehicles.latency_s - start[:, np.newaxis], 0.0)
@@ -227,9 +227,9 @@ def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bo
         counts: [n] True for worlds in which the next impact of the pair counts.
 
     """
-    at, found, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
+    at, bounds, out = np.zeros((len(until), PAIR_WIDTH)), np.zeros(len(until)), np.empty(int(counts.sum()))
     for column, values in columns.items():
         at[:, column] = values
     bound_pairs(at[counts], until[counts], out)
-    found[counts] = out
-    return found
+    bounds[counts] = out
+    return bounds

@@ -61,7 +61,7 @@ def from_data_command(
         out.check(output, ".yaml", what="the scenario")
         out.check(rows)
         try:
-            made = scenario_from_data(
+            result = scenario_from_data(
                 output.stem, folder, format, columns=columns, based_on=based_on, every_s=every, draw=draw,
                 strict=strict, progress=out.progress,
             )  # fmt: skip
@@ -69,17 +69,17 @@ def from_data_command(
             for each in getattr(error, "__notes__", ()):
                 out.note(f"refused: {each}")
             raise
-        for each in made.refused:
+        for each in result.refused:
             out.note(f"refused: {each}")
         with new_file(output) as partial:
-            partial.write_text(made.text, "utf-8")
+            partial.write_text(result.text, "utf-8")
             if draw == "rows":
-                out.write(rows, made.csv, what="rows")
+                out.write(rows, result.csv, what="rows")
             else:  # remove the rows of an earlier run, to which no scenario refers any more
                 rows.unlink(missing_ok=True)
         out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
-        lists = {"found": made.found, "refused": made.refused, "skipped": made.skipped}
-        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, **lists}, *made.found)
+        lists = {"found": result.found, "refused": result.refused, "skipped": result.skipped}
+        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, **lists}, *result.found)
 
 
 FROM_DATA = Part(

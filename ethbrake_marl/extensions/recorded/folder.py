@@ -100,7 +100,7 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
-    found, seen, refused, twice = dict[str, Path](), set[object](), list[str](), list[str]()
+    files, seen, refused, twice = dict[str, Path](), set[object](), list[str](), list[str]()
     walk = os.walk(folder, onerror=lambda error: refused.append(f"{error.filename}: cannot be read ({error.strerror})"))
     everything = {Path(top, name) for top, _, names in walk for name in names}
     sizes = Counter(map(_size, everything))
@@ -112,12 +112,12 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
         shown = plain_text(below.as_posix())
         again = entry.headless and file.suffix == ".txt" and file.with_suffix(".csv") in everything
         content = _content(file) if sizes[_size(file)] > 1 else file
-        if again or shown in found or content in seen:
+        if again or shown in files or content in seen:
             twice.append(shown)
         else:
             seen.add(content)
-            found[shown] = file
-    return found, refused, twice
+            files[shown] = file
+    return files, refused, twice
 
 
 def _size(file: Path) -> int:

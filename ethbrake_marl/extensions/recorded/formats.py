@@ -118,21 +118,21 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
             raise InvalidInput(f"columns: only --format table takes columns; those of {FORMATS[name].title} are known")
         return FORMATS[name]
     pairs = [[each.strip() for each in part.partition("=")[::2]] for part in columns.split(",")]
-    given = {key: value for key, value in pairs if value}
+    settings = {key: value for key, value in pairs if value}
     known, example = (*_ROLES, "units"), ",".join(f"{key}=..." for key in _ROLES)
-    if Counter(key for key, _ in pairs) != Counter(known) or len(given) < len(known):
+    if Counter(key for key, _ in pairs) != Counter(known) or len(settings) < len(known):
         raise InvalidInput(f"columns = {columns!r}: must be {example},units={'|'.join(_UNITS)}, each once")
-    if given["units"] not in _UNITS:
-        raise InvalidInput(f"columns: units = {given['units']!r}: must be one of {', '.join(_UNITS)}")
-    metres, mps, units = _UNITS[given["units"]]
-    column, _, divisor = given["time"].rpartition("/")
+    if settings["units"] not in _UNITS:
+        raise InvalidInput(f"columns: units = {settings['units']!r}: must be one of {', '.join(_UNITS)}")
+    metres, mps, units = _UNITS[settings["units"]]
+    column, _, divisor = settings["time"].rpartition("/")
     second = parse_numeral(divisor) if column else None
     if second is not None:
-        given["time"] = column
+        settings["time"] = column
         if not 0.0 < second < math.inf:
             raise InvalidInput(f"columns: time = .../{divisor}: must be the number of units of time in a second")
     return Format(
-        "the table", ("*.csv", "*.txt", "*.parquet"), {role: given[key] for key, role in _ROLES.items()},
+        "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[key] for key, role in _ROLES.items()},
         units,
         "Its licence is not known here: look where the data come from.", metres, mps, 1.0 / (second or 1.0), 0.0, 0.01,
         mixed=True, texts=(1, 2), separators=",;\t",

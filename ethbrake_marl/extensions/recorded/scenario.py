@@ -95,7 +95,7 @@ def scenario_from_data(
             f"{folder}: no {vehicles} vehicles follow each other in a lane at any moment looked at"
             f"{longest * (rows.longest > 1)}"
         )
-    recordings, found = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)
+    recordings, summary = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)
     fastest_mps = max(max(row[vehicles - 1 :]) for row in rows.numbers)
     at_rest_s = np.max(base.bounds("latency_s")) + fastest_mps / np.min(base.bounds("braking_capacity_mps2"))
     headings = [rule.column_of(i) for rule in _OF_A_ROW for i in range(rule.count(vehicles))] + [RECORDING]
@@ -107,7 +107,7 @@ def scenario_from_data(
         "description": f"Speeds and gaps of {recordings} of {entry.title}. Brakes, masses and latencies, which nobody"
         f" recorded, are as in {base.name}.",
         "source": f"{entry.title}, recorded in {entry.units}, folder {plain_text(folder.resolve().name)}."
-        f" {'; '.join(found)}. {entry.licence}",
+        f" {'; '.join(summary)}. {entry.licence}",
         "horizon_s": max(base.horizon_s, math.ceil(at_rest_s) + 1.0),
         **(table if draw == "rows" else fit_rows(np.array(rows.numbers), draw)),
     }
@@ -119,7 +119,7 @@ def scenario_from_data(
     text = "".join(f"{key}: {flow_text(content[key])}\n" for key in Scenario.model_fields if key in content)
     lines = io.StringIO()
     csv.writer(lines, lineterminator="\n").writerows([headings, *named])
-    return FromData(text, lines.getvalue(), found, rows.refused, rows.skipped)
+    return FromData(text, lines.getvalue(), summary, rows.refused, rows.skipped)
 
 
 def _name(file: str, vehicles: str) -> str:
@@ -130,16 +130,16 @@ def _name(file: str, vehicles: str) -> str:
 def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
     """Return sentences that say what was found in a folder, and what was left out."""
     groups = {2: "pair", 3: "trio"}.get(vehicles, "queue")
-    found = [
+    parts = [
         f"{count_of(rows.seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s, each vehicle in one of them at"
         " most",
         f"rows of {count_of(len(set(rows.of)), f'different {groups}')} of vehicles in"
         f" {count_of(len({file for file, _ in rows.of}), 'recording')}",
     ]
-    found += [f"left out: {number:,} {what}" for what, number in sorted(rows.left_out.items()) if number]
+    parts += [f"left out: {number:,} {what}" for what, number in sorted(rows.left_out.items()) if number]
     if rows.skipped:
         more = f" and {len(rows.skipped) - _LISTED:,} more" if len(rows.skipped) > _LISTED else ""
-        found += [f"skipped, no recordings or there already: {', '.join(rows.skipped[:_LISTED])}{more}"]
+        parts += [f"skipped, no recordings or there already: {', '.join(rows.skipped[:_LISTED])}{more}"]
     if rows.refused:
-        found += [f"refused: {count_of(len(rows.refused), 'file')}"]
-    return found
+        parts += [f"refused: {count_of(len(rows.refused), 'file')}"]
+    return parts

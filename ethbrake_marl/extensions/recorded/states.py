@@ -137,17 +137,17 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
     """
     if entry.gaps:
         return _of_gaps(piece, entry, ticks)
-    given, at = dict(zip(entry.columns, piece.values.T, strict=True)), list(entry.columns).index
+    columns, at = dict(zip(entry.columns, piece.values.T, strict=True)), list(entry.columns).index
     for role in ("id", "lane", "preceding") if not entry.texts else ():
-        if role in given:
-            value, least = given[role], entry.alone if role == "preceding" else 0.0
+        if role in columns:
+            value, least = columns[role], entry.alone if role == "preceding" else 0.0
             odd, right = (value != np.rint(value)) | (value < least), f"must be a whole number, {least:g} or above"
             piece.refuse(odd, at(role), right)
     zero = np.zeros(len(ticks))
-    who, lane, ahead = given["id"], given.get("lane", zero), given.get("preceding", zero - 1.0)
+    who, lane, ahead = columns["id"], columns.get("lane", zero), columns.get("preceding", zero - 1.0)
     ahead = np.where(ahead == entry.alone, -1.0, ahead)
-    front, side, length = (given.get(role, zero) * entry.metres for role in ("front", "side", "length"))
-    dx, dy, speed = zero + 1.0, zero, given["speed"] * entry.mps
+    front, side, length = (columns.get(role, zero) * entry.metres for role in ("front", "side", "length"))
+    dx, dy, speed = zero + 1.0, zero, columns["speed"] * entry.mps
     right = f"m of length: must be in (0, {LONGEST_M:g}]; {entry.title} has {entry.units}"
     piece.refuse((length <= 0.0) | (length > LONGEST_M), at("length"), right, length)
     if entry.title == "highD":
@@ -157,7 +157,7 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
         right_hand = turned[place, 1] == 2.0  # x is the left edge of the vehicle and grows to the right
         front, speed = np.where(right_hand, front + length, -front), speed * np.where(right_hand, 1.0, -1.0)
     elif entry.title == "exiD":  # x and y are those of the centre
-        dx, dy = np.cos(np.deg2rad(given["heading"])), np.sin(np.deg2rad(given["heading"]))
+        dx, dy = np.cos(np.deg2rad(columns["heading"])), np.sin(np.deg2rad(columns["heading"]))
         front, side = front + length / 2.0 * dx, side + length / 2.0 * dy
     right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
     piece.refuse(speed > FASTEST_MPS, at("speed"), right, speed)
