@@ -34,8 +34,8 @@ class Progress:
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
-        told = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
-        return ", ".join(told[:1])
+        parts = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
+        return ", ".join(parts[:1])
 
     @staticmethod
     def listener(told: Told) -> OnProgress | None:

@@ -65,11 +65,11 @@ class Cost(NamedTuple):
     def __str__(self) -> str:
         """Return the estimate in words, with a line for each damaged part of a search."""
         speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
-        told = Timed.in_words
+        text = Timed.in_words
         line = (
-            f"to do: {self.trainings} trainings, {self.decisions:,} decisions{speed}: {told(self.training_s)}; joint"
-            f" optima {told(self.search_s)}; driving the common worlds {told(self.driving_s)}; together about"
-            f" {told(self.total_s)} of one core"
+            f"to do: {self.trainings} trainings, {self.decisions:,} decisions{speed}: {text(self.training_s)}; joint"
+            f" optima {text(self.search_s)}; driving the common worlds {text(self.driving_s)}; together about"
+            f" {text(self.total_s)} of one core"
         )
         return "\n".join([line, *(f"{file}: is damaged; its worlds are searched again" for file in self.damaged)])
 
@@ -122,5 +122,5 @@ def ablation_cost(plan: Plan) -> Cost:
             searching = partial(best_harm, level.scenario, budget=plan.budget, threads=1)
             searched_s[name] = Timed.each_s(part.worlds, searching, most=4)
         search_s += number * searched_s.get(name, 0.0)
-    begun = sum(steps > 0 for *_, steps in left)
-    return Cost(begun, decisions.total(), training_s, search_s, driving_s, len(left), len(searches), tuple(damaged))
+    started = sum(steps > 0 for *_, steps in left)
+    return Cost(started, decisions.total(), training_s, search_s, driving_s, len(left), len(searches), tuple(damaged))

@@ -85,9 +85,9 @@ def ablate_command(
         written = run_ablation(plan, jobs or 1, str(this_machine()), out.show_progress)
         if written is None:
             out.interrupted(f"interrupted; {KEPT}")
-        found, (page, text, *figures) = written
-        alarms = [Text(line, "bold red") for line in found["undertrained"]]
-        out.result(found, text.read_text("utf-8"), *alarms, end="")
+        results, (page, text, *figures) = written
+        alarms = [Text(line, "bold red") for line in results["undertrained"]]
+        out.result(results, text.read_text("utf-8"), *alarms, end="")
         drawn = f"; figures: {', '.join(map(str, figures))}" if figures else ""
         out.note(f"page: {page}; tables: {text}{drawn}")
 

@@ -65,7 +65,7 @@ def _level(one: Measured, searched: int) -> Json:
     The ``searched`` part also has the joint optimum and the share of the possible reduction.
     """
     scenario = one.level.scenario
-    found: Json = {
+    entry: Json = {
         **one.identity,
         "policy_sha256": [dict(seed) for seed in one.reached.policies],
         "level": one.level.name,
@@ -83,7 +83,7 @@ def _level(one: Measured, searched: int) -> Json:
         reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
         best = None if one.best is None else one.best[harm_count]
         share = None if best is None else share_over_seeds(reached[:, :searched], braking[:, :searched], best)
-        found[harm_count] = {
+        entry[harm_count] = {
             "full_brake": mean_over_seeds(braking).to_json(),
             "harm": mean_over_seeds(reached).to_json(),
             "each_seed": reached.mean(axis=1).tolist(),
@@ -99,7 +99,7 @@ def _level(one: Measured, searched: int) -> Json:
             },
             "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
         }
-    return found
+    return entry
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
@@ -137,22 +137,22 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``, with
     the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
     """
-    found: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
+    entry: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     if before.level.swept is not None and after.level.swept is not None:
-        found |= {"swept_key": after.level.swept.key}
-        found |= {"from_number": before.level.swept.number, "to_number": after.level.swept.number}
+        entry |= {"swept_key": after.level.swept.key}
+        entry |= {"from_number": before.level.swept.number, "to_number": after.level.swept.number}
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
         # compares seed k with seed k, or with the only seed
         old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
         worse = new > old + TOLERANCE
-        found[harm_count] = {
+        entry[harm_count] = {
             "difference": mean_over_seeds(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
             "vehicles": [mean_over_seeds(new, old).to_json() for new, old in pairs],
             "worse_off": mean_over_seeds(worse.any(axis=2)).to_json(),
             "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
         }
-    return found
+    return entry
 
 
 def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:

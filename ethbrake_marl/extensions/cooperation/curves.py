@@ -26,33 +26,33 @@ _MARGIN = 0.06  # at either end, as a share of the axis
 Json = dict[str, Any]
 
 
-def swept_axis(found: Json) -> str | None:
+def swept_axis(results: Json) -> str | None:
     """Return the label of the swept key: ``v2x.lost``, ``objective = social:…``; None if nothing is swept."""
-    first = found["levels"][0]
+    first = results["levels"][0]
     if "swept_key" not in first:
         return None
     word, colon, _ = first["swept_value"].rpartition(":")
     return f"{first['swept_key']} = {word}:…" if colon else str(first["swept_key"])
 
 
-def sweep_figures(found: Json, caption: str) -> list[Figure]:
+def sweep_figures(results: Json, caption: str) -> list[Figure]:
     """Return the figures of a sweep, drawn over its number on linear axes from 0, with 95 % intervals."""
-    return [_harm_curves(found, caption), _who_bears(found, caption)]
+    return [_harm_curves(results, caption), _who_bears(results, caption)]
 
 
-def _harm_curves(found: Json, caption: str) -> Figure:
+def _harm_curves(results: Json, caption: str) -> Figure:
     """Draw both harms between full braking and the joint optimum, in the worlds in which the optimum was searched."""
     figure, panels = new_panels((10.5, 4.8), columns=2)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
-        first = _of(found, algorithms(found)[0])
+        first = _of(results, algorithms(results)[0])
         for key, label, colour in (
             ("full_brake", "all brake fully", GREY),
             ("best_known", "joint optimum", COLOURS[3]),
         ):
             ends = [Estimate(**level[harm_count]["searched"][key]) for level in first]
             _curve(axes, first, ends, shade=True, color=colour, label=label, linewidth=2.0)
-        for number, algorithm in enumerate(algorithms(found)):
-            levels = _of(found, algorithm)
+        for number, algorithm in enumerate(algorithms(results)):
+            levels = _of(results, algorithm)
             style = series_style(number + 1 if number == 0 else number + 3)
             reached = [Estimate(**level[harm_count]["searched"]["harm"]) for level in levels]
             _curve(axes, levels, reached, 3 * number, capsize=3, label=algorithm, **style)
@@ -64,33 +64,33 @@ def _harm_curves(found: Json, caption: str) -> Figure:
                 behind = [Estimate(**level[harm_count]["shielded"]["searched"]["harm"]) for level in levels]
                 cross = {**style, "marker": "x", "linestyle": ":"}
                 _curve(axes, levels, behind, -2 - 2 * number, capsize=3, label=f"{algorithm}, shielded", **cross)
-        _number_axis(axes, found)
+        _number_axis(axes, results)
         name_axes(axes, TITLES[harm_count])
-    worlds = found["levels"][0]["first"]["searched"]["worlds"]
+    worlds = results["levels"][0]["first"]["searched"]["worlds"]
     told = f"{caption} All of this figure: the first {count_of(worlds, 'world')}."
     return finish(figure, told, panels[0], columns=4, fontsize=8.5)
 
 
-def _who_bears(found: Json, caption: str) -> Figure:
+def _who_bears(results: Json, caption: str) -> Figure:
     """Draw the harm of each vehicle, in all worlds; a further algorithm has other dashes."""
     figure, panels = new_panels((10.5, 4.8), columns=2)
-    several = len(algorithms(found))
+    several = len(algorithms(results))
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
-        for number, algorithm in enumerate(algorithms(found)):
-            levels = _of(found, algorithm)
+        for number, algorithm in enumerate(algorithms(results)):
+            levels = _of(results, algorithm)
             for i in range(len(levels[0][harm_count]["vehicles"])):
                 borne = [Estimate(**level[harm_count]["vehicles"][i]) for level in levels]
                 name = f"Vehicle {i + 1}" + (f", {algorithm}" if several > 1 else "")
                 style = {**series_style(i), "linestyle": series_style(number)["linestyle"]}
                 _curve(axes, levels, borne, several * i + number, capsize=3, label=name, clip_on=False, **style)
-        _number_axis(axes, found)
+        _number_axis(axes, results)
         name_axes(axes, f"{TITLES[harm_count]} that each vehicle bears")
     return finish(figure, caption, panels[0], columns=4, fontsize=8.5)
 
 
-def algorithms(found: Json) -> list[str]:
+def algorithms(results: Json) -> list[str]:
     """Return the algorithms that were trained, each once."""
-    return list(dict.fromkeys(level["algorithm"] for level in found["levels"] if level["algorithm"] is not None))
+    return list(dict.fromkeys(level["algorithm"] for level in results["levels"] if level["algorithm"] is not None))
 
 
 def with_intervals(
@@ -105,8 +105,8 @@ def with_intervals(
         axes.errorbar(values, at, xerr=errors, **style)
 
 
-def _of(found: Json, algorithm: str) -> list[Json]:
-    return [level for level in found["levels"] if level["algorithm"] == algorithm]
+def _of(results: Json, algorithm: str) -> list[Json]:
+    return [level for level in results["levels"] if level["algorithm"] == algorithm]
 
 
 def _curve(
@@ -140,13 +140,13 @@ def _span(levels: Sequence[Json]) -> tuple[float, float]:
     return min(*numbers, 0.0), max(*numbers, 0.0)
 
 
-def _number_axis(axes: Axes, found: Json) -> None:
+def _number_axis(axes: Axes, results: Json) -> None:
     """Make both axes linear from 0; ticks of the x axis are the swept numbers and 0 where there is room."""
-    numbers = sorted({0.0, *(level["swept_number"] for level in found["levels"])})
-    low, high = _span(found["levels"])
+    numbers = sorted({0.0, *(level["swept_number"] for level in results["levels"])})
+    low, high = _span(results["levels"])
     margin = _MARGIN * (high - low)
     axes.set_xlim(low - margin, high + margin)
     if len(numbers) <= _MOST_TICKS and np.diff(numbers).min() >= _ROOM * (high - low):
         axes.set_xticks(numbers)
-    axes.set_xlabel(swept_axis(found) or "", fontsize=9)
+    axes.set_xlabel(swept_axis(results) or "", fontsize=9)
     axes.set_ylim(0.0, 1.02 * axes.get_ylim()[1])

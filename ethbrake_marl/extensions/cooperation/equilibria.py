@@ -97,8 +97,8 @@ class _Game(NamedTuple):
             deciders=self.task.vehicles,
         )  # fmt: skip
         problem = minimising(problem, self.worlds, self.declared, task.vehicles)
-        given = starting_profiles(problem, self.worlds, task, others, [own[c]])
-        return search_profiles(problem, joined(given, problem.n), **effort)[0]
+        starts = starting_profiles(problem, self.worlds, task, others, [own[c]])
+        return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
         """Return the vehicles, of which the learners but number ``c`` follow ``own`` in pieces."""
@@ -173,12 +173,12 @@ def find_equilibria(
     draws = [seeded(game.joint.identity, seed + c) >> np.uint64(11) for c in range(low.shape[1])]
     share = np.stack(draws, axis=1) * 2.0**-53
     starts = dict(zip(STARTS, (low, high, np.clip(low + share * (high - low), low, high)), strict=True))
-    found = {}
+    equilibria = {}
     for k, (name, commands) in enumerate(starts.items()):
         own = [game.joint.constant(commands[:, np.newaxis, [c]]) for c in range(low.shape[1])]
         effort = {"budget": budget, "threads": threads, "seed": seed + k * rounds}
-        found[name] = _settle(game, own, rounds, tolerance, effort)
-    return found
+        equilibria[name] = _settle(game, own, rounds, tolerance, effort)
+    return equilibria
 
 
 def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, effort: Mapping[str, int]) -> Equilibrium:

@@ -41,21 +41,21 @@ _BESIDE = 0.42  # offset of a level with a worse channel, to the right of its le
 Json = dict[str, Any]
 
 
-def ablation_figures(found: Json, caption: str) -> list[Figure]:
+def ablation_figures(results: Json, caption: str) -> list[Figure]:
     """Return three figures of an ablation: harm per level, change from level to level, and change for each vehicle.
 
     Of a sweep, return its two figures (``sweep_figures``).
 
-    ``found`` is the content of ``ablation.json``; ``caption`` is the text below each figure.
+    ``results`` is the content of ``ablation.json``; ``caption`` is the text below each figure.
 
     Red text above a figure names the levels that are not trained enough.
     """
-    if swept_axis(found) is None:
-        figures = [_harm_curve(found, caption), _change_figure(found, caption), _who_pays(found, caption)]
+    if swept_axis(results) is None:
+        figures = [_harm_curve(results, caption), _change_figure(results, caption), _who_pays(results, caption)]
     else:
-        figures = sweep_figures(found, caption)
-    for figure in figures if found["undertrained"] else ():
-        text = "\n".join(textwrap.fill(line, int(figure.get_figwidth() * 13.0)) for line in found["undertrained"])
+        figures = sweep_figures(results, caption)
+    for figure in figures if results["undertrained"] else ():
+        text = "\n".join(textwrap.fill(line, int(figure.get_figwidth() * 13.0)) for line in results["undertrained"])
         for legend in figure.legends:  # the text goes into the legend, because a figure title would overlap it
             legend.set_title(text, prop=FontProperties(size=9))
             legend.set_alignment("left")
@@ -65,43 +65,43 @@ def ablation_figures(found: Json, caption: str) -> list[Figure]:
     return figures
 
 
-def _harm_curve(found: Json, caption: str) -> Figure:
+def _harm_curve(results: Json, caption: str) -> Figure:
     """Draw first-impact and total harm at each level, between full braking and the joint optimum.
 
-    All values are over the worlds in which the joint optimum was searched. ``found`` is the content of
+    All values are over the worlds in which the joint optimum was searched. ``results`` is the content of
     ``ablation.json``; ``caption`` is the text below.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
-    ladder = list(dict.fromkeys(level["level"] for level in found["levels"] if level["clear"] is None))
+    ladder = list(dict.fromkeys(level["level"] for level in results["levels"] if level["clear"] is None))
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
         for key, label, colour in (
             ("full_brake", "all brake fully", GREY),
             ("best_known", "joint optimum", COLOURS[3]),
         ):
-            shown = [level for level in found["levels"] if level[harm_count]["searched"][key] is not None]
+            shown = [level for level in results["levels"] if level[harm_count]["searched"][key] is not None]
             for number, level in enumerate(shown):  # short lines; even shorter lines for worse channels
                 x, half = _place(level, ladder), 0.3 if level["clear"] is None else 0.07
                 value, name = level[harm_count]["searched"][key]["value"], "" if number else label
                 axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
-        for number, algorithm in enumerate(algorithms(found)):
-            _reached(axes, found["levels"], ladder, harm_count, algorithm, number)
+        for number, algorithm in enumerate(algorithms(results)):
+            _reached(axes, results["levels"], ladder, harm_count, algorithm, number)
         axes.set_xticks(range(len(ladder)), [_short(name) for name in ladder], fontsize=8)
         if axes.dataLim.ymin < 1.0:
             axes.set_yscale("symlog", linthresh=LINEAR)
         axes.yaxis.set_major_formatter(FuncFormatter(plain))
         axes.set_ylim(0.0, (1.5 if axes.get_yscale() == "symlog" else 1.1) * axes.get_ylim()[1])
         name_axes(axes, TITLES[harm_count])
-    worlds = found["levels"][0]["first"]["searched"]["worlds"]
+    worlds = results["levels"][0]["first"]["searched"]["worlds"]
     told = f"{caption} All of this figure: the first {count_of(worlds, 'world')}."
     return finish(figure, told, panels[0], columns=4, fontsize=8.5)
 
 
-def _change_figure(found: Json, caption: str) -> Figure:
+def _change_figure(results: Json, caption: str) -> Figure:
     """Draw the change of harm from level to level, and by each worse V2X channel, with intervals; left: less harm.
 
-    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    ``results`` is the content of ``ablation.json``; ``caption`` is the text below.
     """
-    changes = found["steps"] + found["channels"]
+    changes = results["steps"] + results["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
         axes.axvline(0.0, color=GREY, linewidth=0.9)
@@ -122,17 +122,17 @@ def _change_figure(found: Json, caption: str) -> Figure:
         axes.set_xticks(signed_ticks(*axes.get_xlim()))
         axes.xaxis.set_major_formatter(FuncFormatter(plain))
         axes.xaxis.set_minor_locator(NullLocator())
-    panels[0].set_yticks(range(len(changes)), _of_changes(found), fontsize=8)
+    panels[0].set_yticks(range(len(changes)), _of_changes(results), fontsize=8)
     panels[0].set_ylim(len(changes) - 0.5, -0.8)  # from top to bottom
     return finish(figure, caption)
 
 
-def _who_pays(found: Json, caption: str) -> Figure:
+def _who_pays(results: Json, caption: str) -> Figure:
     """Draw the change of each vehicle's harm from level to level as a matrix; blue is less harm.
 
-    ``found`` is the content of ``ablation.json``; ``caption`` is the text below.
+    ``results`` is the content of ``ablation.json``; ``caption`` is the text below.
     """
-    changes = found["steps"] + found["channels"]
+    changes = results["steps"] + results["channels"]
     figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
     grids = {
         count: np.array([[estimate["value"] for estimate in change[count]["vehicles"]] for change in changes])
@@ -149,7 +149,7 @@ def _who_pays(found: Json, caption: str) -> Figure:
                 axes.text(column, row, f"{value:+.2f}", ha="center", va="center", fontsize=8, color=colour)
         axes.set_xticks(range(grid.shape[1]), [f"Vehicle {i + 1}" for i in range(grid.shape[1])], fontsize=9)
         axes.set_title(f"Change of {TITLES[harm_count][0].lower()}{TITLES[harm_count][1:]}", loc="left", fontsize=10)
-    every[0].set_yticks(range(len(changes)), _of_changes(found), fontsize=8)
+    every[0].set_yticks(range(len(changes)), _of_changes(results), fontsize=8)
     bar = figure.colorbar(image, ax=list(every), label="m²/s²", format=FuncFormatter(plain))
     bar.set_ticks(signed_ticks(-largest, largest))
     bar.ax.yaxis.set_minor_locator(NullLocator())
@@ -162,13 +162,13 @@ def signed_ticks(low: float, high: float) -> list[float]:
     They are for an axis that is linear between -0.1 and 0.1 and logarithmic beyond (``LINEAR``).
     """
     first = -1 if max(-low, high) > LINEAR else -3
-    found: list[float] = []
+    ticks: list[float] = []
     for steps in ((1,), (1, 3), (1, 2, 5)):
         sizes = [float(f"{step}e{power}") for power in range(first, 6) for step in steps]
-        found = [tick for tick in sorted({0.0, *sizes, *(-size for size in sizes)}) if low <= tick <= high]
-        if len(found) >= _LEAST_TICKS:
+        ticks = [tick for tick in sorted({0.0, *sizes, *(-size for size in sizes)}) if low <= tick <= high]
+        if len(ticks) >= _LEAST_TICKS:
             break
-    return found
+    return ticks
 
 
 def _place(level: Json, ladder: Sequence[str]) -> float:
@@ -200,7 +200,7 @@ def _reached(
     hollow = {**style, "linestyle": "none", "markerfacecolor": "white"}
     steps, worse = ([level for level in own if (level["clear"] is None) == clear] for clear in (True, False))
     shielded = [level for level in own if level["first"].get("shielded") is not None]
-    for some, told, beside, look in (
+    for some, key, beside, look in (
         (steps, steps, 0.0, {**style, "label": algorithm}),
         # the same teams behind the step shield, as crosses to the left
         (
@@ -211,14 +211,14 @@ def _reached(
     ):  # fmt: skip
         x = [_place(level, ladder) + 0.06 * number + beside for level in some]
         if some:
-            harms = [Estimate(**each[harm_count]["searched"]["harm"]) for each in told]
+            harms = [Estimate(**each[harm_count]["searched"]["harm"]) for each in key]
             with_intervals(axes, x, harms, capsize=3, **look)
     for level in [*steps, *worse]:
-        place, found = _place(level, ladder) + 0.06 * number, level[harm_count]["searched"]
+        place, searched = _place(level, ladder) + 0.06 * number, level[harm_count]["searched"]
         if level["clear"] is not None:
-            channel, spot = level["level"].rpartition("-")[2], (place, found["full_brake"]["value"])
+            channel, spot = level["level"].rpartition("-")[2], (place, searched["full_brake"]["value"])
             axes.annotate(channel, spot, xytext=(0, 4), textcoords="offset points", ha="center", fontsize=8)
-        dots = found["each_seed"]
+        dots = searched["each_seed"]
         if len(dots) > 1:
             axes.scatter([place + 0.05] * len(dots), dots, s=6, color=str(style["color"]), alpha=0.5, linewidths=0)
 
@@ -228,8 +228,8 @@ def _short(name: str) -> str:
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 
-def _of_changes(found: Json) -> list[str]:
+def _of_changes(results: Json) -> list[str]:
     """Return a label ``LEVEL → LEVEL`` for each change between levels, then for each worse V2X channel."""
-    changes, several = found["steps"] + found["channels"], len(algorithms(found)) > 1
+    changes, several = results["steps"] + results["channels"], len(algorithms(results)) > 1
     words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
     return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]

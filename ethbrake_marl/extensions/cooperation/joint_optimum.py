@@ -58,14 +58,14 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
     the worlds to search, and all such levels. Levels without learners need no search. ``samples`` holds the worlds of
     each level of ``plan``, in the same order.
     """
-    found: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
+    by_content: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
     rows = np.arange(plan.search_episodes)
     for level, sample in zip(plan.levels, samples, strict=True):
         if level.scenario.learners:
             part = sample.take(rows)
             identity = task_problem(part.worlds, Task(level.scenario, level.scenario.learners)).identity.tobytes()
-            found.setdefault(identity, (level, part, []))[2].append(level)
-    return list(found.values())
+            by_content.setdefault(identity, (level, part, []))[2].append(level)
+    return list(by_content.values())
 
 
 def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
@@ -80,7 +80,7 @@ def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgres
         tell: called with the progress.
 
     """
-    found: dict[str, BestHarmTable] = {}
+    tables: dict[str, BestHarmTable] = {}
     for level, part, alike in questions(plan, samples):
         table = search_list(
             level.scenario,
@@ -90,8 +90,8 @@ def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgres
             chunks=plan.optimum_folder(level),
             on_progress=partial(_tell, tell, f"joint optimum of {level.name}"),
         )
-        found |= {each.name: table for each in alike}
-    return found
+        tables |= {each.name: table for each in alike}
+    return tables
 
 
 def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
@@ -146,11 +146,11 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
     for best in other.searched.best.values():
-        kept = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
-        yield dict(zip(HARM_COUNTS, task_problem(worlds, task).follow(kept.profiles), strict=True))
+        best_here = best._replace(harm=best.harm[rows], profiles=best.profiles.take(rows))
+        yield dict(zip(HARM_COUNTS, task_problem(worlds, task).follow(best_here.profiles), strict=True))
     for team in other.teams:
-        driven = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
-        ledger = driven.outcome(team.name).ledger
+        evaluation = evaluate(worlds, {team.name: team}, scenario=scenario, aftermath=False).complete()
+        ledger = evaluation.outcome(team.name).ledger
         yield {harm_count: ledger.world_harm(harm_count) for harm_count in HARM_COUNTS}
 
 
@@ -243,14 +243,14 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
             own = [team for algorithm in plan.algorithms for team in teams[level.name, algorithm]]
             part = sample.worlds.take(np.arange(plan.search_episodes))
             answers[level.name] = LevelOptimum(level, part, tables[level.name], tuple(own))
-    found: list[Measured] = []
+    measured: list[Measured] = []
     for level, sample in zip(plan.levels, samples, strict=True):
         alike = level.scenario.replace(roles=dict.fromkeys(level.scenario.vehicle_names, "full_brake"))
         braking = _drive(alike, sample, [Team({}, f"full braking in {level.name}")], say)
         about = result_identity("ablate", level.scenario, sample)
         if not level.scenario.learners:
             scripts = _drive(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
-            found.append(Measured(level, None, scripts, braking, None, about))
+            measured.append(Measured(level, None, scripts, braking, None, about))
             continue
         known = best_known(answers[level.name], list(answers.values()))
         best = {harm_count: harm[np.newaxis] for harm_count, harm in known.items()}
@@ -266,8 +266,8 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
                     say(Progress(name, sample.worlds.n, sample.worlds.n))
                 behind[harm_count] = Shielded.stack(parts)
             goal = Goal.of(trainings[level.name, algorithm], reached, braking)
-            found.append(Measured(level, algorithm, reached, braking, best, about, behind or None, goal))
-    return found
+            measured.append(Measured(level, algorithm, reached, braking, best, about, behind or None, goal))
+    return measured
 
 
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:

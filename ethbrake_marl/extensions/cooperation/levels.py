@@ -100,13 +100,13 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
         scenario = load_runnable(name, settings)
         if any(level.name == scenario.name for level in levels):
             raise InvalidInput(f"levels: {scenario.name!r} is given twice")
-        told = scenario.model_dump(mode="json", exclude=_BUT_CHANNEL)
+        fields = scenario.model_dump(mode="json", exclude=_BUT_CHANNEL)
         same = [
             level.name
             for level in levels
             if level.clear is None
             and level.scenario.v2x != scenario.v2x
-            and level.scenario.model_dump(mode="json", exclude=_BUT_CHANNEL) == told
+            and level.scenario.model_dump(mode="json", exclude=_BUT_CHANNEL) == fields
         ]
         levels.append(Level(scenario, same[0] if same else None))
     if len(levels) < 2:
@@ -121,11 +121,11 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     which levels could not be compared; and the exceptions of ``Swept.parse`` and ``load_runnable``.
     """
     values = Swept.parse(sweep)
-    found = read_settings([values[0].setting], recipes).scenario
-    if not found:
+    scenario = read_settings([values[0].setting], recipes).scenario
+    if not scenario:
         key = values[0].key
         raise InvalidInput(f"--sweep {key}: is a recipe's; a sweep varies a scenario (recipes: ethbrake study sweep)")
-    key, path = found[0].key, found[0].path
+    key, path = scenario[0].key, scenario[0].path
     if path[0] in _LINE:
         raise InvalidInput(
             f"--sweep {key}: levels with different {path[0]} cannot be compared, vehicle by vehicle and time by time;"

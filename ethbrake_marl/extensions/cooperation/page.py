@@ -47,11 +47,11 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
         ("As usual", order[middle : middle + _USUAL]),
         ("Where it saves least, or harms", order[::-1][:_LEAST]),
     )
-    found: dict[int, Played] = {}
+    chosen: dict[int, Played] = {}
     for kind, rows in kinds:
         for row in map(int, rows):
-            found.setdefault(row, Played(row, kind, f"total harm {before[row]:.2f} to {after[row]:.2f}"))
-    return list(found.values())
+            chosen.setdefault(row, Played(row, kind, f"total harm {before[row]:.2f} to {after[row]:.2f}"))
+    return list(chosen.values())
 
 
 def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
@@ -61,7 +61,7 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
     """
     played = choose_worlds(measured)
     rows = np.array([each.number for each in played], np.int64)
-    driven: dict[str, tuple[int, ...]] = {}
+    controlled: dict[str, tuple[int, ...]] = {}
     for level in plan.levels:
         worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
         drivers = {level.name: Team({}, level.name)}  # a team without vehicles: scripts drive
@@ -73,16 +73,16 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
                 drivers[name] = load_team(folder, level.scenario, name)
         for name, team in drivers.items():
             Played.drive(played, worlds, name, team, level.scenario)
-            driven[name] = level.scenario.learners
+            controlled[name] = level.scenario.learners
     first = plan.levels[0]
     same = "the same line" if first.same_lines else "drawn with the same random numbers"
     other = "" if first.swept is None or first.same_lines else f" {first.swept.key},"
-    told = (
+    text = (
         f"{count_of(len(played), 'world')}, {same} at every level; of several seeds the first drives."
         f" The conditions are those of {first.name}:{other} delays of messages and an obstacle ahead are each"
         " level's own."
     )
-    return Section("Episodes", [told, Part.player(played, driven)])
+    return Section("Episodes", [text, Part.player(played, controlled)])
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
@@ -131,33 +131,35 @@ def _seed_row(one: Measured, seed: int, searched: int) -> Json:
 _ALGORITHM = "Algorithm"
 
 
-def markdown(found: Json, conditions: str) -> str:
+def markdown(results: Json, conditions: str) -> str:
     """Return all tables of an ablation as Markdown.
 
-    ``found`` is the content of ``ablation.json``; ``conditions`` is the text below the tables.
+    ``results`` is the content of ``ablation.json``; ``conditions`` is the text below the tables.
     """
-    blocks = [f"**{line}**" for line in found["undertrained"]]
-    blocks += [text for title, sheets in _blocks(found) for text in (f"## {title}", *(s.markdown() for s in sheets))]
+    blocks = [f"**{line}**" for line in results["undertrained"]]
+    blocks += [text for title, sheets in _blocks(results) for text in (f"## {title}", *(s.markdown() for s in sheets))]
     return "\n\n".join([*blocks, conditions]) + "\n"
 
 
-def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], episodes: Sequence[Section] = ()) -> str:
+def ablation_page(
+    results: Json, conditions: str, figures: Mapping[str, Figure], episodes: Sequence[Section] = ()
+) -> str:
     """Return the HTML page of an ablation.
 
     Args:
-        found: content of ``ablation.json``.
+        results: content of ``ablation.json``.
         conditions: text about worlds, seeds and machine.
         figures: file name -> figure.
         episodes: sections with episodes to watch.
 
     """
-    titles = FIGURES if swept_axis(found) is None else SWEEP_FIGURES
+    titles = FIGURES if swept_axis(results) is None else SWEEP_FIGURES
     drawn = [
         Part.drawing(figure, *titles[name], alone=name == "ablation-who-pays.png", known=conditions)
         for name, figure in figures.items()
     ]
     sections = [Section("Conditions", [conditions]), *([Section("Figures", drawn)] if drawn else []), *episodes]
-    for title, sheets in _blocks(found):
+    for title, sheets in _blocks(results):
         parts = []
         for sheet in sheets:
             rows = [
@@ -165,25 +167,25 @@ def ablation_page(found: Json, conditions: str, figures: Mapping[str, Figure], e
             ]
             parts.append(Part.table(Sheet("", [Column(heading) for heading in sheet.headings], rows)))
         sections.append(Section(title, parts))
-    settings = {name: value for name, value in found["settings"].items() if name != "recipes"}
+    settings = {name: value for name, value in results["settings"].items() if name != "recipes"}
     sections.append(Section("Settings", [Part.facts(settings)]))
-    lead, swept = "Who learns, who knows, whose harm counts: step by step.", swept_axis(found)
+    lead, swept = "Who learns, who knows, whose harm counts: step by step.", swept_axis(results)
     if swept is not None:
         lead = f"One level with several numbers of {swept}."
-    alarms = [Part.paragraph(line, "alarm") for line in found["undertrained"]]
+    alarms = [Part.paragraph(line, "alarm") for line in results["undertrained"]]
     return Page("What cooperation is worth", sections, lead, opening=alarms).html
 
 
-def _blocks(found: Json) -> list[tuple[str, list[Sheet]]]:
-    """Return the tables of an ablation in groups, each as (title, tables); ``found`` is from ``ablation.json``."""
-    swept = swept_axis(found)
+def _blocks(results: Json) -> list[tuple[str, list[Sheet]]]:
+    """Return the tables of an ablation in groups, each as (title, tables); ``results`` is from ``ablation.json``."""
+    swept = swept_axis(results)
     shown = {
         level["level"]: f"`{level['level']}`" if swept is None else f"{level['swept_number']:g}"
-        for level in found["levels"]
+        for level in results["levels"]
     }
-    levels = [{**level, "level": f"`{level['level']}`", "number": shown[level["level"]]} for level in found["levels"]]
+    levels = [{**level, "level": f"`{level['level']}`", "number": shown[level["level"]]} for level in results["levels"]]
     steps, channels = (
-        [{**change, "from": shown[change["from"]], "to": shown[change["to"]]} for change in found[key]]
+        [{**change, "from": shown[change["from"]], "to": shown[change["to"]]} for change in results[key]]
         for key in ("steps", "channels")
     )
     both = [{**change, "change": f"{change['from']} to {change['to']}"} for change in steps + channels]
@@ -266,10 +268,10 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
     for row in rows:
         cells.append([])
         for _, path in columns:
-            found: Any = row
+            value: Any = row
             for key in path.split():
-                found = found[int(key) if isinstance(found, list) else key]
-            cells[-1].append(Estimate(**found) if isinstance(found, dict) else found)
+                value = value[int(key) if isinstance(value, list) else key]
+            cells[-1].append(Estimate(**value) if isinstance(value, dict) else value)
     return Sheet("", [column for column, _ in columns], cells)
 
 
@@ -304,7 +306,7 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
         "machine": machine,
         "date": datetime.now(UTC).date().isoformat(),
     }
-    found = {"settings": settings, **compare(measured, plan.search_episodes)}
+    results = {"settings": settings, **compare(measured, plan.search_episodes)}
     recipes = ", ".join(
         f"{name} (rewarded for {'first-impact' if recipe.reward.harm_count == 'first' else 'total'} harm)"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
@@ -312,7 +314,7 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
     worlds, first = f"{count_of(plan.episodes, 'world')} of seed {plan.list_seed}", plan.levels[0]
     same = f"the same {worlds}" if first.same_lines else f"{worlds}, drawn with the same random numbers"
     swept = "" if plan.sweep is None else f"{first.scenario.name} with {plan.sweep}; "
-    told = [
+    lines = [
         f"{level.name}: {message_words(level.scenario)}. " for level in plan.levels if message_words(level.scenario)
     ]
     conditions = (
@@ -320,19 +322,19 @@ def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tu
         f" of each learner, rounded up to whole updates. Harms are means per world in m²/s² on {same} at every level;"
         f" {interval_words(plan.seeds)}. Joint optimum: the least harm known that the level's learners can do, and"
         f" everything beside it, in the first {plan.search_episodes:,} of these worlds, {plan.budget:,} candidates per"
-        f" world and count. {''.join(told)}{machine}."
+        f" world and count. {''.join(lines)}{machine}."
     )
-    drawn = found["steps"] or found["channels"]
+    drawn = results["steps"] or results["channels"]
     titles = FIGURES if plan.sweep is None else SWEEP_FIGURES
-    figures = dict(zip(titles, ablation_figures(found, conditions), strict=True)) if drawn else {}
+    figures = dict(zip(titles, ablation_figures(results, conditions), strict=True)) if drawn else {}
     for name, figure in figures.items():
         write_picture(plan.folder / name, figure, force=True)
     texts = {
-        "ablation.html": ablation_page(found, conditions, figures, [episodes_section(plan, measured)]),
-        "ablation.md": markdown(found, conditions),
+        "ablation.html": ablation_page(results, conditions, figures, [episodes_section(plan, measured)]),
+        "ablation.md": markdown(results, conditions),
         "ablation.csv": levels_csv(measured, plan.search_episodes),
-        "ablation.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
+        "ablation.json": json.dumps(results, indent=2, allow_nan=False) + "\n",
     }
     for name, text in texts.items():
         write_output(plan.folder / name, text.encode(), force=True)
-    return found, [plan.folder / name for name in ("ablation.html", "ablation.md", *figures)]
+    return results, [plan.folder / name for name in ("ablation.html", "ablation.md", *figures)]

@@ -67,7 +67,7 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     evaluation, team = experiment.evaluation, experiment.learned
     if team != TRAINED_TEAM:
         return None
-    outcomes, told = dict(evaluation.outcomes), "The training was interrupted: nothing more was trained to compare."
+    outcomes, note = dict(evaluation.outcomes), "The training was interrupted: nothing more was trained to compare."
     rows: list[Compared] = []
     if experiment.trained.status == "finished":
         try:
@@ -79,22 +79,22 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
             silent, why_silent = _without_messages(experiment, tell)
             optimum, why_optimum = _joint_optimum(experiment, outcomes, tell)
             rows += [*silent, *optimum]
-            told = f"{why_silent} {why_optimum}"
+            note = f"{why_silent} {why_optimum}"
         except Stopped as stopped:
-            told = f"{stopped}: nothing more was compared."
+            note = f"{stopped}: nothing more was compared."
     sheets = {f"borne_{each}": _borne(outcomes, each, evaluation.scenario) for each in HARM_COUNTS}
     sheets["added"] = _added(experiment)
     if rows:
         sheets |= {f"compared_{each}": _compared(rows, each) for each in HARM_COUNTS}
-    content = {name: sheet.json() for name, sheet in sheets.items()} | {"note": told}
+    content = {name: sheet.json() for name, sheet in sheets.items()} | {"note": note}
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_output(experiment.run.path / "cooperation.json", text.encode(), force=True)
-    return RunSection("Several learners", (*sheets.values(), told))
+    return RunSection("Several learners", (*sheets.values(), note))
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
     """Train each learner alone while all others brake fully; return name -> team, which brakes the others fully."""
-    scenario, found = experiment.evaluation.scenario, {}
+    scenario, policies = experiment.evaluation.scenario, {}
     braking = make_agents(["full_brake"], scenario)["full_brake"]
     for vehicle in scenario.learners:
         name = scenario.vehicle_names[vehicle]
@@ -102,8 +102,8 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
         own = scenario.replace(roles={**scenario.roles, **others})
         team = _train(experiment, own, f"alone/{name}", len(scenario.learners), tell)
         drivers: dict[int, Agent] = dict.fromkeys(scenario.learners, braking)
-        found[f"{name} alone"] = Team(drivers | team.drivers, f"{name} alone")
-    return found
+        policies[f"{name} alone"] = Team(drivers | team.drivers, f"{name} alone")
+    return policies
 
 
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
@@ -156,8 +156,8 @@ def _joint_optimum(
     identity = task_problem(part.worlds, evaluation.task).identity
     best, shares = {}, []
     for harm_count in HARM_COUNTS:
-        driven = [outcome.take(rows).world_harm(harm_count) for outcome in outcomes.values()]
-        best[harm_count] = np.fmin.reduce([table.harm(identity, harm_count), *driven])
+        harms = [outcome.take(rows).world_harm(harm_count) for outcome in outcomes.values()]
+        best[harm_count] = np.fmin.reduce([table.harm(identity, harm_count), *harms])
         ours, worst = (outcomes[name].take(rows).world_harm(harm_count) for name in (TRAINED_TEAM, "full_brake"))
         share = share_over_seeds(ours[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis])
         if share is not None and share.value >= 0.0:

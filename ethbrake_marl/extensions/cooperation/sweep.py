@@ -33,7 +33,7 @@ class Swept(NamedTuple):
         that is no number, for a range whose steps miss its end, and for a repeated, a single or too many numbers.
         """
         key, equals, values = (part.strip() for part in text.partition("="))
-        word = found.group(1) or "" if (found := _WORD.match(values)) else ""
+        word = match.group(1) or "" if (match := _WORD.match(values)) else ""
         numbers: list[Decimal] = []
         for item in values.split(","):
             parsed = _ITEM.fullmatch(item.strip().removeprefix(word).strip())

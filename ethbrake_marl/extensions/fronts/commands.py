@@ -76,13 +76,13 @@ def front_command(
         )  # fmt: skip
         largest = least_largest(chosen, sample.worlds, front, budget=budget, threads=jobs or 1)
         beside = {"full_brake": full_braking(chosen, sample), "maximin": largest}
-        found = front_results(front, chosen, sample, beside, seed)
-        found |= {"budget": budget, "settings": list(settings or ())}
+        results = front_results(front, chosen, sample, beside, seed)
+        results |= {"budget": budget, "settings": list(settings or ())}
         output.mkdir(parents=True, exist_ok=True)
-        out.write(output / "front.json", json.dumps(found, indent=1, allow_nan=False) + "\n")
-        for name, figure in front_figures(found).items():
+        out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
+        for name, figure in front_figures(results).items():
             out.write(output / name, picture_bytes(figure, name), "figure")
-        out.result(found, front_sheet(found), hypervolume_sheet(found))
+        out.result(results, front_sheet(results), hypervolume_sheet(results))
 
 
 FRONT = Part(

@@ -30,35 +30,35 @@ _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])  # of the tr
 Json = dict[str, Any]
 
 
-def front_figures(found: Json) -> dict[str, Figure]:
+def front_figures(results: Json) -> dict[str, Figure]:
     """Return the figures of the content of ``front.json``, by file name; the ternary one for three vehicles only."""
-    figures = {"front.png": sum_figure(found)}
-    if len(found["vehicles"]) == 3:
-        figures["front-ternary.png"] = ternary_figure(found)
+    figures = {"front.png": sum_figure(results)}
+    if len(results["vehicles"]) == 3:
+        figures["front-ternary.png"] = ternary_figure(results)
     return figures
 
 
-def sum_figure(found: Json) -> Figure:
+def sum_figure(results: Json) -> Figure:
     """Draw the mean harm of the line against that of the vehicle that bears most, a point for each set of weights.
 
     No point minimises either of the two, except that of equal weights, and maximin world by world.
     """
     figure, (axes,) = new_panels((WIDTH_IN, 4.6))
-    for name, harm, style in _series(found):
+    for name, harm, style in _series(results):
         axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style, fillstyle="none")
-    if all((harm.max(axis=1) > 0.0).all() for _, harm, _ in _series(found)):
+    if all((harm.max(axis=1) > 0.0).all() for _, harm, _ in _series(results)):
         axes.set_xscale("log")
         axes.set_yscale("log")
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(FuncFormatter(plain))
             axis.set_minor_formatter(FuncFormatter(plain))
     axes.tick_params(which="minor", labelsize=7)
-    count = {"first": "first impacts", "total": "all impacts"}[found["harm_count"]]
+    count = {"first": "first impacts", "total": "all impacts"}[results["harm_count"]]
     name_axes(axes, x=f"Harm of the line, {count} (m²/s²)", y="Harm of the vehicle that bears most (m²/s²)")
-    return finish(figure, _caption(found), axes, columns=2, fontsize=8)
+    return finish(figure, _caption(results), axes, columns=2, fontsize=8)
 
 
-def ternary_figure(found: Json) -> Figure:
+def ternary_figure(results: Json) -> Figure:
     """Draw which share of the harm each of three vehicles bears; the colour is the harm of the line."""
     figure = new_figure(WIDTH_IN, 5.4)
     axes = figure.add_subplot()
@@ -71,7 +71,7 @@ def ternary_figure(found: Json) -> Figure:
             ends[:, i] = share
             ends[0, (i + 1) % 3] = ends[1, (i + 2) % 3] = 1.0 - share
             axes.plot(*_places(ends), color="#dddddd", linewidth=0.6, zorder=0)
-    for name, at, up in zip(found["vehicles"], _CORNERS, ("top", "top", "bottom"), strict=True):
+    for name, at, up in zip(results["vehicles"], _CORNERS, ("top", "top", "bottom"), strict=True):
         axes.annotate(
             f"{name} bears all",
             at,
@@ -81,7 +81,7 @@ def ternary_figure(found: Json) -> Figure:
             xytext=(0, -4 if up == "top" else 4),
             textcoords="offset points",
         )
-    series = list(_series(found))
+    series = list(_series(results))
     sums = np.concatenate([harm.sum(axis=1) for _, harm, _ in series])
     for name, harm, style in series:
         whole = harm.sum(axis=1)
@@ -95,7 +95,7 @@ def ternary_figure(found: Json) -> Figure:
     bar = figure.colorbar(points, ax=axes, shrink=0.7, location="bottom", pad=0.02)
     bar.set_label("Harm of the line (m²/s²)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    return finish(figure, _caption(found), axes, columns=2, fontsize=8)
+    return finish(figure, _caption(results), axes, columns=2, fontsize=8)
 
 
 def _places(shares: Floats) -> Floats:
@@ -104,16 +104,16 @@ def _places(shares: Floats) -> Floats:
     return places
 
 
-def _series(found: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
+def _series(results: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
     """Return name, mean harm [W, N] m2/s2 and style of the front, of what is shown beside it and of each agent."""
-    count = found["harm_count"]
+    count = results["harm_count"]
 
     def harm(points: Sequence[Mapping[str, Any]]) -> Floats:
         return np.array([[each["value"] for each in point["vehicles"][count]] for point in points])
 
-    named = [("front", harm(found["points"]))]
-    named += [(name, harm([{"vehicles": vehicles}])) for name, vehicles in found["beside"].items()]
-    named += [(name, np.unique(harm(points), axis=0)) for name, points in found["agents"].items()]
+    named = [("front", harm(results["points"]))]
+    named += [(name, harm([{"vehicles": vehicles}])) for name, vehicles in results["beside"].items()]
+    named += [(name, np.unique(harm(points), axis=0)) for name, points in results["agents"].items()]
     styles = ({"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]} for k in range(len(named)))
     return [
         (name, values, {**style, "linestyle": "none", "markersize": 5.0})
@@ -121,6 +121,6 @@ def _series(found: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
     ]
 
 
-def _caption(found: Json) -> str:
-    worlds = count_of(found["episodes"], "world")
-    return f"{found['scenario']}, {worlds}; a point for each of {len(found['points'])} choices of the weights."
+def _caption(results: Json) -> str:
+    worlds = count_of(results["episodes"], "world")
+    return f"{results['scenario']}, {worlds}; a point for each of {len(results['points'])} choices of the weights."

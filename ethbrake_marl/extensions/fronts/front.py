@@ -204,12 +204,12 @@ class Preferring(NamedTuple):
 
 def _shipped_specs(scenario: Scenario) -> list[str]:
     """Return the specs of all shipped policies that can drive the one learner of the scenario."""
-    found = []
+    specs = []
     for name in shipped_policies():
         with suppress(InvalidInput):
             make_agents([f"policy@{SHIPPED}/{name}"], scenario)
-            found.append(f"policy@{SHIPPED}/{name}")
-    return found
+            specs.append(f"policy@{SHIPPED}/{name}")
+    return specs
 
 
 def _searched(
@@ -255,11 +255,11 @@ def _searched(
             pool.add(problem, search_profiles(aim, joined(given, worlds.n), **spent)[0])
             tell(worlds.n)
     borne, best = pool.least(weights, task.harm_count)
-    told = {
+    values = {
         name: {count: np.stack([each[count] for each in driven[name]]) for count in HARM_COUNTS}
         for name in preferring[0].agents
     }
-    return Front(weights, task.harm_count, borne, best, told)
+    return Front(weights, task.harm_count, borne, best, values)
 
 
 def observes_weights(agent: Driver) -> bool:

@@ -115,12 +115,12 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
             name: np.array([hypervolume(each, at) for each, at in zip(rows, reference, strict=True)])
             for name, rows in points.items()
         }
-        told: Json = {"reference": words, "at": reference[0].tolist(), "of": {}}
+        entry: Json = {"reference": words, "at": reference[0].tolist(), "of": {}}
         for name, volume in volumes.items():
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = volume / volumes["front"]
-            told["of"][name] = {"volume": _interval(volume), "share": _interval(share)}
-        found.append(told)
+            entry["of"][name] = {"volume": _interval(volume), "share": _interval(share)}
+        found.append(entry)
     return found
 
 
@@ -142,21 +142,21 @@ def full_braking(scenario: Scenario, sample: Sample) -> Borne:
     return {count: ledger.vehicle_harm(count) for count in HARM_COUNTS}
 
 
-def front_sheet(found: Json) -> Sheet:
+def front_sheet(results: Json) -> Sheet:
     """Return the table of the content of ``front.json``: who bears what for each set of weights, and agents' ratios."""
-    count = found["harm_count"]
+    count = results["harm_count"]
     columns: list[Column | str] = [
-        Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(found["vehicles"]))),
+        Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(results["vehicles"]))),
         Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
-        *(Column(name, digits=3, short=re.sub("@[^+]*", "", name)[:14]) for name in found["agents"]),
+        *(Column(name, digits=3, short=re.sub("@[^+]*", "", name)[:14]) for name in results["agents"]),
     ]  # fmt: skip
     rows: list[Row] = []
-    for k, point in enumerate(found["points"]):
-        told = ",".join(f"{weight:g}" for weight in point["weights"])
+    for k, point in enumerate(results["points"]):
+        weights = ",".join(f"{weight:g}" for weight in point["weights"])
         borne = [each["value"] for each in point["vehicles"][count]]
         sums = [sum(each["value"] for each in point["vehicles"][also]) for also in HARM_COUNTS]
-        rows.append((told, *borne, *sums, *(points[k]["ratio"] for points in found["agents"].values())))
-    for name, braking in found["beside"].items():
+        rows.append((weights, *borne, *sums, *(points[k]["ratio"] for points in results["agents"].values())))
+    for name, braking in results["beside"].items():
         sums = [sum(each["value"] for each in braking[also]) for also in HARM_COUNTS]
         rows.append((name, *(each["value"] for each in braking[count]), *sums))
     words = {"first": "first-impact", "total": "total"}[count]
@@ -164,10 +164,10 @@ def front_sheet(found: Json) -> Sheet:
         f"Mean {words} harm of each vehicle, and of the line by first and by all impacts, m2/s2. Agents: their weighted"
     )
     note += " harm divided by the front's."
-    return Sheet(f"Front of {found['scenario']}, {found['episodes']:,} worlds", columns, rows, note, gap=2)
+    return Sheet(f"Front of {results['scenario']}, {results['episodes']:,} worlds", columns, rows, note, gap=2)
 
 
-def hypervolume_sheet(found: Json) -> Sheet:
+def hypervolume_sheet(results: Json) -> Sheet:
     """Return the table of hypervolumes of the content of ``front.json``."""
     columns: list[Column | str] = [
         "Reference",
@@ -176,8 +176,8 @@ def hypervolume_sheet(found: Json) -> Sheet:
         Column("Share of the front", digits=1, scale=100.0, unit=" %"),
     ]
     rows = [
-        (each["reference"], name, *(None if value is None else Estimate(**value) for value in told.values()))
-        for each in found["hypervolume"]
-        for name, told in each["of"].items()
+        (each["reference"], name, *(None if value is None else Estimate(**value) for value in volume.values()))
+        for each in results["hypervolume"]
+        for name, volume in each["of"].items()
     ]
     return Sheet("Hypervolume of the mean harm (m2/s2)^N", columns, rows, gap=2)

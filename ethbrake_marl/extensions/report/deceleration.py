@@ -194,9 +194,9 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
             axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)
         proof = limits.proof
         least = "" if proof.harm is None else f"; proven: no less than {proof.harm[0]:.2f}"
-        told = " (avoidable)" if proof.avoidable is not None and proof.avoidable[0] else least
+        text = " (avoidable)" if proof.avoidable is not None and proof.avoidable[0] else least
         axes.annotate(
-            f"best known profile: {first:.2f} first-impact, {total:.2f} total{told}", (0.0, max(first, total)),
+            f"best known profile: {first:.2f} first-impact, {total:.2f} total{text}", (0.0, max(first, total)),
             xytext=(6, 3), textcoords="offset points", fontsize=8.5, color=GREY,
         )  # fmt: skip
     axes.set_xlim(0.0, float(at[-1]))

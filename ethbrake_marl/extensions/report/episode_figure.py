@@ -40,8 +40,8 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
         for axes, draw in zip(panels[k::columns], (_positions, _gaps, _command), strict=True):
             draw(axes, record)
         harms = (float(record.ledger.world_harm(count)[0]) for count in HARM_COUNTS)
-        told = "{}\nharm {:.2f} first-impact, {:.2f} total".format(label_text(title), *harms)
-        panels[k].set_title(told, loc="left", fontsize=9.5)
+        text = "{}\nharm {:.2f} first-impact, {:.2f} total".format(label_text(title), *harms)
+        panels[k].set_title(text, loc="left", fontsize=9.5)
         name_axes(axes, x="Time since Vehicle 1 began to brake (s)")
     positions, gaps, commands = panels[::columns]
     moving = [np.flatnonzero((each.speeds_mps != 0.0).any(axis=1)) for each in records.values()]
@@ -53,9 +53,9 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
     positions.set_xlim(0.0, 1.1 * max(ends))
     gaps.set_ylim(bottom=0.0)
     commands.yaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))
-    driven = [(each, list(each.vehicles)) for each in records.values()]
-    capacity = max(float(each.initial.vehicles.braking_capacity_mps2[0, some].max()) for each, some in driven)
-    largest = max(float(each.command_mps2[:, some].max()) for each, some in driven)
+    motions = [(each, list(each.vehicles)) for each in records.values()]
+    capacity = max(float(each.initial.vehicles.braking_capacity_mps2[0, some].max()) for each, some in motions)
+    largest = max(float(each.command_mps2[:, some].max()) for each, some in motions)
     commands.set_ylim(-1.1 * capacity, max(largest, 0.0) + 0.4 * capacity)  # with room for a line of text
     name_axes(positions, y="Position from Vehicle 1's\nat the alert (m)")
     name_axes(gaps, y="Gap ahead (m)")

@@ -150,17 +150,17 @@ class _Strip:
         One impact is shown at a time, for a short while; a weaker one is left out while a harder one is shown.
         """
         known: set[tuple[int, float]] = set()
-        found: list[tuple[int, int, Struck]] = []
+        events: list[tuple[int, int, Struck]] = []
         for k, scene in enumerate(self._film):
             new = [struck for struck in scene.struck if (struck.pair, struck.time_s) not in known]
             known |= {(struck.pair, struck.time_s) for struck in new}
             hardest = max(new, key=lambda struck: struck.closing_mps, default=None)
-            if hardest is None or (found and k < found[-1][1] and hardest.closing_mps < found[-1][2].closing_mps):
+            if hardest is None or (events and k < events[-1][1] and hardest.closing_mps < events[-1][2].closing_mps):
                 continue
-            if found:
-                found[-1] = (found[-1][0], min(found[-1][1], k), found[-1][2])
-            found.append((k, k + round(_SHOWN_S * self._fps), hardest))
-        return found
+            if events:
+                events[-1] = (events[-1][0], min(events[-1][1], k), events[-1][2])
+            events.append((k, k + round(_SHOWN_S * self._fps), hardest))
+        return events
 
     def _switched(self, lit: Sequence[bool]) -> str:
         """Return an SVG animation with opacity 1 in the scenes in which ``lit`` is True, and 0 in the others."""

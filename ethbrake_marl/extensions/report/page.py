@@ -57,9 +57,9 @@ class Part:
         return cls(Markup("<h3>{}</h3>\n").format(shown(text)))
 
     @classmethod
-    def facts(cls, found: Mapping[str, object]) -> Part:
-        """Return a part that lists names with their values, one below the other; ``found`` maps names to values."""
-        lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in found.items()]
+    def facts(cls, facts: Mapping[str, object]) -> Part:
+        """Return a part that lists names with their values, one below the other; ``facts`` maps names to values."""
+        lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in facts.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
@@ -155,8 +155,8 @@ class Part:
             svg, caption = inline_svg(figure, f"{title}. {description}", recolour=not alone)
         except InvalidInput as error:
             raise InvalidInput(f"{where}: {error}") from None
-        for told in (known.strip(), description):
-            caption = caption.replace(told, "").strip() if told else caption
+        for text in (known.strip(), description):
+            caption = caption.replace(text, "").strip() if text else caption
         below = Markup('<p class="quiet">{}</p>').format(shown(caption)) if caption else Markup()
         return cls(
             Markup(
@@ -191,12 +191,12 @@ class Part:
         by_agent = driven if isinstance(driven, Mapping) else dict.fromkeys(agents, driven)
         middle = [agents.index(focus)] if focus in agents else []
         order = dict.fromkeys([*middle, 0, *reversed(range(len(agents)))])
-        told: list[dict[str, Any]] = []
+        data: list[dict[str, Any]] = []
         for world in worlds:
             alert = next(iter(world.motions.values())).world
             title = shown(world.title or f"World {world.number}")
             episodes = [Played.episode(motion, by_agent[agent]) for agent, motion in world.motions.items()]
-            told.append({
+            data.append({
                 "conditions": f"{title}: {Conditions.of(alert).quantities}.",
                 "episodes": episodes,
                 "number": world.number,
@@ -209,9 +209,9 @@ class Part:
             "agents": [shown(agent) for agent in agents],
             # the first agent, the focus, and the last ones, up to three
             "shown": list(shown_first) or sorted(list(order)[:3]),
-            "worlds": told,
+            "worlds": data,
         }
-        shielded = any(episode["stepped"] for world in told for episode in world["episodes"])
+        shielded = any(episode["stepped"] for world in data for episode in world["episodes"])
         return cls.template(
             "player.html.j2",
             ("player.css",),
@@ -286,11 +286,11 @@ class Page:
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
         """Return a unique link name for each title, of letters, digits and hyphens, for instance "worst-ten-worlds"."""
-        found: list[str] = []
+        anchors: list[str] = []
         for k, title in enumerate(titles):
             name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
-            found.append(f"{name}-{k + 1}" if name in found or not name else name)
-        return found
+            anchors.append(f"{name}-{k + 1}" if name in anchors or not name else name)
+        return anchors
 
     @cached_property
     def html(self) -> str:

@@ -113,5 +113,5 @@ def _beside() -> RowsBeside:
         if paper.harm_decrease is not None:
             texts["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
         rows.append((paper.agent, texts))
-    conditions: list[Note] = [("quiet", f"Paper, {name}: {told}.") for name, told in PAPER_PARAMETERS.items()]
+    conditions: list[Note] = [("quiet", f"Paper, {name}: {text}.") for name, text in PAPER_PARAMETERS.items()]
     return RowsBeside(rows, [*conditions, ("note", PAPER_NOTE)])

@@ -87,9 +87,9 @@ def _impacts(motion: EpisodeMotion) -> list[list[float]]:
     first, total = np.cumsum(harm * rows.first[order]), np.cumsum(harm)
     if len(harm):
         first[np.flatnonzero(rows.first[order])[-1] :], total[-1] = motion.harm
-    told: dict[tuple[int, int, bool], list[float]] = {}
+    by_key: dict[tuple[int, int, bool], list[float]] = {}
     for number, k in enumerate(order.tolist()):
         time, pair, is_first = float(rows.time_s[k]), int(rows.pair[k]), bool(rows.first[k])
         entry = [time, pair, float(rows.closing_speed_mps[k]), int(is_first), number + 1]
-        told[pair, int(time / _BIN_S), is_first] = [*entry, float(first[number]), float(total[number])]
-    return sorted(told.values(), key=lambda entry: (entry[0], entry[4]))
+        by_key[pair, int(time / _BIN_S), is_first] = [*entry, float(first[number]), float(total[number])]
+    return sorted(by_key.values(), key=lambda entry: (entry[0], entry[4]))

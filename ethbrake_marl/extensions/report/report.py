@@ -74,8 +74,8 @@ def avoidable_section(evaluation: Evaluation) -> Section:
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     if isinstance(limits, Unproven):
-        told = "Nothing is proven of these worlds, so what was avoidable is not told apart."
-        body.append(f"{told} Reason: {limits.because}.")
+        text = "Nothing is proven of these worlds, so what was avoidable is not told apart."
+        body.append(f"{text} Reason: {limits.because}.")
     elif regrets is None or avoidable is None:
         body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
     else:
@@ -122,13 +122,13 @@ def shield_section(rows: ShieldModes, conditions: str) -> Section:
     """
     if not rows:
         return Section("Shield", ())
-    told = (
+    text = (
         "What is shielded, alone and behind every mode of the shield. step-alert rolls the policy out at the alert"
         " alone; step-cap, of several vehicles, lets none bear more than under the plan with which the shield begins"
         " (the baseline plan). Each decision that step mode replaced was simulated again without it: needed (harm would"
         " have been higher), harmless (the same), costly (lower)."
     )
-    body: list[str | Part] = [told, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
+    body: list[str | Part] = [text, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
     if left_out := rows[0].left_out:
         told_of = count_of(len(left_out), "world")
         body.append(Part.paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
@@ -217,8 +217,8 @@ class Report:
         for title, about, told_rows in self.tests:
             rows = _table_of(told_rows)
             notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
-            told = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(identity_line(rows), "quiet")]
-            sections.append(Section(title, [about, *told]))
+            parts = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(identity_line(rows), "quiet")]
+            sections.append(Section(title, [about, *parts]))
             nowhere.intersection_update(_empty(rows))
         unseen = tuple(name for name in sheet.headings[2:] if name in nowhere)
         seen = tuple(name for name in sheet.headings[2:] if name not in nowhere)
@@ -265,25 +265,25 @@ class Report:
             return f"{name} does {_words(value)} m²/s² of harm per emergency ({impacts}{known})."
         change, decrease = _change(row, harm), row[f"harm_decrease_{self.harm_count}"]
         much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
-        told = "about as much harm as" if change == "as much" else f"{much}{change} harm than"
+        words = "about as much harm as" if change == "as much" else f"{much}{change} harm than"
         numbers = f"{impacts}: {_words(value)} m²/s² per emergency instead of {_words(before[harm])}{known}"
         fails = self._fails(harm)
         joined = ", but " if fails and change == "less" else ", and "
-        return f"{name} does {told} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
+        return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
 
     def _fails(self, harm: str) -> str:
         """Return a clause on where the agent does no less harm than full braking; empty if nowhere.
 
         ``harm`` is the measure to compare, for instance ``total_harm``.
         """
-        found = []
+        reasons = []
         for title, _, others in self.tests:
             rows = {row.agent: row for row in others}
             if self.about in rows and BASELINE in rows and (change := _change(rows[self.about], harm)) != "less":
                 numbers = f"{_words(rows[self.about][harm])} instead of {_words(rows[BASELINE][harm])}"
-                found.append(f"{change} in the {title.lower()} ({numbers})")
-        if found:
-            return " and ".join(found)
+                reasons.append(f"{change} in the {title.lower()} ({numbers})")
+        if reasons:
+            return " and ".join(reasons)
         outcomes = (self.evaluation.outcome(agent) for agent in (self.about, BASELINE))
         after, before = (outcome.world_harm(self.harm_count) for outcome in outcomes)
         share = float((after > before + ROUNDING).mean())
@@ -296,7 +296,7 @@ class Report:
         if not rows:
             return []
         which = "First-impact" if self.harm_count == "first" else "Total"
-        elsewhere = {title: told for title, _, told in self.tests}
+        elsewhere = {title: text for title, _, text in self.tests}
         marks = "; marks: the other tests" if elsewhere else ""
         figure = harm_by_agent(rows, self.harm_count, elsewhere)
         about = f"Mean and 95 % interval{marks}{self.evaluation.conditions.by_recording}."
@@ -306,8 +306,8 @@ class Report:
     def _results(self) -> Section:
         rows, limits = _table_of(self.rows), limits_of(self.evaluation)
         because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
-        told: list[str | Part] = [self.summary] if self.summary else []
-        return Section("Results", [*told, Part.box("Three words", WORDS), *_measured(rows, because)])
+        parts: list[str | Part] = [self.summary] if self.summary else []
+        return Section("Results", [*parts, Part.box("Three words", WORDS), *_measured(rows, because)])
 
     def _episodes(self) -> Section:
         """Return the section with episodes to watch. Notes name agents whose second drive differs from the
@@ -388,8 +388,8 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
         _table(ours.sheet(), "In the same worlds", _OTHERS),
     ]
     left_out = f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"
-    told = [*([("quiet", left_out)] if empty else []), *(note for note in rows.notes() if note not in notes)]
-    folded += [Part.paragraph(text, kind) for kind, text in told]
+    lines = [*([("quiet", left_out)] if empty else []), *(note for note in rows.notes() if note not in notes)]
+    folded += [Part.paragraph(text, kind) for kind, text in lines]
     quiet = [
         *(f"{row.parameters.line}. Harm in m²/s²." for row in rows[:1]),
         *(t for kind, t in notes if kind == "quiet"),

@@ -93,7 +93,7 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
     Only quantities that vary between the worlds are drawn. Of each, the value of the vehicle (or pair) nearest to
     vehicle ``focus`` is chosen first, then values of others while there is room.
     """
-    found: list[tuple[int, str, Floats]] = []
+    pairs: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
         values, own = rule.of(worlds), {"vehicle": focus, "pair": max(focus - 1, 0), "world": 0}[rule.per]
         varying = np.flatnonzero(
@@ -102,9 +102,9 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
         nearest = varying[np.argsort(np.abs(varying - own), kind="stable")].tolist()
         for i in sorted(nearest):
             owner = "" if rule.per == "world" else f"{rule.per.capitalize()} {i + 1}, "
-            found.append((nearest.index(i), textwrap.fill(owner + rule.label, _LABEL_CHARACTERS), values[:, i]))
-    chosen = np.argsort([place for place, *_ in found], kind="stable")[:_MOST_PAIRED]
-    return {found[k][1]: found[k][2] for k in sorted(chosen)}
+            pairs.append((nearest.index(i), textwrap.fill(owner + rule.label, _LABEL_CHARACTERS), values[:, i]))
+    chosen = np.argsort([place for place, *_ in pairs], kind="stable")[:_MOST_PAIRED]
+    return {pairs[k][1]: pairs[k][2] for k in sorted(chosen)}
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
@@ -177,13 +177,13 @@ def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
         fronts = -np.concatenate([[0.0], np.cumsum(gaps + BODY_M)])
         bodies = {"left": fronts - BODY_M, "color": [vehicle_colour(i) for i in range(worlds.N)]}
         axes.barh(np.zeros(worlds.N), BODY_M, 0.8, **bodies)
-        told = [(front + 0.5 * gap, 0.65, f"{gap:.1f}") for front, gap in zip(fronts[1:], gaps, strict=True)]
+        labels = [(front + 0.5 * gap, 0.65, f"{gap:.1f}") for front, gap in zip(fronts[1:], gaps, strict=True)]
         for i, front in enumerate(fronts - 0.5 * BODY_M):
             kind = "" if sample.types is None else f"\n{label_text(str(sample.types[row, i]), 20)}"
-            told += [(front, 0.0, f"{i + 1}"), (front, -0.95, f"{worlds.speeds_mps[row, i]:.1f}{kind}")]
+            labels += [(front, 0.0, f"{i + 1}"), (front, -0.95, f"{worlds.speeds_mps[row, i]:.1f}{kind}")]
         if worlds.obstacle_ahead[row]:
             axes.axvline(ahead, 0.2, 1.0, color="black", linewidth=4.0)
-            told.append((0.5 * ahead, 0.65, f"{ahead:.1f} to the obstacle"))
-        for x, y, text in told if worlds.N <= _MOST_NAMED else ():
+            labels.append((0.5 * ahead, 0.65, f"{ahead:.1f} to the obstacle"))
+        for x, y, text in labels if worlds.N <= _MOST_NAMED else ():
             axes.text(x, y, text, ha="center", va="center", fontsize=7, color="black" if y else "white")
     name_axes(every[-1], x="Position from the front of Vehicle 1, at the alert (m)")

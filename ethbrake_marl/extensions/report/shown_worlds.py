@@ -42,14 +42,14 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
     random. The entries hold no motion yet.
     """
     outcome = evaluation.outcome(focus)
-    found: dict[int, Played] = {}
+    chosen: dict[int, Played] = {}
     total, first = outcome.total_harm, outcome.first_impact_harm
 
     def add(kind: str, rows: Sequence[int] | Ints, most_of_kind: int) -> None:
-        fresh = [int(row) for row in rows if int(row) not in found][: min(most_of_kind, most - len(found))]
+        fresh = [int(row) for row in rows if int(row) not in chosen][: min(most_of_kind, most - len(chosen))]
         for row in fresh:
             why = f"{focus}: harm {first[row]:.2f} first-impact, {total[row]:.2f} total"
-            found[row] = Played(int(evaluation.index[row]), kind, why)
+            chosen[row] = Played(int(evaluation.index[row]), kind, why)
 
     add(f"Where {focus} did worst", worst_rows(evaluation, focus), WORST)
     regrets = regrets_of(evaluation)
@@ -63,7 +63,7 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
     order = np.argsort(total, kind="stable")
     add(f"Typical of {focus}", [order[int(q * (len(order) - 1))] for q in (0.5, 0.6, 0.7, 0.8, 0.9)], _EACH)
     add("Drawn at random", np.random.default_rng(_RANDOM_SEED).permutation(len(total))[: 2 * most], most)
-    return found
+    return chosen
 
 
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:

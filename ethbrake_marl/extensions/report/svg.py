@@ -116,8 +116,8 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
 
 def _size_pt(root: ElementTree.Element) -> tuple[float, float]:
     """Return width and height of an SVG figure in points; 0, 0 if its viewBox has another form than in our figures."""
-    found = re.fullmatch(r"0 0 (\d+(?:\.\d+)?) (\d+(?:\.\d+)?)", root.attrib.get("viewBox", ""))
-    return (float(found[1]), float(found[2])) if found else (0.0, 0.0)
+    match = re.fullmatch(r"0 0 (\d+(?:\.\d+)?) (\d+(?:\.\d+)?)", root.attrib.get("viewBox", ""))
+    return (float(match[1]), float(match[2])) if match else (0.0, 0.0)
 
 
 def _is_ours(svg: bytes) -> bool:

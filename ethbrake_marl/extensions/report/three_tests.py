@@ -54,8 +54,8 @@ def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
     """
     ours = SummaryTable(table)
     sheet = ours.terminal()
-    kept = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in _KEPT)
-    columns, rows = list(kept.columns), [list(row) for row in kept.rows]
+    short = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in _KEPT)
+    columns, rows = list(short.columns), [list(row) for row in short.rows]
     note = f"{ours[0].parameters.line}. Harm: mean per world in m²/s², below it the 95 % interval."
     notes = [note, *(text for _, text in ours.notes())]
     for test, other in beside.items():
@@ -65,4 +65,4 @@ def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
             cells.append(row and f"{row.first_impact_harm.value:.2f}, {row.total_harm.value:.2f}")
         must = [text for kind, text in other.notes() if kind == "note"]
         notes.append(" ".join([TESTS[test], f"{count_of(other[0].episodes, 'world')}.", *must]))
-    return replace(kept, columns=columns, rows=rows, note="\n".join(notes))
+    return replace(short, columns=columns, rows=rows, note="\n".join(notes))

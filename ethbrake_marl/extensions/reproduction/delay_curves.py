@@ -65,14 +65,16 @@ def _shipped_ends(settings: Reproduction) -> Made:
     verdicts, rows, data = [], [], []
     for reading in READINGS:
         scenarios = {delay: reading.scenario(f"paper-delay-{delay}") for delay in (LOW, HIGH)}
-        found = {
+        shipped = {
             delay: harms(drive_list(each, lineup(each, PPO, SAC, UNIVERSAL, FULL_BRAKE), episodes, settings))
             for delay, each in scenarios.items()
         }
-        low, high = found.values()
+        low, high = shipped.values()
         rows += [(reading.name, name, mean(low[name]), mean(high[name])) for name in low]
         data += [
-            [reading.name, name, delay, episodes, float(found[delay][name].mean())] for name in low for delay in found
+            [reading.name, name, delay, episodes, float(shipped[delay][name].mean())]
+            for name in low
+            for delay in shipped
         ]
         parts = [Less.of_lists(name, low[name], high[name]) for name in low if name not in (NAMES[FULL_BRAKE], PROVEN)]
         what = f"finished policies harm less at low delay than at high ({reading.name})"
@@ -227,8 +229,8 @@ def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
     verdicts = [_higher_when_low(courses)] if high and low else []
     for first, second, _, about in _PAIRS.values():
         if not {first, second} <= own.keys():
-            told = f"{first} and {second} are not both trained"
-            verdicts.append(Verdict(f"PPO against SAC, {about}", "not run", told))
+            text = f"{first} and {second} are not both trained"
+            verdicts.append(Verdict(f"PPO against SAC, {about}", "not run", text))
             continue
         ppo, sac = own[first], own[second]
         if delay == LOW:
@@ -258,12 +260,12 @@ def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
         ]
         apart = abs(float(ppo.last_returns.mean() - sac.last_returns.mean())) / max(ppo.rise, sac.rise)
         where = f"apart by {100.0 * apart:.1f} % of the rise, at most {100.0 * _NEARLY:g} % asked"
-        told = (
+        text = (
             f"not converged: in the last quarter the return still rose by more than {100.0 * _NEARLY:g} % of its rise,"
             f" {' and '.join(rising)}"
         )
         parts = [Less(where, Estimate(apart - _NEARLY, None))]
-        verdicts.append(Verdict(what, "undecided", told) if rising else judge_statement(what, parts, show=_NUMBER))
+        verdicts.append(Verdict(what, "undecided", text) if rising else judge_statement(what, parts, show=_NUMBER))
     if delay == LOW and high:
         what = "the returns of different seeds spread more at low delay than at high"
         parts = [
@@ -271,8 +273,8 @@ def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
             for name in sorted(high.keys() & low.keys())
             if min(len(high[name].returns.values), len(low[name].returns.values)) > 1  # one seed has no spread
         ]
-        told = "no recipe has several seeds at both delays"
-        verdicts.append(judge_statement(what, parts, show=_NUMBER) if parts else Verdict(what, "not run", told))
+        text = "no recipe has several seeds at both delays"
+        verdicts.append(judge_statement(what, parts, show=_NUMBER) if parts else Verdict(what, "not run", text))
     return verdicts
 
 

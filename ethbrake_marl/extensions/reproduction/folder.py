@@ -112,11 +112,11 @@ class Reproduction:
     def cost(self, items: Sequence[Item]) -> str:
         """Return one line of text on the work left to do for ``items`` and the time it takes."""
         wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
-        told = (
+        cost = (
             f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
         )
         training_s = self.seconds_left(wanted)
-        return f"{told}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else told
+        return f"{cost}; trainings before them about {training_s / 60.0:.0f} min of one core" if wanted else cost
 
 
 @model(frozen=True, config=WRITTEN)
@@ -244,13 +244,13 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
     scenario -> other place; an empty text marks our default.
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
-    found = [
+    parameters = [
         stated(name, f"{_plain(content[key])}{f' {unit}' if unit else ''}", places.get(key, where))
         for name, key, unit, where in _QUANTITIES
         if key in content
     ]
     early = "worlds in which Vehicle 2 is hit before it may act are drawn again"
-    return [*found, stated("early impacts", early, "sec:system_model, assumed away")]
+    return [*parameters, stated("early impacts", early, "sec:system_model, assumed away")]
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:

@@ -90,20 +90,20 @@ def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
 
 def over_distance(
     stem: str,
-    found: Mapping[str, tuple[Sequence[float], Groups]],
+    curves: Mapping[str, tuple[Sequence[float], Groups]],
     verdicts: Sequence[Verdict],
     lines: Sequence[str],
-    told: Sequence[Parameter],
+    parameters: Sequence[Parameter],
     episodes: int,
 ) -> Made:
     """Return an item that shows the harm of strategies against the sum of both gaps.
 
     Args:
         stem: name of its files without ending.
-        found: result of ``by_distance`` for each assumption on when Vehicle 2 may act, by the name of the assumption.
+        curves: result of ``by_distance`` for each assumption on when Vehicle 2 may act, by the name of the assumption.
         verdicts: verdicts on the paper's statements.
         lines: names of the strategies to draw.
-        told: parameters to list besides those of the scenario.
+        parameters: parameters to list besides those of the scenario.
         episodes: number of worlds.
 
     """
@@ -111,7 +111,7 @@ def over_distance(
         reading: {
             name: {at: mean(harm[name]) for at, harm in zip(at_m, groups.values(), strict=True)} for name in lines
         }
-        for reading, (at_m, groups) in found.items()
+        for reading, (at_m, groups) in curves.items()
     }
     figure = estimates_figure(
         panels,
@@ -122,7 +122,7 @@ def over_distance(
     text = "Mean harm of each strategy against the sum of both gaps; left as the paper states it, right with Vehicle 2"
     rows = [
         (reading, name, group, at, len(harm[name]), mean(harm[name]))
-        for reading, (at_m, groups) in found.items()
+        for reading, (at_m, groups) in curves.items()
         for name in next(iter(groups.values()))
         for at, (group, harm) in zip(at_m, groups.items(), strict=True)
     ]
@@ -132,10 +132,10 @@ def over_distance(
         verdicts,
         [
             *scenario_parameters(load_scenario(DISTANCE), gaps_m="5 to 10 m, text to Table:hybrid"),
-            *told,
+            *parameters,
             list_parameter(episodes),
         ],
-        [_harm_table(f"{title}, {reading}", groups, note) for reading, (_, groups) in found.items()],
+        [_harm_table(f"{title}, {reading}", groups, note) for reading, (_, groups) in curves.items()],
         {Drawn(stem, "Harm over total distance", f"{text} acting at 0.2 s."): figure},
         {stem: csv_text(head, rows)},
     )
@@ -147,11 +147,11 @@ def reproduce_distance(settings: Reproduction) -> Made:
     The verdicts judge the paper's statements about it.
     """
     episodes, braking = min(_DISTANCE_WORLDS, settings.episodes), NAMES[FULL_BRAKE]
-    found, verdicts = {}, []
+    curves, verdicts = {}, []
     for reading in READINGS:
         scenario = reading.scenario(DISTANCE)
-        found[reading.name] = by_distance(drive_list(scenario, lineup(scenario, *FOUR), episodes, settings))
-        _, groups = found[reading.name]
+        curves[reading.name] = by_distance(drive_list(scenario, lineup(scenario, *FOUR), episodes, settings))
+        _, groups = curves[reading.name]
         claims = {
             "non-ethical: the larger the distance, the larger the harm": [
                 Less.of_lists(f"{one} to {other}", groups[one][braking], groups[other][braking])
@@ -167,9 +167,13 @@ def reproduce_distance(settings: Reproduction) -> Made:
             },
         }
         verdicts += [judge_statement(f"{claim} ({reading.name})", parts) for claim, parts in claims.items()]
-    told = [Parameter("distances", "each gap drawn on its own, then grouped by the sum"), FIRST_IMPACTS, NOT_THEIRS]
+    parameters = [
+        Parameter("distances", "each gap drawn on its own, then grouped by the sum"),
+        FIRST_IMPACTS,
+        NOT_THEIRS,
+    ]
     lines = [*(NAMES[spec] for spec in FOUR), PREDICTED, PROVEN]
-    return over_distance("harm-distance", found, verdicts, lines, told, episodes)
+    return over_distance("harm-distance", curves, verdicts, lines, parameters, episodes)
 
 
 _DELAYS, _DELAY_WORLDS = ("low", "middle", "high"), 2_000
@@ -185,11 +189,11 @@ def reproduce_delays(settings: Reproduction) -> Made:
     There is one figure for the world of the paper's figure, and one for a list of worlds.
     """
     episodes = min(_DELAY_WORLDS, settings.episodes)
-    found: dict[tuple[str, str], Groups] = {}  # by worlds and reading
+    curves: dict[tuple[str, str], Groups] = {}  # by worlds and reading
     for reading in READINGS:
         for worlds, state, count in ((_ONE, _STATE, 1), (_LIST, {}, episodes)):
             scenarios = [reading.scenario(f"paper-delay-{delay}", **state) for delay in _DELAYS]
-            found[worlds, reading.name] = {
+            curves[worlds, reading.name] = {
                 _delay_name(each): harms(drive_list(each, lineup(each, *FOUR), count, settings)) for each in scenarios
             }
     figures = {}
@@ -199,7 +203,7 @@ def reproduce_delays(settings: Reproduction) -> Made:
                 name: {at: mean(harm[name]) for at, harm in zip(_DELAYS, delays.values(), strict=True)}
                 for name in next(iter(delays.values()))
             }
-            for (own, reading), delays in found.items()
+            for (own, reading), delays in curves.items()
             if own == worlds
         }
         caption = f"{worlds}. Low, middle, high: τ3 = 0.3, 0.6, 1.2 s; left τ2 = 0.1, 0.3, 0.8 s. Bars: 95 % intervals."
@@ -217,7 +221,7 @@ def reproduce_delays(settings: Reproduction) -> Made:
     ]
     rows = [
         (*where, delay, name, len(values), mean(values))
-        for where, delays in found.items()
+        for where, delays in curves.items()
         for delay, harm in delays.items()
         for name, values in harm.items()
     ]
@@ -227,10 +231,10 @@ def reproduce_delays(settings: Reproduction) -> Made:
             f"{NAMES[policy]} harms less than non-ethical and E-V2X-BM at every delay ({'; '.join(where)})",
             less_in_each(delays, NAMES[policy], NAMES[FULL_BRAKE], *BASELINES),
         )
-        for where, delays in found.items()
+        for where, delays in curves.items()
         for policy in (SAC, PPO)
     ]
-    tables = [_harm_table(", ".join(where), delays, "; one world has no interval") for where, delays in found.items()]
+    tables = [_harm_table(", ".join(where), delays, "; one world has no interval") for where, delays in curves.items()]
     return Made(verdicts, parameters, tables, figures, {"harm-delays": csv_text(head, rows)})
 
 

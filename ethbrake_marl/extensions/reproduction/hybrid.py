@@ -84,10 +84,10 @@ def reproduce_illustration(settings: Reproduction) -> Made:
     alert. The paper's claim that it "consistently selects the strategy that results in lower harm" is judged in each
     world and in each group.
     """
-    found, verdicts = {}, []
+    curves, verdicts = {}, []
     for reading in READINGS:
         evaluation = _drive_hybrid(DISTANCE, settings, reading)
-        found[reading.name], harm = by_distance(evaluation), harms(evaluation)
+        curves[reading.name], harm = by_distance(evaluation), harms(evaluation)
         for name, baseline in ((_REALISED, NAMES[COUPLED]), (_AS_PRINTED, NAMES[PAIRWISE])):
             lower = np.minimum(harm[_ALONE], harm[baseline])
             worse = harm[name] > lower + 1e-9
@@ -99,12 +99,12 @@ def reproduce_illustration(settings: Reproduction) -> Made:
             verdicts.append(Verdict(what, "differs" if worse.any() else "agrees", because))
         for other in (_ALONE, NAMES[COUPLED]):
             what = f"the {_REALISED} harms no more than {other} at every distance ({reading.name})"
-            parts = less_in_each(found[reading.name][1], _REALISED, other)
+            parts = less_in_each(curves[reading.name][1], _REALISED, other)
             verdicts.append(judge_statement(what, parts, or_equal=True))
     lines = [NAMES[PAIRWISE], NAMES[COUPLED], _ALONE, _REALISED, _AS_PRINTED, PREDICTED]
-    told = [Parameter("policy", unconverged_policy(settings)[1]), H_STAR, FIRST_IMPACTS]
+    parameters = [Parameter("policy", unconverged_policy(settings)[1]), H_STAR, FIRST_IMPACTS]
     episodes = min(_HYBRID_WORLDS, settings.episodes)
-    return over_distance("hybrid-illustration", found, verdicts, lines, told, episodes)
+    return over_distance("hybrid-illustration", curves, verdicts, lines, parameters, episodes)
 
 
 def reproduce_hybrid_table(settings: Reproduction) -> Made:

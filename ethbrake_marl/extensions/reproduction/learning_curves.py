@@ -60,15 +60,15 @@ class LearningCurves(NamedTuple):
 
         Raises ``InvalidInput`` for another form or two recipes of the same name.
         """
-        found = []
+        curves = []
         for part in split_names(text, lambda part: os.path.isfile(part.rpartition(":")[0])):
             match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
             if match is None:
                 raise InvalidInput(f"recipes {text!r}: {part!r} must be RECIPE:SEEDS, for instance ppo:5,sac:3")
-            found.append((load_recipe(match[1]), int(match[2])))
-        if len({recipe.name for recipe, _ in found}) < len(found):
+            curves.append((load_recipe(match[1]), int(match[2])))
+        if len({recipe.name for recipe, _ in curves}) < len(curves):
             raise InvalidInput(f"recipes {text!r}: two recipes have the same name")
-        return found
+        return curves
 
     def train(
         self, *, steps: int | None = None, settings: Sequence[str] = (), jobs: int = 1, tell: OnProgress | None = None

@@ -83,8 +83,8 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
             if full and finished:
                 finished = asked.train(item.trained)
             trained = list(asked.trained(item.trained))
-            kept = {result.name: list(result.trained) for result in read_results(asked.folder)}
-            if kept.get(item.name) != trained:
+            stored = {result.name: list(result.trained) for result in read_results(asked.folder)}
+            if stored.get(item.name) != trained:
                 _make_item(asked, item, trained)
                 write_file(asked.folder / "index.html", render_page(asked.folder, read_results(asked.folder)).encode())
         results = read_results(asked.folder)

@@ -147,12 +147,12 @@ def reproduce_gaps(settings: Reproduction) -> Made:
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
     measured = [gap for gap in GAPS if gap.alternatives]
-    found: dict[tuple[Gap, Alternative], Headline] = {}
+    headlines: dict[tuple[Gap, Alternative], Headline] = {}
     for number, gap in enumerate(measured):
         settings.tell(Progress("open quantities", number, len(measured)))
-        found |= {(gap, each): _measure(scenario, each, episodes) for each in gap.alternatives}
+        headlines |= {(gap, each): _measure(scenario, each, episodes) for each in gap.alternatives}
     settings.tell(Progress("open quantities", len(measured), len(measured)))
-    rows = {f"{gap.name}: {each.value}": headline for (gap, each), headline in found.items()}
+    rows = {f"{gap.name}: {each.value}": headline for (gap, each), headline in headlines.items()}
     changes = {row: {name: headline.change(base, name) for name in _SHOWN} for row, headline in rows.items()}
     verdicts, notes, printed = [], [], {row.agent: row for row in PAPER_ROWS if row.table == "random test"}
     for agent, spec in (("Non-E", FULL_BRAKE), ("E-V2X-BM", PAIRWISE), ("Hybrid PPO", PPO)):
@@ -196,7 +196,7 @@ def reproduce_gaps(settings: Reproduction) -> Made:
                     *(gap.name, gap.ours, each.value, *(headline.change(base, name) for name in _SHOWN)),
                     *(collision_rate(headline.collided[NAMES[spec]]).value for spec in (PAIRWISE, PPO)),
                 )
-                for (gap, each), headline in found.items()
+                for (gap, each), headline in headlines.items()
             ],
             "Change of the mean harm (m²/s²) with its 95 % interval, paired by world where the worlds are the same;"
             " then the collision rates in the alternative. In the rows of H* inside the hybrid, PPO stands behind"
@@ -214,8 +214,8 @@ def reproduce_gaps(settings: Reproduction) -> Made:
             f" {load_recipe(PPO_PAPER.recipe).total_steps:,} decisions; two seeds say little about others."
         )
         told = [
-            (name, len(kept), float(np.mean(kept)), ", ".join(f"{harm:.2f}" for harm in kept))
-            for name, kept in trained.items()
+            (name, len(policy), float(np.mean(policy)), ", ".join(f"{harm:.2f}" for harm in policy))
+            for name, policy in trained.items()
         ]
         tables.append(Sheet("What is open in training", ("Training", "Seeds", "Mean harm", "Each seed"), told, note))
     else:

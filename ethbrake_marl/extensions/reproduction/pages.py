@@ -59,7 +59,7 @@ def render_page(folder: Path, results: Sequence[Result]) -> str:
 
     Raises ``InvalidInput`` for a missing figure, or a figure with elements that our figures do not contain.
     """
-    lead, command, made, few = _account(results)
+    lead, command, count, few = _account(results)
     _, *names = Page.anchors(["Overview", *(result.title for result in results)])
     link = Markup('<a href="#{}">{}</a>')
     rows = [
@@ -67,7 +67,7 @@ def render_page(folder: Path, results: Sequence[Result]) -> str:
         for name, each in zip(names, results, strict=True)
     ]
     overview = [
-        Part(Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(command), shown(made))),
+        Part(Markup("<p>Made by <code>{}</code> ({}).</p>\n").format(shown(command), shown(count))),
         *(Part.paragraph(text, "note") for text in few),
         Part.table(Sheet("Verdict on each item", ["Item", "Verdict"], rows)),
     ]
@@ -138,12 +138,12 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
 
 def docs_page(results: Sequence[Result]) -> str:
     """Return the Markdown page of these results, with the verdict on each item. The ``.json`` file has all the rest."""
-    lead, command, made, few = _account(results)
+    lead, command, count, few = _account(results)
     blocks = [
         f"# {_TITLE}",
         "What comes out where the paper's experiments are made again, and where it cannot?",
         _wrapped(lead),
-        _wrapped(f"Made by `{command} --output runs/reproduction --docs docs/reproduction.md` ({_escaped(made)})."),
+        _wrapped(f"Made by `{command} --output runs/reproduction --docs docs/reproduction.md` ({_escaped(count)})."),
         _wrapped(
             "That command writes this page, its figures and `reproduction.json`; nothing is written by hand. `ethbrake"
             " reproduce` makes them again without training. [All that was measured](results/reproduction.md) has every"

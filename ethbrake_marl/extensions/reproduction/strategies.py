@@ -51,11 +51,11 @@ class Reading:
         """Return the shipped scenario ``name`` under this assumption; ``changes`` replace further keys of the
         scenario.
         """
-        found = load_scenario(name).replace(**changes) if changes else load_scenario(name)
+        scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
-            return found
-        first, _, *others = found.model_dump()["latency_s"]
-        return found.replace(latency_s=[first, self.acts_s, *others])
+            return scenario
+        first, _, *others = scenario.model_dump()["latency_s"]
+        return scenario.replace(latency_s=[first, self.acts_s, *others])
 
 
 READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
@@ -86,14 +86,14 @@ def harms(evaluation: Evaluation) -> dict[str, Floats]:
     The mapping also has the harm that E-V2X-BM predicts (``PREDICTED``) and the proven lower bound (``PROVEN``), if
     known.
     """
-    found = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
+    each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
     if pairwise is not None and pairwise.predicted_harm is not None:
-        found[PREDICTED] = pairwise.predicted_harm
+        each_harm[PREDICTED] = pairwise.predicted_harm
     limits = limits_of(evaluation)
     if not isinstance(limits, Unproven) and limits.proof.harm is not None:
-        found[PROVEN] = limits.proof.harm
-    return found
+        each_harm[PROVEN] = limits.proof.harm
+    return each_harm
 
 
 _STAND_IN = "ppo-paper-random-obstacle"  # shipped policy that replaces an unconverged one without trainings

@@ -46,7 +46,7 @@ class Beside:
 
         The key "least possible (proven)" (``NOBODY``), if present, holds the proven minimum over all strategies.
         """
-        found, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
+        numbers, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
             harm, predicted = outcome.first_impact_harm, outcome.predicted_harm
             own = {
@@ -56,11 +56,11 @@ class Beside:
                 _TOTAL: mean(outcome.total_harm),
                 _PREDICTED_HARM: None if predicted is None else mean(predicted),
             }
-            found[name] = {quantity: estimate for quantity, estimate in own.items() if estimate is not None}
+            numbers[name] = {quantity: estimate for quantity, estimate in own.items() if estimate is not None}
         least = harms(self.evaluation).get(PROVEN)
         if least is not None:
-            found[NOBODY] = {_RATE: collision_rate(least > 0.0), _MEAN_HARM: mean(least), _TOTAL: mean(least)}
-        return found
+            numbers[NOBODY] = {_RATE: collision_rate(least > 0.0), _MEAN_HARM: mean(least), _TOTAL: mean(least)}
+        return numbers
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
         """Yield all results of ours that a number in the paper may mean, each as (name, estimate).
@@ -118,12 +118,12 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]
-    told = (
+    text = (
         f"{chosen.agent} is one of the two in every world, so it avoids at most {avoided[0]:,} + {avoided[1]:,} ="
         f" {together:,} collisions; printed: {avoided[2]:,}"
     )
     what = f"{chosen.agent} avoids no more than {one.agent} and {other.agent} together (arithmetic of the printed rows)"
-    return Verdict(what, "agrees" if avoided[2] <= together else "cannot agree", told)
+    return Verdict(what, "agrees" if avoided[2] <= together else "cannot agree", text)
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
@@ -133,11 +133,11 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0
-    told = (
+    text = (
         f"1 - {row.average_harm:g} / {baseline.average_harm:g} = {100.0 * follows:.2f} %; printed {100 * printed:g} %"
     )
     what = f"{row.agent}, harm decrease follows from the printed harms"
-    return Verdict(what, "agrees" if abs(follows - printed) < 0.0001 else "cannot agree", told)
+    return Verdict(what, "agrees" if abs(follows - printed) < 0.0001 else "cannot agree", text)
 
 
 def rows_table(beside: Beside) -> Sheet:

@@ -35,11 +35,11 @@ class TrainedRecipe:
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
         """Return the recipe, renamed to ``name``, with these settings and with ``changes`` of further keys."""
-        found = load_recipe(self.recipe)
-        evaluation = {**found.evaluation.model_dump(), "every_updates": self.every_updates}
-        if "log_every_updates" in type(found).model_fields:  # otherwise the table has a row for every update
+        recipe = load_recipe(self.recipe)
+        evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}
+        if "log_every_updates" in type(recipe).model_fields:  # otherwise the table has a row for every update
             changes["log_every_updates"] = self.every_updates
-        return found.replace(name=name, total_steps=self.decisions, evaluation=evaluation, **changes)
+        return recipe.replace(name=name, total_steps=self.decisions, evaluation=evaluation, **changes)
 
 
 PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 5_000)

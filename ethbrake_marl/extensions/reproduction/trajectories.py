@@ -93,7 +93,7 @@ def reproduce_trajectories(settings: Reproduction) -> Made:
 def reproduce_accelerations(settings: Reproduction) -> Made:
     """Reproduce the commands of Vehicle 2 in the paper's Scenarios 1 and 2; return figure, table and verdicts."""
     records, verdicts = _record_all(settings), []
-    driven = {key: _asked_of_vehicle_2(record) for key, record in records.items()}
+    commands = {key: _asked_of_vehicle_2(record) for key, record in records.items()}
     panels = {
         f"{name}, Scenario {number}": {reading.name: records[reading, number, name] for reading in READINGS}
         for name in _POLICIES
@@ -103,7 +103,7 @@ def reproduce_accelerations(settings: Reproduction) -> Made:
     figures = {Drawn("accelerations", "Acceleration profiles", text): profiles_figure(panels, caption=text)}
     for reading in READINGS:
         one, two = _apart(records, reading, "command_mps2")
-        (first, ppo_changes, _), (_, sac_changes, braking) = (driven[reading, 2, name] for name in _POLICIES)
+        (first, ppo_changes, _), (_, sac_changes, braking) = (commands[reading, 2, name] for name in _POLICIES)
         claims = {
             "the profiles are more alike in Scenario 1 than in 2": (
                 f"root mean square difference {one:.2f} m/s² against {two:.2f} m/s²", one, two,
@@ -124,7 +124,7 @@ def reproduce_accelerations(settings: Reproduction) -> Made:
             f"{records[reading, number, name].command_mps2[:, 1].min():+.2f}",
             *(f"{100.0 * braking:.0f} %", f"{changes:.1f}"),
         )
-        for (reading, number, name), (first, changes, braking) in driven.items()
+        for (reading, number, name), (first, changes, braking) in commands.items()
     ]
     head = ("Reading", "Scenario", "Strategy", "First command", "Hardest", "Braking while it moves", "Ups and downs")
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
@@ -133,14 +133,14 @@ def reproduce_accelerations(settings: Reproduction) -> Made:
 
 
 def _record_all(settings: Reproduction) -> Records:
-    found: Records = {}
+    records: Records = {}
     for reading, number in _CELLS:
         scenario = reading.scenario(f"paper-scenario-{number}")
         world = scenario.sample(1, LIST_SEED).worlds
         for name, agent in lineup(scenario, *_AGENTS).items():
-            found[reading, number, name] = record_episode(world, agent, scenario=scenario)
-            settings.tell(Progress("recorded episodes", len(found), len(_CELLS) * len(_AGENTS)))
-    return found
+            records[reading, number, name] = record_episode(world, agent, scenario=scenario)
+            settings.tell(Progress("recorded episodes", len(records), len(_CELLS) * len(_AGENTS)))
+    return records
 
 
 @cache
@@ -149,7 +149,7 @@ def play() -> Part:
 
     It shows PPO and SAC side by side.
     """
-    found = []
+    records = []
     for reading, number in _CELLS:
         scenario = reading.scenario(f"paper-scenario-{number}")
         world = scenario.sample(1, LIST_SEED).worlds
@@ -158,19 +158,19 @@ def play() -> Part:
         one = Played(0, reading.name, again, title=f"Scenario {number}, {reading.name}")
         for spec, agent in make_agents(_AGENTS, scenario).items():
             Played.drive([one], world, NAMES[spec], agent, scenario)
-        found.append(one)
-    return Part.player(found, scenario.learners, shown_first=[_AGENTS.index(PPO), _AGENTS.index(SAC)])
+        records.append(one)
+    return Part.player(records, scenario.learners, shown_first=[_AGENTS.index(PPO), _AGENTS.index(SAC)])
 
 
 def _parameters() -> list[Parameter]:
     one, two = (scenario_parameters(load_scenario(f"paper-scenario-{k}")) for k in _SCENARIOS)
-    told = [
+    parameters = [
         stated(first.name, f"{first.value}; Scenario 2: {second.value}", "text to Fig:pic5sim")
         if first.value != second.value
         else first
         for first, second in zip(one, two, strict=True)
     ]
-    return [*told, Parameter("policies", f"{POLICIES}; not the paper's")]
+    return [*parameters, Parameter("policies", f"{POLICIES}; not the paper's")]
 
 
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
@@ -212,8 +212,8 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 
     """
     return [
-        judge_statement(f"{claim} ({reading.name})", [Less(told, Estimate(smaller - larger, None))], show=show)
-        for claim, (told, smaller, larger) in claims.items()
+        judge_statement(f"{claim} ({reading.name})", [Less(value, Estimate(smaller - larger, None))], show=show)
+        for claim, (value, smaller, larger) in claims.items()
     ]
 
 

@@ -71,24 +71,24 @@ def compare_number(
         others: the same quantity under other assumptions, by description; if ours differs, the nearest one is named.
 
     """
-    told = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
+    text = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
     if least is not None and least[1].value - printed > _chance(least[1]):
         undercut = f"{least[0]}: at least {show.show(least[1]).in_words}, whoever drives"
-        return Verdict(what, "cannot agree", f"{undercut}; {told}")
+        return Verdict(what, "cannot agree", f"{undercut}; {text}")
     off = _off(printed, ours)
     if not off:
-        return Verdict(what, "agrees", told)
+        return Verdict(what, "agrees", text)
     if abs(ours.value - printed) <= _chance(ours):
-        return Verdict(what, "undecided", f"{told}: too few worlds to tell")
-    told += f" ({off})"
+        return Verdict(what, "undecided", f"{text}: too few worlds to tell")
+    text += f" ({off})"
     if others:
-        name, found = min(others.items(), key=lambda each: abs(each[1].value - printed))
-        if abs(found.value - printed) < abs(ours.value - printed):
-            met = _off(printed, found) or "which agrees"
-            told += f"; nearest: {name}, {show.show(found).in_words}, {met}"
+        name, nearest = min(others.items(), key=lambda each: abs(each[1].value - printed))
+        if abs(nearest.value - printed) < abs(ours.value - printed):
+            met = _off(printed, nearest) or "which agrees"
+            text += f"; nearest: {name}, {show.show(nearest).in_words}, {met}"
         else:
-            told += "; no other reading here comes nearer"
-    return Verdict(what, "differs", told)
+            text += "; no other reading here comes nearer"
+    return Verdict(what, "differs", text)
 
 
 def _off(printed: float, ours: Estimate) -> str:
@@ -98,8 +98,8 @@ def _off(printed: float, ours: Estimate) -> str:
     ``_chance``). Chance does not count if it is above 15 % of the larger number (``WIDE``).
     """
     chance = _chance(ours)
-    told = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
-    if abs(ours.value - printed) <= max(told, TOLERANCE * abs(printed)):
+    off = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
+    if abs(ours.value - printed) <= max(off, TOLERANCE * abs(printed)):
         return ""
     return f"{ours.value:+.3g} off" if printed == 0.0 else f"{100.0 * (ours.value / printed - 1.0):+.1f} %"
 
@@ -171,14 +171,14 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
     ]
     counts = f"holds in {len(compared) - len(failing)} of {len(compared)}{f' (both are 0 in {places})' if ties else ''}"
     if impossible:
-        told = f"the harm proven to be the least is above it in: {', '.join(impossible)}"
-        return Verdict(what, "cannot agree", f"{counts}; {told}")
+        text = f"the harm proven to be the least is above it in: {', '.join(impossible)}"
+        return Verdict(what, "cannot agree", f"{counts}; {text}")
     if failing:
         ends = [part.difference.ends for part in failing]
         is_open = all(low < 0.0 <= high for low, high in ends)  # another list may decide either way
-        told = ", ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in failing)
+        text = ", ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in failing)
         lead = f"{counts}; not " if len(parts) > 1 else "not "
-        shown = f"{lead}{'shown' if is_open else 'so'}: {told}"
+        shown = f"{lead}{'shown' if is_open else 'so'}: {text}"
         return Verdict(what, "undecided" if is_open else "differs", shown)
     worst = max(compared, key=lambda part: part.difference.value)
     lead = f"{counts}; the nearest is " if len(parts) > 1 else ""
@@ -191,9 +191,9 @@ def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
         return Verdict("all", "not run", "nothing was compared")
     counted = {outcome: sum(each.outcome == outcome for each in verdicts) for outcome in get_args(Judgement)}
     plural = {"agrees": "agree", "differs": "differ"}
-    told = [f"{n} {plural.get(outcome, outcome) if n > 1 else outcome}" for outcome, n in counted.items() if n]
+    parts = [f"{n} {plural.get(outcome, outcome) if n > 1 else outcome}" for outcome, n in counted.items() if n]
     first = next(each for outcome in counted for each in verdicts if each.outcome == outcome)
-    lead = "" if len(verdicts) == 1 else f"of {len(verdicts)} comparisons {', '.join(told)}; "
+    lead = "" if len(verdicts) == 1 else f"of {len(verdicts)} comparisons {', '.join(parts)}; "
     return Verdict("all", first.outcome, f"{lead}{first.what}: {first.because}")
 
 

@@ -74,10 +74,10 @@ def sweep_command(
         result = plan.run(output, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
         counts = {"jobs": result.jobs, "finished": result.finished, "failed": result.failed}
         out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
-        told = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
+        summary = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
         if result.failed:
-            told += f"; {result.failed:,} failed: {output / 'failures.csv'}"
-        _end_study(out, told, interrupted=result.interrupted, failed=result.failed > 0)
+            summary += f"; {result.failed:,} failed: {output / 'failures.csv'}"
+        _end_study(out, summary, interrupted=result.interrupted, failed=result.failed > 0)
 
 
 @study_group.command(
@@ -128,13 +128,13 @@ def tune_command(
             own = plan.own_values()
             space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
             now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
-            begun, steps, example = len(plan.proposals(output)), plan.recipe.total_steps, plan.example()
+            started, steps, example = len(plan.proposals(output)), plan.recipe.total_steps, plan.example()
             out.result(
                 {
-                    **{"search": space, "own_values": own, "trials": trials, "begun": begun, "total_steps": steps},
+                    **{"search": space, "own_values": own, "trials": trials, "begun": started, "total_steps": steps},
                     **{"scenario": plan.file.scenario, "recipe": plan.file.recipe, "example": example},
                 },
-                f"{count_of(trials, 'trial')} ({begun:,} begun before): recipe {plan.file.recipe} in scenario"
+                f"{count_of(trials, 'trial')} ({started:,} begun before): recipe {plan.file.recipe} in scenario"
                 f" {plan.file.scenario}, {steps:,} decisions each unless it is pruned",
                 *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
                 f"{'the first' if own else 'for example'}: {example}",
@@ -143,7 +143,7 @@ def tune_command(
         need("ray")
         result = plan.run(output, trials, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
         counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
-        told, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
+        summary, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
         export = None if best is None or result.interrupted else export  # what goes on exports at its end
         if best is not None:
             measure = training.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
@@ -154,23 +154,23 @@ def tune_command(
             if export is not None:
                 source = f"trial {best.number}, {best.harm!r} on the list of seed {plan.file.measure.seed}"
                 out.write(export, plan.best_recipe(best.values, export, f"ethbrake study tune: {source}"))
-                told += f"; recipe: {export}"
-        found = {
+                summary += f"; recipe: {export}"
+        best_row = {
             "best": shown,
             "trials": result.counts,
             "interrupted": result.interrupted,
             "table": str(result.table),
             "exported": None if export is None else str(export),
         }
-        out.result(found, *lines)
-        _end_study(out, told, interrupted=result.interrupted, failed=best is None)
+        out.result(best_row, *lines)
+        _end_study(out, summary, interrupted=result.interrupted, failed=best is None)
 
 
-def _end_study(out: Out, told: str, *, interrupted: bool, failed: bool) -> None:
-    """Print ``told``, the result of a sweep or tuning, and end the command: status 130 if interrupted, 1 if failed."""
+def _end_study(out: Out, summary: str, *, interrupted: bool, failed: bool) -> None:
+    """Print ``summary``, the result of a sweep or tuning, and end the command: status 130 if interrupted, 1 if failed."""
     if interrupted:
-        out.interrupted(f"interrupted; {told}; {KEPT}")
-    out.note(told)
+        out.interrupted(f"interrupted; {summary}; {KEPT}")
+    out.note(summary)
     if failed:
         raise typer.Exit(1)
 
@@ -241,30 +241,30 @@ def falsify_command(
         chosen = task.scenario
         measured_by = Measure.of(measure, agent, against, chosen, task.harm_count)
         evaluation.check_agents(measured_by.agents, chosen.replace(early_impacts="keep").sample(1, seed).worlds, chosen)
-        found = measured_by.falsify(
+        worst = measured_by.falsify(
             budget, seed, most=keep, on_round=lambda done, total: out.progress(agent, done, total)
         )
-        worlds, good = found.worlds, found.scores[np.isfinite(found.scores)]
+        worlds, good = worst.worlds, worst.scores[np.isfinite(worst.scores)]
         told: dict[str, Any] = {
             "tried": budget,
             "counted": len(good),
-            "share_above_zero": found.share_above,
-            "first_above_zero": found.first_above,
+            "share_above_zero": worst.share_above,
+            "first_above_zero": worst.first_above,
             "median": float(np.median(good)),
             "worst": float(good.max()),
             "machine": asdict(this_machine()),
             "worlds": [world.model_dump(exclude_none=True) for world in worlds],
         }
-        first, shown = found.first_above, []
+        first, shown = worst.first_above, []
         left_out = f" ({budget - len(good):,} of them are none of the scenario's)" if len(good) < budget else ""
         summary = (
             f"{chosen.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {task.harm_count} count: worst"
-            f" {told['worst']:.4g}, median {told['median']:.4g}; above zero in {100 * found.share_above:.1f} % of those"
+            f" {told['worst']:.4g}, median {told['median']:.4g}; above zero in {100 * worst.share_above:.1f} % of those"
             f" tried, {f'the first after {first:,}' if first else 'none'}."
             " The search looks for bad worlds: shares of it say nothing about a list."
         )
         if worlds:
-            kept = NamedWorlds.of(
+            named = NamedWorlds.of(
                 measured_by.scenario,
                 scenario=scenario,
                 settings=[each.text for each in training.read_settings(settings, of_agents=("harm_count",)).scenario],
@@ -278,7 +278,7 @@ def falsify_command(
                 ),
                 worlds=worlds,
             )  # fmt: skip
-            told |= kept.model_dump(exclude_none=True)
+            told |= named.model_dump(exclude_none=True)
             beside = {"harm": [], "bound": ["Bound"]}.get(measure, ["Reference's harm"])
             columns = ("World", measure.capitalize(), "Harm", *beside, "State")
             rows = []
@@ -288,7 +288,7 @@ def falsify_command(
                 rows.append((world.name, f"{world.score:.4g}", f"{world.harm:.2f}", *reference, state))
             shown.append(Sheet("", columns, rows, gap=2))
             if output is not None:
-                out.write(output, kept.text, what="the worlds")
+                out.write(output, named.text, what="the worlds")
         elif output is not None:
             out.note(f"nothing was found, and {output} not written")
         out.result({**told, "versions": evaluation.result_versions()}, *shown, summary)
@@ -320,16 +320,16 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     from ethbrake_marl.extensions.studies.weakness import Measure
     from ethbrake_marl.scenario.sample import Sample
 
-    kept = NamedWorlds.read(file)
-    for spec in (*([kept.agent] if agent is None else []), *([kept.against] if kept.against else [])):
+    named = NamedWorlds.read(file)
+    for spec in (*([named.agent] if agent is None else []), *([named.against] if named.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
                 f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
                 " names another one, and who is compared with is edited in the file"
             )
-    chosen = evaluation.load_runnable(kept.scenario, training.read_settings(kept.settings).scenario, drives="some")
-    measured_by = Measure.of(kept.measure, agent or kept.agent, kept.against, chosen, kept.harm_count)
-    worlds = kept.worlds_of(chosen, str(file))
+    chosen = evaluation.load_runnable(named.scenario, training.read_settings(named.settings).scenario, drives="some")
+    measured_by = Measure.of(named.measure, agent or named.agent, named.against, chosen, named.harm_count)
+    worlds = named.worlds_of(chosen, str(file))
     measured = measured_by(Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0))
     rows = [
         {
@@ -338,7 +338,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
             "now": float(now) if np.isfinite(now) else None,
             "worse": not np.isfinite(now) or bool(now > world.score + ROUNDING),
         }
-        for world, now in zip(kept.worlds, measured.score, strict=True)
+        for world, now in zip(named.worlds, measured.score, strict=True)
     ]
     shown = [
         (
@@ -348,9 +348,9 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
         )
         for row in rows
     ]
-    sheet = Sheet("", ("World", f"{kept.measure} before", "now", ""), shown, gap=2)
-    out.result({"agent": agent or kept.agent, "measure": kept.measure, "worlds": rows}, sheet)
+    sheet = Sheet("", ("World", f"{named.measure} before", "now", ""), shown, gap=2)
+    out.result({"agent": agent or named.agent, "measure": named.measure, "worlds": rows}, sheet)
     worse = sum(bool(row["worse"]) for row in rows)
-    out.note(f"{file}: {agent or kept.agent} is worse in {worse} of {count_of(len(rows), 'world')}")
+    out.note(f"{file}: {agent or named.agent} is worse in {worse} of {count_of(len(rows), 'world')}")
     if worse:
         raise typer.Exit(1)

@@ -88,27 +88,27 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
         yield from np.minimum(sobol.random(ROUND), _LAST)
 
 
-def far_apart(found: Scored, count: int) -> Ints:
-    """Return the row numbers of the best points of ``found`` that are far apart, best first, at most ``count``.
+def far_apart(scored: Scored, count: int) -> Ints:
+    """Return the row numbers of the best points of ``scored`` that are far apart, best first, at most ``count``.
 
     Any two of them differ by at least 0.1 in some coordinate. Points that do not count (score not finite) are omitted.
     """
-    order = np.argsort(-found.scores, kind="stable")
-    order = order[np.isfinite(found.scores[order])]
-    kept: list[int] = []
-    while len(order) and len(kept) < count:
+    order = np.argsort(-scored.scores, kind="stable")
+    order = order[np.isfinite(scored.scores[order])]
+    chosen: list[int] = []
+    while len(order) and len(chosen) < count:
         best = order[0]
-        kept.append(int(best))
-        order = order[np.abs(found.points[order] - found.points[best]).max(axis=1) >= APART]
-    return np.array(kept, np.int64)
+        chosen.append(int(best))
+        order = order[np.abs(scored.points[order] - scored.points[best]).max(axis=1) >= APART]
+    return np.array(chosen, np.int64)
 
 
-def _above_median(found: Scored) -> Scored:
-    """Return the points of ``found`` with the score -inf for those that are no better than the median."""
-    good = np.isfinite(found.scores)
+def _above_median(scored: Scored) -> Scored:
+    """Return the points of ``scored`` with the score -inf for those that are no better than the median."""
+    good = np.isfinite(scored.scores)
     if not good.any():
-        return found
-    return found._replace(scores=np.where(found.scores > np.median(found.scores[good]), found.scores, -np.inf))
+        return scored
+    return scored._replace(scores=np.where(scored.scores > np.median(scored.scores[good]), scored.scores, -np.inf))
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:

@@ -90,12 +90,12 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
     ``policy_sha256``; for example ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
     """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
-    kept, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
+    lowest, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
     return {
-        HARM: kept[harm],
+        HARM: lowest[harm],
         "steps": last["steps"],
-        "policy_steps": kept["steps"],
-        **{name: kept[name] for name in (*_MEASURED, RunDirectory.OBJECTIVE) if name in kept},
+        "policy_steps": lowest["steps"],
+        **{name: lowest[name] for name in (*_MEASURED, RunDirectory.OBJECTIVE) if name in lowest},
         **{f"last_{name}": last[name] for name in _MEASURED},
     }
 

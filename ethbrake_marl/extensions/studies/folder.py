@@ -68,10 +68,10 @@ class StudyFolder:
                 raise AlreadyExists(f"{self.path}: is there already, and holds no {self._kind}; give another folder")
             return True
         try:
-            kept = read_object(self._record)
+            stored = read_object(self._record)
         except InvalidInput as error:
             raise InvalidInput(f"{error}; {self._advice}") from None
-        other = _differences({key: kept[key] for key in kept if key not in self._more}, self._question)
+        other = _differences({key: stored[key] for key in stored if key not in self._more}, self._question)
         if other:
             raise InvalidInput(
                 f"{self.path}: holds {self._kind} with other settings ({'; '.join(other)}); {self._advice}"
@@ -103,13 +103,13 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str 
 
     For a list or an object, only the name is given. ``inside`` is the text before each name.
     """
-    found: list[str] = []
+    differences: list[str] = []
     for name in dict.fromkeys([*now, *before]):
         old, new = before.get(name), now.get(name)
-        told = f"{inside}{name.replace('_', '-')}"
+        name_here = f"{inside}{name.replace('_', '-')}"
         if isinstance(old, dict) and isinstance(new, dict):
-            found += _differences(old, new, f"{told} ")
+            differences += _differences(old, new, f"{name_here} ")
         elif old != new:
             plain = not isinstance(old, list | dict) and not isinstance(new, list | dict)
-            found.append(f"{told} {old!s:.40}, here {new!s:.40}" if plain else told)
-    return found
+            differences.append(f"{name_here} {old!s:.40}, here {new!s:.40}" if plain else name_here)
+    return differences

@@ -68,11 +68,11 @@ class NamedWorlds(FileModel):
     def read(cls, path: str | Path) -> NamedWorlds:
         """Read and check a file of named worlds; raise ``InvalidInput`` with file, line and key of an error."""
         document = read_yaml(path, SIZE_LIMIT)
-        found = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
-        names = [world.name for world in found.worlds]
+        worlds = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
+        names = [world.name for world in worlds.worlds]
         if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
             raise InvalidInput(f"{path}: world {twice!r} is given twice; names must differ")
-        return found
+        return worlds
 
     @property
     def text(self) -> str:

@@ -40,9 +40,9 @@ class StudyFile(FileModel):
 
         """
         document = read_yaml(path)
-        found = read_model(document, cls, Wording(cls, f"it is needed; docs/{page}.md shows an example"), needed)
-        found._document = document
-        return found
+        study = read_model(document, cls, Wording(cls, f"it is needed; docs/{page}.md shows an example"), needed)
+        study._document = document
+        return study
 
 
 def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:

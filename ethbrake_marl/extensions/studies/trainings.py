@@ -119,21 +119,21 @@ class TrainingJob:
         """
         from ethbrake_marl.training.session import train
 
-        told: list[tuple[Progress, float]] = []  # with the CPU time
+        reports: list[tuple[Progress, float]] = []  # with the CPU time
 
         def note(progress: Progress) -> None:
-            told.append((progress, time.process_time()))
+            reports.append((progress, time.process_time()))
 
         recipe, scenario = self.training.recipe, self.training.scenario
         short = recipe.replace(evaluation={**recipe.evaluation.model_dump(), "worlds": 10, "every_updates": 1000})
         with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:
             path = Path(folder) / "timed"
             train(short, scenario, path, steps=1, on_progress=lambda _: None)  # to compile and warm up
-            begun = Progress("begun", 0, 0), time.process_time()
+            started = Progress("begun", 0, 0), time.process_time()
             train(short, scenario, path, steps=4 * self.per_update, force=True, on_progress=note)
-            updates = [one for one in told if one[0].updates >= 1]
+            updates = [one for one in reports if one[0].updates >= 1]
             last, last_s = updates[-1]
-            first, first_s = updates[0] if updates[0][0].done < last.done else begun
+            first, first_s = updates[0] if updates[0][0].done < last.done else started
             decision_s = (last_s - first_s) / (last.done - first.done)
             worlds = scenario.sample(50, recipe.evaluation.seed) if sample is None else sample
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))

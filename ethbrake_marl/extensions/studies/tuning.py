@@ -336,13 +336,13 @@ class TuningPlan:
         recipe = recipe.replace(seed=file.seed)
         with at(("scenario",)):
             content = Training.of(recipe, scenario).content()
-        told = {
+        settings = {
             "training": content,
             **file.model_dump(mode="json", include={"search", "measure", "prune", "sampler"}),
             "order": [*file.search],
             "versions": installed_versions(),
         }
-        plan = cls(file, recipe, scenario, told)
+        plan = cls(file, recipe, scenario, settings)
         for key, dimension in file.search.items():
             with at(("search", key)):
                 plan._check_dimension(key, dimension)
@@ -506,11 +506,11 @@ class TuningPlan:
         first = None if own is None else {key: self.file.search[key].stored(value) for key, value in own.items()}
         search = Proposals(path / PROPOSALS, known, self.file.space(), self.file.sampler.of_trial, first)
         total, prune = max(trials, len(known)), self.file.prune
-        told = Told("tuning", 0, total, tell)
+        telling = Told("tuning", 0, total, tell)
         if known:
-            told.say(f"{count_of(len(known), 'trial')} begun before: what ended is kept, the rest goes on")
+            telling.say(f"{count_of(len(known), 'trial')} begun before: what ended is kept, the rest goes on")
         elif own is None:
-            told.say("the recipe's own values are not in the space, so no trial has them")
+            telling.say("the recipe's own values are not in the space, so no trial has them")
         ends = run_trials(
             do_trial,
             {"plan": self, "path": path.absolute()},
@@ -519,7 +519,7 @@ class TuningPlan:
             {},
             jobs=jobs,
             retries=retries,
-            told=told,
+            told=telling,
         )
         return search.known, ends
 
@@ -582,8 +582,8 @@ class Trial:
             state = "failed"
         elif end.get("done"):
             state = "finished" if "policy_sha256" in end else "pruned"
-        found = {name: end[name] for name in FIGURES if name in end and not reason}
-        return cls(number, state, values, end[HARM] if state == "finished" else None, found, reason)
+        figures = {name: end[name] for name in FIGURES if name in end and not reason}
+        return cls(number, state, values, end[HARM] if state == "finished" else None, figures, reason)
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,11 +57,11 @@ class Measure:
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
         try:
-            found = evaluate(sample, self.agents, scenario=self.scenario, aftermath=False)
+            evaluation = evaluate(sample, self.agents, scenario=self.scenario, aftermath=False)
         except PhysicsError:
             return Measured(score, harm, reference)
-        rows = np.searchsorted(sample.index, found.index)
-        agent, *other = (found.outcome(name) for name in self.agents)
+        rows = np.searchsorted(sample.index, evaluation.index)
+        agent, *other = (evaluation.outcome(name) for name in self.agents)
         harm[rows] = agent.ledger.world_harm(self.harm_count)
         if self.name == "harm":
             score[rows] = harm[rows]
@@ -99,10 +99,10 @@ class Measure:
 
         def score(points: Floats) -> Floats:
             sample, accepted = drawn.sample(points)
-            found, rows = np.full(len(points), -np.inf), np.flatnonzero(accepted)
+            scores, rows = np.full(len(points), -np.inf), np.flatnonzero(accepted)
             if len(rows):
-                found[rows] = self(sample.take(rows)).score
-            return found
+                scores[rows] = self(sample.take(rows)).score
+            return scores
 
         tried = search(score, len(drawn.names), budget, seed, adaptive=adaptive, on_round=on_round)
         worst = far_apart(tried, most)
@@ -114,20 +114,20 @@ class Measure:
                 " anybody may act, or the physics fails; give early_impacts: keep, or a larger --budget"
             )
         above = np.flatnonzero(tried.scores > 0.0)
-        sample, kept = drawn.sample(tried.points[worst])[0], []
+        sample, shown_worlds = drawn.sample(tried.points[worst])[0], []
         if len(worst):
-            found = self(sample)
-            kept = [
+            evaluation = self(sample)
+            shown_worlds = [
                 NamedWorld(
                     name=f"{self.name}-{k + 1}",
-                    score=float(found.score[k]),
-                    harm=float(found.harm[k]),
-                    reference=None if found.reference is None else float(found.reference[k]),
+                    score=float(evaluation.score[k]),
+                    harm=float(evaluation.harm[k]),
+                    reference=None if evaluation.reference is None else float(evaluation.reference[k]),
                     state={name: each for name, each in state.items() if each is not None},
                 )
                 for k, state in enumerate(states_of(sample.worlds, self.scenario))
             ]
-        return Falsified(sample, kept, tried.scores, int(above[0]) + 1 if len(above) else None)
+        return Falsified(sample, shown_worlds, tried.scores, int(above[0]) + 1 if len(above) else None)
 
     @classmethod
     def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
