@@ -167,7 +167,7 @@ def tune_command(
 
 
 def _end_study(out: Out, summary: str, *, interrupted: bool, failed: bool) -> None:
-    """Print ``summary``, the result of a sweep or tuning, and end the command: status 130 if interrupted, 1 if failed."""
+    """Print ``summary`` of a sweep or tuning, then end the command: status 130 if interrupted, 1 if failed."""
     if interrupted:
         out.interrupted(f"interrupted; {summary}; {KEPT}")
     out.note(summary)
