@@ -237,8 +237,32 @@ class UncertifiedStep(EthBrakeError):
     """A step of the engine differs from the step that its shield certified; the step was not made."""
 
 
+# Name in earlier versions -> name now. Old names of agents, algorithms, recipes and keys are refused with the new one.
+RENAMED: dict[str, str] = {
+    "counterfactual": "vine",
+    "options": "rollout-classification",
+    "modes": "experts",
+    "counterfactuals": "tried",
+    "among": "policies",
+    "gate": "gating",
+    "gate_states": "gating_states",
+    "gate_memory": "gating_memory",
+    "gate_steps": "gating_steps",
+    "together_rate": "joint_rate",
+    "alone": "pretraining_first",
+    "further": "pretraining_others",
+    "together": "joint",
+}
+
+
+def new_name(name: object, known: Collection[str]) -> str | None:
+    """Return the present name of what earlier versions called ``name``; None unless that is one of ``known``."""
+    found = RENAMED.get(name) if isinstance(name, str) else None
+    return found if found in known else None
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name: it suggests a similar known name, or lists the known ones.
+    """Return the error for an unknown name: it gives the new name of a renamed one, a similar name, or all known names.
 
     Args:
         kind: what the name stands for, for example ``scenario``.
@@ -248,6 +272,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
     """
     names = sorted(known)
+    if new := new_name(name, names):
+        return UnknownName(f"unknown {kind} {name!r}; it is now called {new!r}")
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     own = "; one of your own must be registered or installed first (docs/extending.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"

@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.policies.network_spec import Float32s
 from ethbrake_marl.training.networks import ACTIVATIONS
 
 
-class AveragedGate(nn.Module):
+class AveragedGatingNetwork(nn.Module):
     """Gating network, which chooses one of K experts (networks that drive) from an observation of F features.
 
     It has two copies: ``learning`` is in training, and ``average``, with the running average of its weights, chooses.
@@ -37,7 +37,7 @@ class AveragedGate(nn.Module):
     more: Tensor  # [M, K] extra cost of each expert over the best one at these decisions
     compared: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
 
-    def __init__(self, inputs: int, rate: Schedule, recipe: CounterfactualRecipe) -> None:
+    def __init__(self, inputs: int, rate: Schedule, recipe: VineRecipe) -> None:
         super().__init__()
         plan = recipe.modes
         assert plan is not None

@@ -14,10 +14,10 @@ from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor
 from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, visit
-from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.mixture_policy import ExpertsPolicy
 from ethbrake_marl.extensions.learners.mixture_stages import Stage, stages_of
 from ethbrake_marl.extensions.learners.mixture_worlds import (
-    NoOtherMode,
+    NoBetterTemplate,
     Shown,
     drive_from,
     explore,
@@ -27,22 +27,22 @@ from ethbrake_marl.extensions.learners.mixture_worlds import (
 from ethbrake_marl.extensions.learners.optimizer import adam, descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
 from ethbrake_marl.extensions.learners.trust_radius import Tried
-from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_model import VineModel
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.network_spec import Float32s
 
 
-class ModesModel(CounterfactualModel):
+class ExpertsModel(VineModel):
     """Model that trains a mixture of experts: several networks that drive, and a gate that chooses one of them.
 
     It trains the first expert alone, further experts in worlds of their own, the gate, then all together. The key
     ``modes`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
     """
 
-    policy: ModesPolicy  # type: ignore[assignment]
+    policy: ExpertsPolicy  # type: ignore[assignment]
 
-    def __init__(self, environment: EthBrakeVecEnv, recipe: CounterfactualRecipe) -> None:
+    def __init__(self, environment: EthBrakeVecEnv, recipe: VineRecipe) -> None:
         assert recipe.modes is not None
         self.plan = recipe.modes
         self._stage: Stage | None = None
@@ -106,7 +106,7 @@ class ModesModel(CounterfactualModel):
         self._imitate(pupil, shown, seed + stage.network)
         self._own = own_worlds(engine, self.plan, found, pupil.act, gamma)
         if len(shown.action) == 0 or len(self._own.motion) == 0:
-            raise NoOtherMode(
+            raise NoBetterTemplate(
                 f"modes: network {stage.network + 1}: in none of {self.plan.worlds:,} worlds did one of"
                 f" {self.plan.templates} templates do better by {self.plan.gain:g}; leave out modes, or have"
                 " fewer networks"

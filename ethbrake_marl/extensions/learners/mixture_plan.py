@@ -24,7 +24,7 @@ class Shares(FileModel):
         return self
 
 
-class ModesPlan(FileModel):
+class ExpertsPlan(FileModel):
     """Settings of a mixture of experts: several networks that drive, and a gate that chooses one at each decision.
 
     A further expert first imitates templates (random braking profiles) in worlds where one of them does better than all

@@ -13,14 +13,14 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
-from ethbrake_marl.extensions.learners.gating_network import AveragedGate
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.gating_network import AveragedGatingNetwork
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.training.networks import tensors_of_layers
 
 
-class ModesPolicy(Deterministic):
+class ExpertsPolicy(Deterministic):
     """Mixture of experts: at each decision a gating network chooses which of several actors (experts) acts.
 
     Args:
@@ -32,14 +32,14 @@ class ModesPolicy(Deterministic):
     """
 
     def __init__(
-        self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
+        self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: VineRecipe
     ) -> None:
         super().__init__(observation_space, action_space)
         assert recipe.modes is not None
         networks = range(recipe.modes.networks)
         self.actors = [AveragedActor(observation_space, action_space, rate, recipe) for _ in networks]
         self.members = nn.ModuleList(self.actors)
-        self.gate = AveragedGate(flatdim(observation_space), rate, recipe)
+        self.gate = AveragedGatingNetwork(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
         """Return for each observation [rows, F] one value, [rows], from the actor that the gate chooses for it.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal, NamedTuple
 
-from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 
 ROUNDING = 1e-6  # tolerance for rounding in sums of shares, in updates
 
@@ -20,7 +20,7 @@ class Stage(NamedTuple):
     end: int  # first update after the stage
 
 
-def stages_of(plan: ModesPlan, updates: int) -> tuple[Stage, ...]:
+def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
     """Return the stages of a training with this number of updates, in order; a stage may be empty.
 
     ``plan`` is the key ``modes`` of the recipe, with the share of each stage.

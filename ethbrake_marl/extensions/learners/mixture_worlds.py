@@ -15,7 +15,7 @@ from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, counted_harm, play_on, play_to_the_end
-from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 from ethbrake_marl.extensions.search.problem import minimising
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.actions import command_to_action
@@ -43,7 +43,7 @@ class Shown(NamedTuple):
     action: Float32s  # [m] actions in [-1, 1]
 
 
-def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
+def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
     """Let every expert drive the first ``plan.worlds`` worlds of the training, and return the best results.
 
     Args:
@@ -83,7 +83,7 @@ def drive_from(
     return gained, counted_harm(rows, engine.reward.harm_count if count is None else count)[:, 0]
 
 
-def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
+def show_templates(engine: Engine, plan: ExpertsPlan, found: Explored, gamma: float, seed: int) -> Shown:
     """Draw templates (random braking profiles), and return the actions of those that do better than all experts.
 
     In each world the best of ``plan.templates`` is taken, if its return exceeds every expert's by ``plan.gain``.
@@ -129,7 +129,7 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
     return Shown(np.concatenate(seen_then)[kept], wanted[kept])
 
 
-def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> State:
+def own_worlds(engine: Engine, plan: ExpertsPlan, found: Explored, act: Act, gamma: float) -> State:
     """Return the starting states of the worlds in which a new expert is to be trained.
 
     These are the worlds in which its return is at most ``plan.margin`` below the best of the earlier experts. Worlds in
@@ -150,7 +150,7 @@ def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma
     return found.start.take(rows)
 
 
-class NoOtherMode(EthBrakeError, ValueError):
+class NoBetterTemplate(EthBrakeError, ValueError):
     """Raised if no template (random braking profile) does better than the experts so far.
 
     A further expert would then have nothing to learn.

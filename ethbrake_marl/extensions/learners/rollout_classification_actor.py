@@ -16,7 +16,7 @@ from torch.nn.functional import softplus
 
 from ethbrake_marl.extensions.learners.averaged_actor import Deterministic
 from ethbrake_marl.extensions.learners.optimizer import adam
-from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
+from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
 from ethbrake_marl.extensions.learners.scout import draw_rows
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.actor import Actor
@@ -72,7 +72,7 @@ class ChoosingActor(Deterministic):
         observation_space: Space[Any],
         action_space: Any,
         rate: Schedule,
-        recipe: OptionsRecipe,
+        recipe: RolloutClassificationRecipe,
         among: Sequence[Mapping[str, Float32s]],
         members: int,
     ) -> None:

@@ -13,8 +13,8 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.branches import counted_harm, moving_rows, other_count, play_on
 from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.rollout_classification_actor import ChoosingActor
-from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
-from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
+from ethbrake_marl.extensions.learners.vine_model import VineModel
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
@@ -28,7 +28,7 @@ USUAL_KEPT = 0.98  # share of itself that the running mean of costs keeps in eac
 LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with almost no harm
 
 
-class OptionsModel(CounterfactualModel):
+class RolloutClassificationModel(VineModel):
     """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs.
 
     Args:
@@ -39,10 +39,10 @@ class OptionsModel(CounterfactualModel):
     """
 
     policy: ChoosingActor  # type: ignore[assignment]
-    recipe: OptionsRecipe  # type: ignore[assignment]
+    recipe: RolloutClassificationRecipe  # type: ignore[assignment]
 
     def __init__(
-        self, environment: EthBrakeVecEnv, recipe: OptionsRecipe, among: Sequence[Mapping[str, Float32s]]
+        self, environment: EthBrakeVecEnv, recipe: RolloutClassificationRecipe, among: Sequence[Mapping[str, Float32s]]
     ) -> None:
         self._among = among
         super().__init__(environment, recipe)  # type: ignore[arg-type]  # it has all keys that the base class reads

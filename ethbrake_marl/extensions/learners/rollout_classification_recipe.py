@@ -39,7 +39,7 @@ class ChoosingShape(Shape):
 PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
 
 
-class OptionsRecipe(TrainingRecipe):
+class RolloutClassificationRecipe(TrainingRecipe):
     """Recipe of rollout classification: the policy learns from several actions, each tried to the end of its episode.
 
     It learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the policies ``among``. In
@@ -120,7 +120,7 @@ class OptionsRecipe(TrainingRecipe):
     network: ChoosingShape = Field(description=NETWORK)
 
     @model_validator(mode="after")
-    def _keys_fit(self) -> OptionsRecipe:
+    def _keys_fit(self) -> RolloutClassificationRecipe:
         if self.reward.shaping > 0.0:
             refuse(("reward", "shaping"), self.reward.shaping, NO_SHAPING)
         visited = self.n_envs * self.n_steps
@@ -167,9 +167,9 @@ class OptionsRecipe(TrainingRecipe):
         return tuple(found)
 
 
-OPTIONS = Part(OptionsRecipe, "ethbrake_marl.extensions.learners.rollout_classification:Options")
+ROLLOUT_CLASSIFICATION = Part(RolloutClassificationRecipe, "ethbrake_marl.extensions.learners.rollout_classification:RolloutClassification")
 
-OPTIONS_AGENT = Part(
+ROLLOUT_CLASSIFICATION_AGENT = Part(
     make_policy_agent,
     form="options@PATH",
     about="a policy trained by options: a run, a bundle, or shipped",

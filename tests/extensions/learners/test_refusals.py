@@ -12,7 +12,7 @@ from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.session import train
 from ethbrake_marl.training.training import Training
-from tests.extensions.learners.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS
+from tests.extensions.learners.tiny import TINY_VINE, TINY_EXPERTS, TINY_ROLLOUTS
 from tests.fixtures.policies import make_policy
 from tests.refused import refused
 
@@ -21,7 +21,7 @@ PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-
 
 def modes(**changes: Any) -> Any:
     """The recipe of several networks, with changes in how they are trained."""
-    return TINY_MODES.replace(modes=TINY_MODES.model_dump(mode="json")["modes"] | changes)
+    return TINY_EXPERTS.replace(modes=TINY_EXPERTS.model_dump(mode="json")["modes"] | changes)
 
 
 def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> None:
@@ -40,20 +40,20 @@ def test_policy_to_start_from__has_one_network(empty_folder: Path) -> None:
     several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "counterfactual", **several)
     several.save(Path("first"))
     with refused("recipe 'counterfactual': start: has 3 networks; give a policy of one"):
-        train(TINY_MODES.replace(start="counterfactual@first"), PAPER, Path("run"))
+        train(TINY_EXPERTS.replace(start="counterfactual@first"), PAPER, Path("run"))
 
 
 def test_tried_actions__are_at_most_the_decisions_of_an_update() -> None:
-    assert TINY_COUNTERFACTUAL.replace(counterfactuals=32).counterfactuals == 8 * 4
+    assert TINY_VINE.replace(counterfactuals=32).counterfactuals == 8 * 4
     with refused("counterfactuals = 33: must be at most n_envs x n_steps = 32"):
-        TINY_COUNTERFACTUAL.replace(counterfactuals=33)
-    assert TINY_OPTIONS.replace(tried=32, memory=99).tried == 8 * 4
+        TINY_VINE.replace(counterfactuals=33)
+    assert TINY_ROLLOUTS.replace(tried=32, memory=99).tried == 8 * 4
     with refused("tried = 33: must be at most n_envs x n_steps = 32"):
-        TINY_OPTIONS.replace(tried=33, memory=99)
+        TINY_ROLLOUTS.replace(tried=33, memory=99)
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "algorithm = trpo: must be one of counterfactual, options, ppo, sac": lambda: TINY_OPTIONS.replace(
+    "algorithm = trpo: must be one of counterfactual, options, ppo, sac": lambda: TINY_ROLLOUTS.replace(
         algorithm="trpo"
     ),
     "recipe 'options': averaging = 1: must be less than 1": lambda: load_recipe("options").replace(averaging=1.0),
@@ -61,19 +61,19 @@ REFUSED: dict[str, Callable[[], object]] = {
         "options"
     ).replace(near=[{"smallest": 0.1, "largest": 1.0}] * 9),
     "recipe 'counterfactual': reward.shaping = 0.1: must be 0: what is tried is played to the end": lambda: (
-        TINY_COUNTERFACTUAL.replace(reward={"harm": 1.0, "shaping": 0.1})
+        TINY_VINE.replace(reward={"harm": 1.0, "shaping": 0.1})
     ),
     "recipe 'counterfactual': offset.largest = 0.1: must be at least smallest = 0.3": lambda: (
-        TINY_COUNTERFACTUAL.replace(offset={"smallest": 0.3, "largest": 0.1})
+        TINY_VINE.replace(offset={"smallest": 0.3, "largest": 0.1})
     ),
     "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: (
-        TINY_COUNTERFACTUAL.replace(gradient_limit="often")
+        TINY_VINE.replace(gradient_limit="often")
     ),
-    "must be ppo@, counterfactual@ or universal@": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
-    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_COUNTERFACTUAL.replace(n_envs=2**22),
-    "must be single, shared, independent or centralised": lambda: TINY_COUNTERFACTUAL.replace(scheme="centralized"),
-    "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_OPTIONS.replace(memory=15),
-    "must hold a range where there are neither fixed": lambda: TINY_OPTIONS.replace(near=[], fixed=[], drawn=0),
+    "must be ppo@, counterfactual@ or universal@": lambda: TINY_VINE.replace(start="sac@shipped"),
+    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_VINE.replace(n_envs=2**22),
+    "must be single, shared, independent or centralised": lambda: TINY_VINE.replace(scheme="centralized"),
+    "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_ROLLOUTS.replace(memory=15),
+    "must hold a range where there are neither fixed": lambda: TINY_ROLLOUTS.replace(near=[], fixed=[], drawn=0),
     "recipe 'counterfactual': modes.networks = 1: must be greater than or equal to 2": lambda: modes(networks=1),
     "recipe 'counterfactual': modes.shares = {alone: 0.5, further: 0.5, gate: 0.5, together: 0}: alone": lambda: modes(
         shares={"alone": 0.5, "further": 0.5, "gate": 0.5, "together": 0.0}
@@ -88,7 +88,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
         load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
     ),
-    "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_MODES, PAIR, Path("run")),
+    "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_EXPERTS, PAIR, Path("run")),
 }
 
 

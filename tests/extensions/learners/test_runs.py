@@ -10,7 +10,7 @@ from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.training import session as train_module
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from tests.cli.test_scenarios import check_new_recipe
-from tests.extensions.learners.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS
+from tests.extensions.learners.tiny import MODES, TINY_VINE, TINY_EXPERTS, TINY_ROLLOUTS
 from tests.learning.test_runs import MIXTURE, Whole, check_one_update, check_resumed, trained_once
 from tests.learning.test_teams import check_meanings, check_shipped
 
@@ -31,10 +31,10 @@ def test_quick__ends_near_the_best_known_for_every_seed(seed: int, tmp_path: Pat
 
 
 def test_recipe__tells_only_the_keys_that_it_has() -> None:
-    told = TINY_COUNTERFACTUAL.model_dump(mode="json")
+    told = TINY_VINE.model_dump(mode="json")
     assert {"focus", "modes"} & told.keys() == set()
     assert "initial_action" not in told["network"]
-    assert TINY_COUNTERFACTUAL.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
+    assert TINY_VINE.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
 
 
 OF_THEIR_KIND = ("cooperation", "modes")  # others differ in numbers
@@ -69,11 +69,11 @@ def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> No
 AMONG = {"among": ["policy@shipped/ppo", "policy@shipped/sac"], "drawn": 2, "near": [], "focus": 0.5,
          "relative": True, "tie_break": 0.5, "observation": ["own", "front_1", "rear_1", "contact"]}  # fmt: skip
 TRAININGS = {
-    "counterfactual": (TINY_COUNTERFACTUAL.replace(gradient_limit="auto"), SCENARIO),
-    "modes": (TINY_MODES, SCENARIO),
-    "options": (TINY_OPTIONS, SCENARIO),
-    "among": (TINY_OPTIONS.replace(**AMONG), MIXTURE),
-    "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), SCENARIO),
+    "counterfactual": (TINY_VINE.replace(gradient_limit="auto"), SCENARIO),
+    "modes": (TINY_EXPERTS, SCENARIO),
+    "options": (TINY_ROLLOUTS, SCENARIO),
+    "among": (TINY_ROLLOUTS.replace(**AMONG), MIXTURE),
+    "scout": (TINY_EXPERTS.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), SCENARIO),
 }
 
 

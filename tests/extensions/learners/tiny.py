@@ -2,7 +2,7 @@
 
 import ethbrake_marl as eb
 
-TINY_COUNTERFACTUAL = eb.load_recipe("counterfactual").replace(
+TINY_VINE = eb.load_recipe("counterfactual").replace(
     start=None,
     observation=None,
     n_envs=8,
@@ -14,7 +14,7 @@ TINY_COUNTERFACTUAL = eb.load_recipe("counterfactual").replace(
     evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
     checkpoint_every_updates=3,
 )
-TINY_OPTIONS = eb.load_recipe("options").replace(
+TINY_ROLLOUTS = eb.load_recipe("options").replace(
     observation=None,
     n_envs=8,
     n_steps=4,
@@ -42,4 +42,4 @@ MODES = {
     "together_rate": 0.5,
     "shares": {"alone": 0.25, "further": 0.25, "gate": 0.25, "together": 0.25},
 }
-TINY_MODES = TINY_COUNTERFACTUAL.replace(modes=MODES)
+TINY_EXPERTS = TINY_VINE.replace(modes=MODES)
