@@ -66,9 +66,7 @@ class AveragedActor(Deterministic):
 
     """
 
-    def __init__(
-        self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: VineRecipe
-    ) -> None:
+    def __init__(self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: VineRecipe) -> None:
         super().__init__(observation_space, action_space)
         inputs, shape = flatdim(observation_space), recipe.network
         hidden, activation = list(shape.policy), ACTIVATIONS[shape.activation]

@@ -47,14 +47,11 @@ class VineRecipe(TrainingRecipe):
 
     algorithm: Literal["vine"]
     start: Annotated[str, Field(pattern=r"^(ppo|vine|universal)@.+$", max_length=4096)] | None = Field(
-        None,
-        description="policy to start from: ppo@shipped (random weights if none ships); left out: random weights",
+        None, description="policy to start from: ppo@shipped (random weights if none ships); left out: random weights"
     )
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
     tried: int = Field(ge=1, description="decisions of a round that are tried with a higher and a lower action")
-    offset: OffsetRange = Field(
-        description="range of the change of the tried action; drawn uniformly in its logarithm"
-    )
+    offset: OffsetRange = Field(description="range of the change of the tried action; drawn uniformly in its logarithm")
     holds: Holds = Field(description="numbers of steps, one of which is drawn; the action is changed for so long")
     # Largest size of a measured gradient (return per unit of action); larger ones, at jumps of the harm, are cut to it.
     gradient_limit: Positive | Literal["auto"] = Field(
@@ -63,12 +60,16 @@ class VineRecipe(TrainingRecipe):
     # Largest distance from an action to the target that it is trained towards in one update.
     trust_radius: Rate = Field(description="largest change of an action that one update aims at")
     # Weight that holds actions where they are; the larger, the less small gradients move them.
-    anchor: Positive = Field(description="weight that holds an action in place; the larger, the less small gradients move it")
+    anchor: Positive = Field(
+        description="weight that holds an action in place; the larger, the less small gradients move it"
+    )
     n_epochs: int = Field(ge=1, le=1000, description="passes of an update over the tried decisions")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     averaging: Averaging = Field(description=AVERAGING)
     # Share of the tried decisions that are drawn in proportion to the gradient that a small network expects there.
-    focus: Focus = Field(0.0, description="share of the tried decisions drawn where a small network expects large gradients")
+    focus: Focus = Field(
+        0.0, description="share of the tried decisions drawn where a small network expects large gradients"
+    )
     network: ActorShape = Field(description=NETWORK)
     experts: Annotated[ExpertsPlan | None, Field(exclude_if=not_)] = Field(
         None, description="mixture of experts: several networks and a gating network; left out: one network"
@@ -140,8 +141,5 @@ class VineRecipe(TrainingRecipe):
 VINE = Part(VineRecipe, "ethbrake_marl.extensions.learners.vine:Vine")
 
 VINE_AGENT = Part(
-    make_policy_agent,
-    form="vine@PATH",
-    about="a policy trained by vine: a run or a bundle",
-    knows=Source.MESSAGES,
+    make_policy_agent, form="vine@PATH", about="a policy trained by vine: a run or a bundle", knows=Source.MESSAGES
 )

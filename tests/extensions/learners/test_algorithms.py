@@ -1,4 +1,4 @@
-"""Learning from counterfactuals, several networks with a gate, and options."""
+"""The algorithms vine, with a mixture of experts too, and rollout classification."""
 
 import copy
 import itertools
@@ -42,19 +42,16 @@ from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.session import train
 from ethbrake_marl.training.training import Training
 from tests.evaluation.test_rollout import check_beyond
-from tests.extensions.learners.tiny import MODES, TINY_VINE, TINY_EXPERTS, TINY_ROLLOUTS
+from tests.extensions.learners.tiny import EXPERTS, TINY_EXPERTS, TINY_ROLLOUTS, TINY_VINE
 from tests.policies.test_networks import check_mixture
 
 SCENARIO = eb.load_scenario("paper-random")
 
 
-SHIPPED = load_recipe("counterfactual")
+SHIPPED = load_recipe("vine")
 
 
-SMALL = {
-    name: getattr(TINY_VINE, name)
-    for name in ("n_envs", "n_steps", "counterfactuals", "batch_size", "evaluation")
-}
+SMALL = {name: getattr(TINY_VINE, name) for name in ("n_envs", "n_steps", "tried", "batch_size", "evaluation")}
 
 
 STILL = {"learning_rate": {"start": 1e-12, "end": 1e-12}, "total_steps": 1}
@@ -83,10 +80,10 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     old, new = (found.outcome(name).first_impact_harm for name in agents)
     np.testing.assert_allclose(old, new, atol=1e-3)
     manifest = policy.manifest
-    assert (manifest.algorithm, manifest.network.value_hidden) == ("counterfactual", ())
+    assert (manifest.algorithm, manifest.network.value_hidden) == ("vine", ())
     assert len(manifest.observation.features) == 57 and policy.observation.time_step_s == 0.1
     assert policy.tensors["policy.log_std"].shape == (1,)
-    assert eb.make_agent(f"counterfactual@{tmp_path / 'run'}").name == f"counterfactual@{tmp_path / 'run'}"
+    assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
 
 
 @pytest.mark.parametrize("name", ["cooperation-4-all", "cooperation-2-five"])
@@ -122,7 +119,7 @@ SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "pla
         (TINY_VINE.replace(**CONTACT), SCENARIO.with_learners(["vehicle_3"])),
         (TINY_VINE.replace(**CONTACT), eb.load_scenario("cooperation-2-five")),
         (TINY_VINE, SCENARIO.replace(early_impacts="keep", roles=SCRIPTED)),  # a script that remembers
-        (TINY_EXPERTS.replace(**OWN, modes={**MODES, "networks": 3}), eb.load_scenario("cooperation-2-five")),
+        (TINY_EXPERTS.replace(**OWN, experts={**EXPERTS, "networks": 3}), eb.load_scenario("cooperation-2-five")),
         (TINY_ROLLOUTS.replace(**CONTACT), SCENARIO.with_learners(["vehicle_2", "vehicle_3"])),
         (TINY_ROLLOUTS.replace(**OWN), eb.load_scenario("cooperation-2-five")),
     ],
@@ -132,7 +129,7 @@ def test_training__of_any_learners_objective_and_line(recipe: Any, scenario: Any
     result = train(recipe, scenario, tmp_path / "run", steps=8 * 32 * len(scenario.learners), on_progress=told.append)
     assert told[-1].harm.partition(" harm ")[0] == {"first": "first-impact", "total": "total"}[recipe.reward.harm_count]
     assert result.status == "finished" and result.updates == 8
-    networks = 3 if getattr(recipe, "modes", None) else 1
+    networks = 3 if getattr(recipe, "experts", None) else 1
     assert eb.load_policy(tmp_path / "run").manifest.network.networks == networks
 
 
@@ -142,15 +139,15 @@ FROM_SCRATCH = {
 }  # fmt: skip
 
 
-SHARES = {"alone": 0.0, "further": 0.25, "gate": 0.5, "together": 0.25}
+SHARES = {"pretraining_first": 0.0, "pretraining_others": 0.25, "gating": 0.5, "joint": 0.25}
 
 
-MANY_TRIED = {"n_steps": 8, "counterfactuals": 256, "total_steps": 30 * 512}
+MANY_TRIED = {"n_steps": 8, "tried": 256, "total_steps": 30 * 512}
 
 
 GATED = {
     "total_steps": 16 * 256,
-    "modes": MODES | {"worlds": 400, "imitation_epochs": 20, "gate_states": 512, "shares": SHARES},
+    "experts": EXPERTS | {"worlds": 400, "imitation_epochs": 20, "gating_states": 512, "shares": SHARES},
 }
 
 
@@ -170,7 +167,7 @@ CHOOSING = {
     ],
 )
 def test_training__gets_better_from_scratch(recipe: Any, tmp_path: Path) -> None:
-    """Random weights hardly act: much of the harm is gone by trying, or by imitating templates and a gate."""
+    """Random weights hardly act: much of the harm is gone by trying, or by imitating templates."""
     result = train(recipe, SCENARIO, tmp_path / "run")
     first, last = (result.evaluations[k]["first_impact_harm"] for k in (0, -1))
     assert last < 0.7 * first
@@ -200,7 +197,7 @@ def new_model(recipe: TrainingRecipe, scenario: eb.Scenario = SCENARIO) -> Any:
 
 
 def choosing(scenario: eb.Scenario = SCENARIO, **changes: Any) -> Any:
-    """A new model that chooses among actions."""
+    """A new model of rollout classification."""
     return new_model(TINY_ROLLOUTS.replace(**changes), scenario)
 
 
@@ -212,9 +209,15 @@ _full_brake, _coast = constant(-1.0), constant(0.0)
 
 
 def test_stages__share_the_updates_and_leave_none_out() -> None:
-    plan = ExpertsPlan(**{**MODES, "networks": 3, "shares": {"alone": 0.5, "further": 0.2, "gate": 0.1, "together": 0.2}})
-    expected = [("alone", 0, 0, 10), ("further", 1, 10, 12), ("further", 2, 12, 14), ("gate", 0, 14, 16),
-                ("together", 0, 16, 20)]  # fmt: skip
+    plan = ExpertsPlan(
+        **{
+            **EXPERTS,
+            "networks": 3,
+            "shares": {"pretraining_first": 0.5, "pretraining_others": 0.2, "gating": 0.1, "joint": 0.2},
+        }
+    )
+    expected = [("first", 0, 0, 10), ("other", 1, 10, 12), ("other", 2, 12, 14), ("gating", 0, 14, 16),
+                ("joint", 0, 16, 20)]  # fmt: skip
     assert [*stages_of(plan, 20)] == expected
     for updates in range(1, 30):
         found = stages_of(plan, updates)
@@ -241,7 +244,7 @@ def test_shown__is_what_gains_more_than_every_network() -> None:
     assert np.array_equal(found.harm, -found.gained)  # the recipe's reward is minus the harm by its own count
     shown = show_templates(engine, model.plan, found, 1.0, 0)
     assert len(shown.seen) == len(shown.action) > 50 and (np.abs(shown.action) <= 1.0).all()
-    picky = ExpertsPlan(**{**MODES, "gain": 1e6})
+    picky = ExpertsPlan(**{**EXPERTS, "gain": 1e6})
     assert len(show_templates(engine, picky, found, 1.0, 0).action) == 0
 
 
@@ -267,9 +270,9 @@ def test_visit__every_decision_of_every_episode() -> None:
 
 def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
     """Of two kinds of decisions that look alike the gate is right where being wrong costs more, or counts for more."""
-    modes = {**MODES, "gate_memory": 1000, "gate_steps": 20}
+    plan = {**EXPERTS, "gating_memory": 1000, "gating_steps": 20}
     fast = {"learning_rate": {"start": 1e-2, "end": 1e-2}, "averaging": 0.9, "batch_size": 128}
-    model = new_model(TINY_EXPERTS.replace(**fast, modes=modes))
+    model = new_model(TINY_EXPERTS.replace(**fast, experts=plan))
     seen = np.repeat(np.eye(27, dtype=np.float32)[[0, 1, 1, 2, 2]], 100, axis=0)
     costs = np.repeat([[0.0, 1.0], [5.0, 0.0], [0.0, 1.0], [2.0, 0.0], [0.0, 4.0]], 100, axis=0)
     importance = np.repeat(np.float32([1.0, 1.0, 1.0, 4.0, 0.5]), 100)
@@ -290,9 +293,9 @@ def test_imitation__draws_from_the_stream_of_its_own_seed() -> None:
     assert taught[0] == taught[1] != taught[2]
 
 
-def test_training__says_that_there_is_no_other_mode(tmp_path: Path) -> None:
-    with pytest.raises(NoBetterTemplate, match="network 2: in none of 64 worlds did one of 20 templates do better by 1e"):
-        train(TINY_EXPERTS.replace(modes={**MODES, "gain": 1e6}), SCENARIO, tmp_path / "run", measure=None)
+def test_training__says_that_no_template_does_better(tmp_path: Path) -> None:
+    with pytest.raises(NoBetterTemplate, match="network 2: in none of 64 worlds does one of 20 templates do better"):
+        train(TINY_EXPERTS.replace(experts={**EXPERTS, "gain": 1e6}), SCENARIO, tmp_path / "run", measure=None)
     assert eb.load_policy(tmp_path / "run" / "policy-last").manifest.network.networks == 2
 
 
@@ -361,7 +364,7 @@ def test_automatic_limit__cuts_its_share_and_offsets_grow_where_harm_jumps() -> 
 
 
 @pytest.mark.parametrize(("objective", "learners"), [("total", ["vehicle_2"]), ("own", ["vehicle_2", "vehicle_3"])])
-def test_options__costs_are_those_of_the_moved_learner_in_episodes_driven_so(
+def test_rollout_classification__costs_are_those_of_the_moved_learner_in_episodes_driven_so(
     objective: str, learners: list[str]
 ) -> None:
     """Full braking of all but for what is tried: each action for its steps, then the policy, to the end."""
@@ -394,7 +397,7 @@ def test_options__costs_are_those_of_the_moved_learner_in_episodes_driven_so(
     np.testing.assert_allclose(cautious, costs + beyond, rtol=1e-12, atol=1e-12)
 
 
-def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
+def test_rollout_classification__loss_by_hand_and_what_is_remembered_last() -> None:
     actor = choosing(
         tried=2, memory=2, near=[], fixed=[0.0, 1.0], drawn=0, network={"policy": [8], "choices": 3}
     ).policy
@@ -415,12 +418,12 @@ def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
     assert [float(importance[rows == row].sum()) / 1000 for row in (0, 1)] == pytest.approx([1.0, 1.0], abs=0.2)
 
 
-def test_options__among_policies_drive_as_alone_and_costs_are_beside_those_usual_in_each_scenario() -> None:
+def test_rollout_classification__policies_drive_as_alone_and_costs_are_beside_those_usual_in_each_scenario() -> None:
     line = eb.load_scenario(
         {"name": "two", "mixture": [{"scenario": "paper-random"}, {"scenario": "paper-delay-high"}]}
     )
-    among, shape = ["policy@shipped/ppo", "policy@shipped/sac"], {"policy": [8], "choices": 2}
-    model = choosing(line, among=among, tried=8, near=[], fixed=[-1.0], drawn=2, holds=[1000], network=shape)
+    policies, shape = ["policy@shipped/ppo", "policy@shipped/sac"], {"policy": [8], "choices": 2}
+    model = choosing(line, policies=policies, tried=8, near=[], fixed=[-1.0], drawn=2, holds=[1000], network=shape)
     start = model.engine.moment()
     model._numbers = model.engine.roster.numbers.copy()
     torch.manual_seed(5)
@@ -472,8 +475,8 @@ def test_widened_policy__keeps_the_weights_of_its_features_and_nothing_of_new_on
 
 @pytest.mark.parametrize("around", ["+episode", "+step", "+search"])
 def test_mixture__drives_shielded_and_searched(around: str, mixture: eb.Policy, tmp_path: Path) -> None:
-    check_mixture("counterfactual", around, mixture, tmp_path)
+    check_mixture("vine", around, mixture, tmp_path)
 
 
 def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once() -> None:
-    check_beyond("options@shipped/options-paper-random-obstacle-total", SCENARIO, "no obstacle_gap_m")
+    check_beyond("rollout-classification@shipped/options-paper-random-obstacle-total", SCENARIO, "no obstacle_gap_m")
