@@ -22,6 +22,22 @@ LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in 
 
 _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
+RENAMED: dict[str, str] = {  # old name -> new name, for messages
+    "counterfactual": "vine",
+    "options": "rollout-classification",
+    "modes": "experts",
+    "counterfactuals": "tried",
+    "among": "policies",
+    "gate": "gating",
+    "gate_states": "gating_states",
+    "gate_memory": "gating_memory",
+    "gate_steps": "gating_steps",
+    "together_rate": "joint_rate",
+    "alone": "pretraining_first",
+    "further": "pretraining_others",
+    "together": "joint",
+}
+
 
 def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
@@ -237,28 +253,10 @@ class UncertifiedStep(EthBrakeError):
     """A step of the engine differs from the step that its shield certified; the step was not made."""
 
 
-# Name in earlier versions -> name now. Old names of agents, algorithms, recipes and keys are refused with the new one.
-RENAMED: dict[str, str] = {
-    "counterfactual": "vine",
-    "options": "rollout-classification",
-    "modes": "experts",
-    "counterfactuals": "tried",
-    "among": "policies",
-    "gate": "gating",
-    "gate_states": "gating_states",
-    "gate_memory": "gating_memory",
-    "gate_steps": "gating_steps",
-    "together_rate": "joint_rate",
-    "alone": "pretraining_first",
-    "further": "pretraining_others",
-    "together": "joint",
-}
-
-
 def new_name(name: object, known: Collection[str]) -> str | None:
-    """Return the present name of what earlier versions called ``name``; None unless that is one of ``known``."""
-    found = RENAMED.get(name) if isinstance(name, str) else None
-    return found if found in known else None
+    """Return the new name of a ``name`` that was renamed, or of its words between colons; None if not in ``known``."""
+    new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
+    return new if new != name and new in known else None
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:

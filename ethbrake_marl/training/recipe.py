@@ -217,8 +217,8 @@ class TrainingRecipe(FileModel):
             raise InvalidInput(f"scheme independent: {where} has one learner; use single")
         if scheme not in self.schemes:
             raise InvalidInput(
-                f"scheme {scheme}: recipe {self.name!r} is for {self.algorithm}, which cannot train so; use a recipe for"
-                " PPO, for instance cooperation-ppo"
+                f"scheme {scheme}: recipe {self.name!r} is for {self.algorithm}, which cannot train so; use a recipe"
+                " for PPO, for instance cooperation-ppo"
             )
         self.check_learners(learners)
         return scheme

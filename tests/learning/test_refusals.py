@@ -151,10 +151,10 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "scheme independent: scenario 'paper-random' has one learner; use single": lambda: train(
         TINY_PPO, PAPER, Path("run"), scheme="independent"
     ),
-    "scheme independent: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+    "scheme independent: recipe 'sac' is for sac, which cannot train so; use a recipe": lambda: train(
         "sac", PAIR, Path("run"), scheme="independent"
     ),
-    "scheme centralised: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+    "scheme centralised: recipe 'sac' is for sac, which cannot train so; use a recipe": lambda: train(
         "sac", PAIR, Path("run"), scheme="centralised"
     ),
     "recipe 'ppo': turns = 3: is for scheme: independent only; leave it out": lambda: train(
@@ -205,7 +205,10 @@ def test_algorithm__has_a_name_of_its_own() -> None:
         ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
         ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
         ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
-        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
+        (
+            {"scheme": "independent"},
+            "scheme independent: recipe 'mine' is for a2c, which cannot train so",
+        ),
     ],
     ids=lambda value: str(value)[:30],
 )

@@ -37,7 +37,8 @@ class ExpertsModel(VineModel):
     """Model that trains a mixture of experts: several networks that drive, and a gating network that chooses.
 
     It trains the first expert in all worlds, the other experts in worlds of their own, the gating network, then all
-    networks jointly. The key ``experts`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
+    networks jointly. The key ``experts`` of the recipe configures it. The arguments are the environment of the
+    training, and the recipe.
     """
 
     policy: ExpertsPolicy  # type: ignore[assignment]

@@ -53,8 +53,8 @@ class RolloutClassificationRecipe(TrainingRecipe):
     most_decisions = 2**22
 
     algorithm: Literal["rollout-classification"]
-    # Trained policies that the network can choose instead of an action; a policy that itself chooses between policies is
-    # replaced by these.
+    # Trained policies that the network can choose instead of an action. A policy that itself chooses between policies
+    # is replaced by these.
     policies: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
         (), description="trained policies, one of which can be chosen to act at a decision; left out: none"
     )
