@@ -103,8 +103,8 @@ def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
 
 def checkpoint_folders(folder: Path) -> list[Path]:
     """Return the folders of all checkpoints inside ``folder``, newest first, without checking their content."""
-    found = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
-    return sorted(found, reverse=True)
+    folders = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
+    return sorted(folders, reverse=True)
 
 
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:

@@ -132,8 +132,10 @@ class RunDirectory:
             prefix: text before the names of metrics in ``evaluations`` and in the result: ``eval/`` for rows.
 
         """
-        found = evaluations and all(entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations)
-        return prefix + (cls.OBJECTIVE if found else cls.HARM[harm_count])
+        with_objective = evaluations and all(
+            entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations
+        )
+        return prefix + (cls.OBJECTIVE if with_objective else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
         """Return the rows of ``progress.csv``, each as column -> text."""
@@ -144,10 +146,10 @@ class RunDirectory:
 
         Raises ``InvalidInput`` if none is recorded.
         """
-        kept = read_object(self.status).get("cpu_s") or {}
-        if not kept:
+        recorded = read_object(self.status).get("cpu_s") or {}
+        if not recorded:
             raise InvalidInput(f"{self.path}: tells no processor time; train again with this version")
-        return {int(steps): float(spent) for steps, spent in kept.items()}
+        return {int(steps): float(spent) for steps, spent in recorded.items()}
 
     def column(self, name: str) -> dict[int, float]:
         """Return the column ``name`` of ``progress.csv`` as number of decisions -> value, without empty cells."""

@@ -113,8 +113,8 @@ class Training:
         bundles: dict[str, list[str]] = {}
         for vehicle, bundle in self.drivers.items():
             bundles.setdefault(bundle, []).append(vehicle)
-        told = "; ".join(f"{bundle} drives {', '.join(vehicles)}" for bundle, vehicles in bundles.items())
-        return f"scheme {self.scheme}: {told}"
+        in_words = "; ".join(f"{bundle} drives {', '.join(vehicles)}" for bundle, vehicles in bundles.items())
+        return f"scheme {self.scheme}: {in_words}"
 
 
 def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
@@ -172,12 +172,12 @@ def check_same_training(run: RunDirectory, training: Training) -> None:
     recorded = recorded_training(run, read_object(run.config))
     if recorded.identity == training.identity:
         return
-    kept, wanted = recorded.content(), training.content()
+    before, wanted = recorded.content(), training.content()
     other = [
         f"{part} {key}"
         for part in wanted
-        for key in dict.fromkeys([*wanted[part], *kept[part]])
-        if key not in kept[part] or key not in wanted[part] or kept[part][key] != wanted[part][key]
+        for key in dict.fromkeys([*wanted[part], *before[part]])
+        if key not in before[part] or key not in wanted[part] or before[part][key] != wanted[part][key]
     ]
     raise InvalidInput(
         f"{run.path}: holds another training (here other: {', '.join(other)}); give another folder (--output)"

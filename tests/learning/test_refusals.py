@@ -205,10 +205,7 @@ def test_algorithm__has_a_name_of_its_own() -> None:
         ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
         ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
         ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
-        (
-            {"scheme": "independent"},
-            "scheme independent: recipe 'mine' is for a2c, which cannot train so",
-        ),
+        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for a2c, which cannot train so"),
     ],
     ids=lambda value: str(value)[:30],
 )
