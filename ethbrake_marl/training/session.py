@@ -305,7 +305,7 @@ def _newest_checkpoint(
     if state.numbers.get("training") not in recorded_identities(run, training):
         name = run.checkpoint(state.steps).name
         raise InvalidInput(
-            f"{run.config}: was changed after the checkpoint {name} of this training; put it back as it was, or"
+            f"{run.config}: was changed after the checkpoint {name} of this training; restore it, or"
             " train again in another folder"
         )
     now, then = installed_versions(), state.numbers["versions"]
@@ -315,6 +315,6 @@ def _newest_checkpoint(
         name = other[0]
         raise InvalidInput(
             f"{run.path}: was trained with {name} {then.get(name)}, here is {now.get(name)}: the numbers would"
-            " differ; install that version, or go on all the same with --other-versions"
+            " differ; install that version, or continue anyway with --other-versions"
         )
     return state, damaged

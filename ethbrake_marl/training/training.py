@@ -124,9 +124,7 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
     invalid configuration, and for a training by another library.
     """
     if "library" in config:
-        raise InvalidInput(
-            f"{run.path}: was trained by {config['library']}, which leaves nothing to go on from; train again"
-        )
+        raise InvalidInput(f"{run.path}: was trained by {config['library']}, which cannot be resumed; train again")
     try:
         recipe = TrainingRecipe.of(with_new_names(config["recipe"]))
         scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))

@@ -163,7 +163,7 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': turns = 5: 2 learners need 10 updates, total_steps = 2048 are 8": lambda: train(
         TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
     ),
-    ".: holds no training; give the folder of a run": lambda: resume(Path()),
+    ".: contains no training; give the folder of a run": lambda: resume(Path()),
     ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: load_team(Path(), PAIR),
 }
 
@@ -228,14 +228,14 @@ def run(empty_folder: Path) -> RunDirectory:
 
 def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> None:
     with refused(
-        "run: is there already; give another folder (--output), go on with it (ethbrake train --resume)", AlreadyExists
+        "run: exists already; give another folder (--output), resume it (ethbrake train --resume)", AlreadyExists
     ):
         RunDirectory(run.path).create({})
     Path("thesis").mkdir()
     Path("thesis/chapter-1").touch()
-    with refused("thesis: is there already, and is no run; give another name", AlreadyExists):
+    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
         RunDirectory(Path("thesis")).create({}, force=True)
-    with refused("thesis: is there already, and is no run; give another name", AlreadyExists):
+    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
         train(TINY_PPO, PAPER, Path("thesis"))
 
 
@@ -288,7 +288,7 @@ def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunD
         ({"recipe": None}, "run/config.json: is not the configuration of a training: 'recipe' is missing"),
         ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
         ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
-        ({"library": "benchmarl"}, "run: was trained by benchmarl, which leaves nothing to go on from; train again"),
+        ({"library": "benchmarl"}, "run: was trained by benchmarl, which cannot be resumed; train again"),
     ],
     ids=lambda value: str(value)[:30],
 )

@@ -658,7 +658,7 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         state = read_checkpoint(place)
         shutil.rmtree(place)
         write_checkpoint(place, state)
-        told = rf"{place / ARRAYS}: .*; delete the checkpoint to go on from the one before"
+        told = rf"{place / ARRAYS}: .*; delete the checkpoint to resume from the one before"
     elif change != "forged":
         state = read_checkpoint(place)
         shutil.rmtree(place)
@@ -669,7 +669,7 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         shutil.rmtree(place)
         arrays = state.arrays | {"policy.log_std": np.zeros(2, np.float32)}
         write_checkpoint(place, TrainingState(state.numbers, arrays))
-        told = rf"the checkpoint of step {state.steps} is not of this training: .*log_std.*; delete it to go on from"
+        told = rf"the checkpoint of step {state.steps} is not of this training: .*log_std.*; delete it to resume from"
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
     with pytest.raises(EthBrakeError, match=told) as error:
         resume(run, measure=measure)
@@ -703,7 +703,7 @@ def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str
     else:
         del arrays[name]
     write_checkpoint(place, TrainingState(numbers, arrays))
-    with pytest.raises(EthBrakeError, match=rf"is not of this training: .*{told}.*; delete it to go on") as error:
+    with pytest.raises(EthBrakeError, match=rf"is not of this training: .*{told}.*; delete it to resume") as error:
         resume(run, measure=measure)
     assert "\n" not in str(error.value)
 
