@@ -22,6 +22,22 @@ LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in 
 
 _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
+RENAMED: dict[str, str] = {  # old name -> new name, for messages
+    "counterfactual": "vine",
+    "options": "rollout-classification",
+    "modes": "experts",
+    "counterfactuals": "tried",
+    "among": "policies",
+    "gate": "gating",
+    "gate_states": "gating_states",
+    "gate_memory": "gating_memory",
+    "gate_steps": "gating_steps",
+    "together_rate": "joint_rate",
+    "alone": "pretraining_first",
+    "further": "pretraining_others",
+    "together": "joint",
+}
+
 
 def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
@@ -237,8 +253,14 @@ class UncertifiedStep(EthBrakeError):
     """A step of the engine differs from the step that its shield certified; the step was not made."""
 
 
+def new_name(name: object, known: Collection[str]) -> str | None:
+    """Return the new name of a ``name`` that was renamed, or of its words between colons; None if not in ``known``."""
+    new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
+    return new if new != name and new in known else None
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name: it suggests a similar known name, or lists the known ones.
+    """Return the error for an unknown name: it gives the new name of a renamed one, a similar name, or all known names.
 
     Args:
         kind: what the name stands for, for example ``scenario``.
@@ -248,6 +270,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
     """
     names = sorted(known)
+    if new := new_name(name, names):
+        return UnknownName(f"unknown {kind} {name!r}; it is now called {new!r}")
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     own = "; one of your own must be registered or installed first (docs/extending.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
 
-_TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=counterfactuals=16", "--set=evaluation.worlds=10")
+_TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluation.worlds=10")
 
 _LINEUP = "ladder,ppo@shipped,ppo@shipped+search+episode,full_brake+step"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.errors import RENAMED, CorruptBundle, InvalidInput
 from ethbrake_marl.files.model import read_json_model
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.game.features import FEATURES
@@ -44,6 +44,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
             f"{place}: its content has SHA-256 {own}, but it says {manifest.manifest_sha256}; it was changed after it"
             " was saved"
         )
+    manifest = manifest.model_copy(update={"algorithm": RENAMED.get(manifest.algorithm, manifest.algorithm)})
     _check_observed(place, manifest)
     data = _read(folder / WEIGHTS)
     sha256 = hashlib.sha256(data).hexdigest()

@@ -54,9 +54,7 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
         agent = LearnedAgent(policy, name=spec if path == f"{SHIPPED}/{kind}" else f"{kind}@{path}")
     trained_by = policy.manifest.algorithm
     if name in ALGORITHMS and name != trained_by:
-        raise InvalidInput(
-            f"agent '{name}@{path}': that policy was trained by {trained_by.upper()}: {trained_by}@{path}"
-        )
+        raise InvalidInput(f"agent '{name}@{path}': that policy was trained by {trained_by}; write {trained_by}@{path}")
     return agent
 
 

@@ -219,6 +219,6 @@ class RunCallback(BaseCallback):
         except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise CorruptBundle(
                 f"{self.run.checkpoints}: the checkpoint of step {state.steps} is not of this training:"
-                f" {' '.join(str(error).split())}; delete it to go on from the one before"
+                f" {' '.join(str(error).split())}; delete it to resume from the one before"
             ) from None
         self._is_done_here = True

@@ -69,8 +69,8 @@ def read_checkpoint(folder: Path) -> TrainingState:
     """
     if not os.path.lexists(folder / NUMBERS):
         raise InvalidInput(
-            f"{folder}: has no {NUMBERS}, so another version of this package wrote it; go on with that version, or"
-            " delete the checkpoint to go on from the one before"
+            f"{folder}: has no {NUMBERS}, so another version of this package wrote it; use that version, or"
+            " delete the checkpoint to resume from the one before"
         )
     data = read_plain(folder / NUMBERS, 256 << 20, refusal=CorruptBundle, follow_links=False)
     with open_plain(folder / ARRAYS, 1 << 36, refusal=CorruptBundle, follow_links=False) as stream:
@@ -84,12 +84,12 @@ def read_checkpoint(folder: Path) -> TrainingState:
     try:
         state = TrainingState(numbers, safetensors.numpy.load_file(folder / ARRAYS))
     except SafetensorError as error:
-        raise InvalidInput(f"{folder / ARRAYS}: {error}; delete the checkpoint to go on from the one before") from None
+        raise InvalidInput(f"{folder / ARRAYS}: {error}; delete the checkpoint to resume from the one before") from None
     for name, kind in _KINDS.items():
         if type(numbers.get(name)) is not kind:
             raise InvalidInput(
                 f"{folder / NUMBERS}: {name} = {numbers.get(name)!r:.60}: must be of type {kind.__name__}; delete the"
-                " checkpoint to go on from the one before"
+                " checkpoint to resume from the one before"
             )
     return state
 
@@ -103,8 +103,8 @@ def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
 
 def checkpoint_folders(folder: Path) -> list[Path]:
     """Return the folders of all checkpoints inside ``folder``, newest first, without checking their content."""
-    found = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
-    return sorted(found, reverse=True)
+    folders = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
+    return sorted(folders, reverse=True)
 
 
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:

@@ -168,9 +168,9 @@ def run_experiment(
         results = write_results(run.path, "results", rows, harm_count, per_world)
         tell(Progress("results", 1, 1))
         experiment = Experiment(trained, agents, evaluation, rows, list_seed, harm_count, started)
-        made = [make(experiment, tell) for make in reports]
-    tables = tuple(table for report in made for table in report.tables)
-    notes = tuple(report.note for report in made)
+        written = [make(experiment, tell) for make in reports]
+    tables = tuple(table for report in written for table in report.tables)
+    notes = tuple(report.note for report in written)
     return ExperimentResult(
         trained,
         results,
@@ -196,20 +196,20 @@ def compared_agents(
     """
     several = len(scenario.learners) > 1
     specs = (TEAM_BASELINES if several else BASELINES) if baselines is None else baselines
-    found = make_lineup(specs, scenario, harm_count=harm_count)
+    agents = make_lineup(specs, scenario, harm_count=harm_count)
     if not several:
-        alone = LearnedAgent(next(iter(trained.drivers.values())), TRAINED_POLICY)
-        return {**found, TRAINED_POLICY: alone, SHIELDED: HybridAgent(alone, scenario, harm_count=harm_count)}
+        agent = LearnedAgent(next(iter(trained.drivers.values())), TRAINED_POLICY)
+        return {**agents, TRAINED_POLICY: agent, SHIELDED: HybridAgent(agent, scenario, harm_count=harm_count)}
     drivers: dict[int, Agent] = {
         i: LearnedAgent(trained.drivers[scenario.vehicle_names[i]], TRAINED_TEAM) for i in scenario.learners
     }
     team = Team(drivers, TRAINED_TEAM)
-    found[TRAINED_TEAM] = team
+    agents[TRAINED_TEAM] = team
     braking = make_agents(["full_brake"], scenario)["full_brake"]
     for i in scenario.learners:
         name = without(scenario.vehicle_names[i])
-        found[name] = Team({**drivers, i: braking}, name)
-    return {**found, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
+        agents[name] = Team({**drivers, i: braking}, name)
+    return {**agents, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
 
 
 def without(vehicle: str) -> str:
@@ -243,12 +243,12 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
     ``rows`` is the table. The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
     """
     lines = []
-    for told in (row.to_json() for row in rows):
-        parameters = told.pop("parameters")
-        for name, value in told.items():
+    for entry in (row.to_json() for row in rows):
+        parameters = entry.pop("parameters")
+        for name, value in entry.items():
             if isinstance(value, list | dict) and not name.endswith("_interval"):
-                told[name] = json.dumps(value, allow_nan=False)
-        lines.append({"scenario": parameters["scenario"], "seed": parameters["seed"], **told})
+                entry[name] = json.dumps(value, allow_nan=False)
+        lines.append({"scenario": parameters["scenario"], "seed": parameters["seed"], **entry})
     return csv_text(lines)
 
 

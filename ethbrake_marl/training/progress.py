@@ -42,7 +42,7 @@ class Course:
         return self.wall_before_s + time.monotonic() - self.started
 
     @property
-    def kept(self) -> Trained | None:
+    def chosen(self) -> Trained | None:
         """The policy to save as the result: the best one, or the last one if there was no evaluation yet."""
         return self.best or self.policy
 

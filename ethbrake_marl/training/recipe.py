@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, field_validator, model_validator
 from pydantic.json_schema import models_json_schema
 
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, new_name, unknown_name
 from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
@@ -217,8 +217,8 @@ class TrainingRecipe(FileModel):
             raise InvalidInput(f"scheme independent: {where} has one learner; use single")
         if scheme not in self.schemes:
             raise InvalidInput(
-                f"scheme {scheme}: recipe {self.name!r} is for {self.algorithm.upper()}; it needs one for PPO, for"
-                " instance cooperation-ppo"
+                f"scheme {scheme}: recipe {self.name!r} is for {self.algorithm}, which cannot train so; use a recipe"
+                " for PPO, for instance cooperation-ppo"
             )
         self.check_learners(learners)
         return scheme
@@ -354,11 +354,11 @@ def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
 
     A key that the class declares without a description has the description of its base class.
     """
-    found: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
         for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():
-            found |= {key: field.description} if field.description else {}
-    return found
+            meanings |= {key: field.description} if field.description else {}
+    return meanings
 
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
@@ -417,11 +417,12 @@ def _checked(source: Path | Document) -> TrainingRecipe:
     document = source if isinstance(source, Document) else read_yaml(source)
     name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
-        where, right = document.where(("algorithm",)), f"one of {', '.join(ALGORITHMS)}"
-        absent = ""
+        new, absent = new_name(name, ALGORITHMS), ""
+        right = f"is now called {new}" if new else f"must be one of {', '.join(ALGORITHMS)}"
         if isinstance(source, Path) and source in TrainingRecipe.shipped().values():
             absent = f"; the extension {source.parent.name}, which gives it, is not installed"
-        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: must be {right}{absent}")
+        where = document.where(("algorithm",))
+        raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: {right}{absent}")
     shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
     model = ALGORITHMS[name][0]
     wording = _RecipeWording(model, f"it is needed{shipped}")

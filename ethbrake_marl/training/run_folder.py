@@ -65,9 +65,9 @@ class RunDirectory:
         replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
         if not replace and (path.exists() or path.is_symlink()):
             if not is_run:
-                raise AlreadyExists(f"{path}: is there already, and is no run; give another name")
+                raise AlreadyExists(f"{path}: exists already and is not a run; give another name")
             raise AlreadyExists(
-                f"{path}: is there already; give another folder (--output), go on with it (ethbrake train --resume),"
+                f"{path}: exists already; give another folder (--output), resume it (ethbrake train --resume),"
                 " or replace it with force (--force; make run ARGS=--force)"
             )
         with new_folder(path, replace=replace) as partial:
@@ -100,7 +100,7 @@ class RunDirectory:
         Raises ``InvalidInput`` if the folder holds no run, or if a file or folder in it is damaged.
         """
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
-            raise InvalidInput(f"{self.path}: holds no training; give the folder of a run, for instance runs/my-run")
+            raise InvalidInput(f"{self.path}: contains no training; give the folder of a run, for instance runs/my-run")
         for folder in (self.checkpoints, self.tensorboard, self.policy, self.last_policy):
             if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
                 raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it, or replaces it")
@@ -132,8 +132,10 @@ class RunDirectory:
             prefix: text before the names of metrics in ``evaluations`` and in the result: ``eval/`` for rows.
 
         """
-        found = evaluations and all(entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations)
-        return prefix + (cls.OBJECTIVE if found else cls.HARM[harm_count])
+        with_objective = evaluations and all(
+            entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations
+        )
+        return prefix + (cls.OBJECTIVE if with_objective else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
         """Return the rows of ``progress.csv``, each as column -> text."""
@@ -144,10 +146,10 @@ class RunDirectory:
 
         Raises ``InvalidInput`` if none is recorded.
         """
-        kept = read_object(self.status).get("cpu_s") or {}
-        if not kept:
-            raise InvalidInput(f"{self.path}: tells no processor time; train again with this version")
-        return {int(steps): float(spent) for steps, spent in kept.items()}
+        recorded = read_object(self.status).get("cpu_s") or {}
+        if not recorded:
+            raise InvalidInput(f"{self.path}: has no record of processor time; train again with this version")
+        return {int(steps): float(spent) for steps, spent in recorded.items()}
 
     def column(self, name: str) -> dict[int, float]:
         """Return the column ``name`` of ``progress.csv`` as number of decisions -> value, without empty cells."""

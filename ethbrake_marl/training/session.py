@@ -27,7 +27,7 @@ from ethbrake_marl.training.models import Learner, make_environment, make_model
 from ethbrake_marl.training.random_state import own_random_state
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.training.run_folder import RunDirectory, RunStatus
-from ethbrake_marl.training.training import Training, recorded_training
+from ethbrake_marl.training.training import Training, recorded_identities, recorded_training
 
 Ended = Literal["finished", "interrupted"]
 
@@ -236,9 +236,9 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     finally:
         model.logger.close()
     save(callback, status, reason)
-    assert course.policy is not None and course.kept is not None  # set before the first rollout
+    assert course.policy is not None and course.chosen is not None  # set before the first rollout
     return TrainResult(
-        run.path, training, course.kept, course.policy, status, course.steps, course.updates, course.wall_s,
+        run.path, training, course.chosen, course.policy, status, course.steps, course.updates, course.wall_s,
         tuple(course.evaluations),
     )  # fmt: skip
 
@@ -255,7 +255,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
 
     """
     run, training, course = callback.run, callback.learner.training, callback.course
-    for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):
+    for policy, folder in ((course.chosen, run.policy), (course.policy, run.last_policy)):
         if policy is not None:
             policy.save(folder, replace=True)
     left_over = () if status == "finished" else run.checkpoints.glob("step_*")
@@ -266,7 +266,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
         "cpu_s": {str(steps): round(spent, 3) for steps, spent in course.cpu_s.items()},
         "steps": course.steps,
         "updates": course.updates,
-        "policy_steps": None if course.kept is None else course.kept.steps,
+        "policy_steps": None if course.chosen is None else course.chosen.steps,
         "policy": run.policy.name if run.policy.is_dir() else None,
         "checkpoints": sorted(path.name for path in left_over),
     }
@@ -280,8 +280,8 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
-        alone = len(training.drivers) == 1
-        agents = f"{training.recipe.algorithm}@{run.path}+episode" if alone else f"team@{run.path}"
+        single = len(training.drivers) == 1
+        agents = f"{training.recipe.algorithm}@{run.path}+episode" if single else f"team@{run.path}"
         raise InvalidInput(
             f"{run.path}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
             f" {training.scenario.name} --agents {agents}"
@@ -302,10 +302,10 @@ def _newest_checkpoint(
     state, damaged = newest_usable(run.checkpoints)
     if state is None:
         return None, damaged
-    if state.numbers.get("training") != training.identity:
+    if state.numbers.get("training") not in recorded_identities(run, training):
         name = run.checkpoint(state.steps).name
         raise InvalidInput(
-            f"{run.config}: was changed after the checkpoint {name} of this training; put it back as it was, or"
+            f"{run.config}: was changed after the checkpoint {name} of this training; restore it, or"
             " train again in another folder"
         )
     now, then = installed_versions(), state.numbers["versions"]
@@ -315,6 +315,6 @@ def _newest_checkpoint(
         name = other[0]
         raise InvalidInput(
             f"{run.path}: was trained with {name} {then.get(name)}, here is {now.get(name)}: the numbers would"
-            " differ; install that version, or go on all the same with --other-versions"
+            " differ; install that version, or continue anyway with --other-versions"
         )
     return state, damaged

@@ -53,9 +53,9 @@ class TeamFile(FileModel):
                 refuse(("drivers",), name, f"must be one of {line[0]} to {line[-1]}")
             if bundle != bundle_of(self.scheme, name):
                 refuse(("drivers", name), bundle, f"must be {bundle_of(self.scheme, name)} under scheme {self.scheme}")
-        alone = len(self.drivers) == 1
-        if (self.scheme == "single" and not alone) or (self.scheme == "independent" and alone):
-            right = "two vehicles or more" if alone else "one vehicle"
+        is_one = len(self.drivers) == 1
+        if (self.scheme == "single" and not is_one) or (self.scheme == "independent" and is_one):
+            right = "two vehicles or more" if is_one else "one vehicle"
             refuse(("drivers",), self.drivers, f"must be {right} under scheme {self.scheme}")
         return self
 

@@ -107,7 +107,7 @@ TRAININGS = [
         "train --scenario cooperation-3-pair --set scheme=centralized --output no",
         "recipe 'ppo': scheme = centralized: must be single, shared, independent or centralised",
     ),
-    ("train --resume .", ".: holds no training; give the folder of a run"),
+    ("train --resume .", ".: contains no training; give the folder of a run"),
     ("agent export shipped/ppo --onnx none/policy.onnx", "none/policy.onnx: there is no folder none; make it first"),
     (
         "shield --agents ppo@shipped+episode",
@@ -178,7 +178,7 @@ def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refus
     [
         ("evaluate --output file/x", "is no folder; give a folder of its own (--output)"),
         ("run --output file/x", "file: Not a directory"),
-        ("train --output . --force", ".: is there already, and is no run; give another name"),
+        ("train --output . --force", ".: exists already and is not a run; give another name"),
     ],
 )
 def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse) -> None:

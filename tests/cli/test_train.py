@@ -121,7 +121,7 @@ def test_run__with_sac_all_minimise_the_harm_it_is_for(ethbrake, tiny_sac, tmp_p
         assert row == {**then, "agent": row["agent"], "per_world": row["per_world"]}
     assert json.loads((folder / "config.json").read_text())["update_ratio"] == 1 / 16
     assert ethbrake("evaluate", "--episodes", "20", "--agents", f"sac@{folder}", "--json").status == 0
-    check_refused(ethbrake("evaluate", "--agents", f"ppo@{folder}"), "was trained by SAC")
+    check_refused(ethbrake("evaluate", "--agents", f"ppo@{folder}"), "was trained by sac")
 
 
 def test_evaluate__interrupted_writes_nothing(ethbrake: Command, tmp_path: Path, monkeypatch) -> None:
@@ -158,7 +158,7 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     words = ("--episodes", "20", "--agents", f"ppo@{folder},team@{folder}", "--json")
     alone, team = told_json(ethbrake("evaluate", *scenario, *words))
     assert alone["first_impact_harm"] == team["first_impact_harm"]
-    check_refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by PPO", f"ppo@{folder}")
+    check_refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by ppo", f"ppo@{folder}")
     check_refused(ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
 
 

@@ -22,7 +22,18 @@ def test_knowledge__every_agent_of_the_registry_stands_in_a_table():
 
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     scripts = ("coast", "constant", "e_v2x_bm", "full_brake", "planner")
-    names = (*scripts, *FIELD, "best_harm", "ppo", "sac", "counterfactual", "options", "policy", "universal", "team")
+    names = (
+        *scripts,
+        *FIELD,
+        "best_harm",
+        "ppo",
+        "sac",
+        "vine",
+        "rollout-classification",
+        "policy",
+        "universal",
+        "team",
+    )
     assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     assert [name for name in (*names, "+search", "+episode", "+step", "+robust") if name not in table] == []

@@ -151,10 +151,10 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "scheme independent: scenario 'paper-random' has one learner; use single": lambda: train(
         TINY_PPO, PAPER, Path("run"), scheme="independent"
     ),
-    "scheme independent: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+    "scheme independent: recipe 'sac' is for sac, which cannot train so; use a recipe": lambda: train(
         "sac", PAIR, Path("run"), scheme="independent"
     ),
-    "scheme centralised: recipe 'sac' is for SAC; it needs one for PPO": lambda: train(
+    "scheme centralised: recipe 'sac' is for sac, which cannot train so; use a recipe": lambda: train(
         "sac", PAIR, Path("run"), scheme="centralised"
     ),
     "recipe 'ppo': turns = 3: is for scheme: independent only; leave it out": lambda: train(
@@ -163,7 +163,7 @@ TRAININGS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': turns = 5: 2 learners need 10 updates, total_steps = 2048 are 8": lambda: train(
         TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
     ),
-    ".: holds no training; give the folder of a run": lambda: resume(Path()),
+    ".: contains no training; give the folder of a run": lambda: resume(Path()),
     ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: load_team(Path(), PAIR),
 }
 
@@ -205,7 +205,7 @@ def test_algorithm__has_a_name_of_its_own() -> None:
         ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
         ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
         ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
-        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for A2C; it needs one for PPO"),
+        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for a2c, which cannot train so"),
     ],
     ids=lambda value: str(value)[:30],
 )
@@ -228,14 +228,14 @@ def run(empty_folder: Path) -> RunDirectory:
 
 def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> None:
     with refused(
-        "run: is there already; give another folder (--output), go on with it (ethbrake train --resume)", AlreadyExists
+        "run: exists already; give another folder (--output), resume it (ethbrake train --resume)", AlreadyExists
     ):
         RunDirectory(run.path).create({})
     Path("thesis").mkdir()
     Path("thesis/chapter-1").touch()
-    with refused("thesis: is there already, and is no run; give another name", AlreadyExists):
+    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
         RunDirectory(Path("thesis")).create({}, force=True)
-    with refused("thesis: is there already, and is no run; give another name", AlreadyExists):
+    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
         train(TINY_PPO, PAPER, Path("thesis"))
 
 
@@ -288,7 +288,7 @@ def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunD
         ({"recipe": None}, "run/config.json: is not the configuration of a training: 'recipe' is missing"),
         ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
         ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
-        ({"library": "benchmarl"}, "run: was trained by benchmarl, which leaves nothing to go on from; train again"),
+        ({"library": "benchmarl"}, "run: was trained by benchmarl, which cannot be resumed; train again"),
     ],
     ids=lambda value: str(value)[:30],
 )

@@ -295,7 +295,7 @@ def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_fr
     course.add_evaluation(policy, {"first_impact_harm": 9.0, "total_harm": 10.0}, None)
     course.add_evaluation(other, second, -3.0)
     again.restore(course.to_json())
-    assert course.kept is policy  # by the harm, as it was begun without an objective
+    assert course.chosen is policy  # by the harm, as it was begun without an objective
     assert (again.evaluations, again.best_harm) == (course.evaluations, 10.0)
     assert again.wall_s >= course.wall_before_s
     assert course.evaluations[1] == {"steps": 0, "updates": 0, **second, "episode_return": -3.0}
@@ -307,7 +307,7 @@ def test_course__the_best_goes_by_the_objective_where_one_is_told(policy) -> Non
     for each, line, objective in zip(by_steps, (24.0, 30.0, 20.0, 18.0), (8.0, 0.1, 6.0, 7.0), strict=True):
         metrics = {"first_impact_harm": line, "objective": objective, "objective_vehicle_2": objective}
         course.add_evaluation(each, metrics, None)
-    assert course.kept is by_steps[1] and course.best_harm == 0.1
+    assert course.chosen is by_steps[1] and course.best_harm == 0.1
     for k, each in enumerate([*by_steps, *by_steps]):
         adversary.add_evaluation(each, {"first_impact_harm": 20.0 + k, "objective": -20.0 - k}, float(k))
     assert adversary.best_harm == -27.0
@@ -658,7 +658,7 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         state = read_checkpoint(place)
         shutil.rmtree(place)
         write_checkpoint(place, state)
-        told = rf"{place / ARRAYS}: .*; delete the checkpoint to go on from the one before"
+        told = rf"{place / ARRAYS}: .*; delete the checkpoint to resume from the one before"
     elif change != "forged":
         state = read_checkpoint(place)
         shutil.rmtree(place)
@@ -669,7 +669,7 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         shutil.rmtree(place)
         arrays = state.arrays | {"policy.log_std": np.zeros(2, np.float32)}
         write_checkpoint(place, TrainingState(state.numbers, arrays))
-        told = rf"the checkpoint of step {state.steps} is not of this training: .*log_std.*; delete it to go on from"
+        told = rf"the checkpoint of step {state.steps} is not of this training: .*log_std.*; delete it to resume from"
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
     with pytest.raises(EthBrakeError, match=told) as error:
         resume(run, measure=measure)
@@ -703,7 +703,7 @@ def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str
     else:
         del arrays[name]
     write_checkpoint(place, TrainingState(numbers, arrays))
-    with pytest.raises(EthBrakeError, match=rf"is not of this training: .*{told}.*; delete it to go on") as error:
+    with pytest.raises(EthBrakeError, match=rf"is not of this training: .*{told}.*; delete it to resume") as error:
         resume(run, measure=measure)
     assert "\n" not in str(error.value)
 

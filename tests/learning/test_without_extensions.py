@@ -21,11 +21,13 @@ pytestmark = pytest.mark.usefixtures("core_alone")
 def test_algorithm__of_an_absent_extension_is_refused_by_name() -> None:
     assert algorithm_names() == ("ppo", "sac")
     with pytest.raises(InvalidInput) as error:
-        load_recipe("counterfactual")
-    told = "counterfactual.yaml, line 10: algorithm = counterfactual: must be one of ppo, sac"
+        load_recipe("vine")
+    told = "vine.yaml, line 11: algorithm = vine: must be one of ppo, sac"
     assert f"{told}; the extension learners, which gives it, is not installed" in str(error.value)
-    with pytest.raises(InvalidInput, match=r"recipe 'ppo': algorithm = options: must be one of ppo, sac$"):
-        TINY.replace(algorithm="options")
+    with pytest.raises(
+        InvalidInput, match=r"recipe 'ppo': algorithm = rollout-classification: must be one of ppo, sac$"
+    ):
+        TINY.replace(algorithm="rollout-classification")
 
 
 def test_recipes__that_are_listed_can_be_used_and_run_takes_the_first_of_them() -> None:
@@ -39,9 +41,9 @@ def test_recipes__that_are_listed_can_be_used_and_run_takes_the_first_of_them() 
 def test_algorithm__of_an_absent_extension_leaves_a_run_that_says_so(tmp_path: Path) -> None:
     eb.train(TINY, "paper-random", tmp_path / "run", measure=None, on_progress=None)
     config = json.loads((tmp_path / "run" / "config.json").read_text())
-    config["recipe"]["algorithm"] = "counterfactual"
+    config["recipe"]["algorithm"] = "vine"
     (tmp_path / "run" / "config.json").write_text(json.dumps(config))
-    with pytest.raises(InvalidInput, match=r"config.json: recipe: algorithm = counterfactual: must be one of ppo, sac"):
+    with pytest.raises(InvalidInput, match=r"config.json: recipe: algorithm = vine: must be one of ppo, sac"):
         eb.resume(tmp_path / "run", on_progress=None)
 
 

@@ -72,7 +72,7 @@ def test_actor__relu_then_output_by_hand(output: str, last: Any, expected: Any, 
         ((256, 256), "tanh", "clip"),
         ((64,), "tanh", "tanh"),
         ((64,), "relu", "choice"),
-        (None, "relu", "clip"),  # several networks and a gate
+        (None, "relu", "clip"),  # a mixture of experts
     ],
 )
 def test_actor__action_is_bitwise_independent_of_the_batch_around_it(
@@ -155,7 +155,7 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
     tensors["policy.output.weight"] -= tensors["policy.output.weight"].mean(axis=0)  # so that each is chosen somewhere
     tensors["policy.output.bias"] *= np.float32(0.0)
     tensors |= {f"among_1.{name}": tensor for name, tensor in mixture.tensors.items()}
-    another(mixture, tensors, network=spec, algorithm="options").save(tmp_path / "among")
+    another(mixture, tensors, network=spec, algorithm="rollout-classification").save(tmp_path / "among")
     policy, seen = load_policy(tmp_path / "among"), _observations(2000, 27)
     assert policy.manifest.format_version == 5
     hidden = np.maximum(seen @ tensors["policy.0.weight"].T + tensors["policy.0.bias"], 0.0)
@@ -209,7 +209,9 @@ def test_onnx__asks_for_the_same_acceleration_in_10_000_states(
     )  # fmt: skip
     tensors = random_tensors(spec)
     tensors["policy.output.weight"] *= 3.0  # so that some actions reach the bounds
-    ours = another(policy, tensors, network=spec, algorithm={"tanh": "sac", "choice": "options"}.get(output, "ppo"))
+    ours = another(
+        policy, tensors, network=spec, algorithm={"tanh": "sac", "choice": "rollout-classification"}.get(output, "ppo")
+    )
     worlds = SCENARIO.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5).worlds
     rng = np.random.default_rng(0)
     command = -rng.uniform(0.0, 1.0, worlds.speeds_mps.shape) * worlds.vehicles.braking_capacity_mps2

@@ -47,8 +47,8 @@ POLICIES: dict[str, Callable[[], object]] = {
     "agent 'universal@runs/x': must be universal@shipped; for another policy: ppo@PATH or sac@PATH": lambda: (
         make_lineup(["universal@runs/x"], PAPER)
     ),
-    "agent 'sac@shipped/universal': that policy was trained by OPTIONS: options@shipped/universal": lambda: make_lineup(
-        ["sac@shipped/universal"], PAPER
+    "that policy was trained by rollout-classification; write rollout-classification@shipped/universal": lambda: (
+        make_lineup(["sac@shipped/universal"], PAPER)
     ),
     "agent 'ppo@': a path is needed after '@'": lambda: make_lineup(["ppo@"], PAPER),
     "agent 'sac': a policy is needed: sac@PATH, where PATH is a run": lambda: make_lineup(["sac"], PAPER),

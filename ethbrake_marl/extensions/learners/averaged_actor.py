@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
@@ -49,8 +49,8 @@ class Deterministic(BasePolicy):
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
-        found: Tensor = self.forward(observation)
-        return found
+        action: Tensor = self.forward(observation)
+        return action
 
 
 class AveragedActor(Deterministic):
@@ -66,9 +66,7 @@ class AveragedActor(Deterministic):
 
     """
 
-    def __init__(
-        self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
-    ) -> None:
+    def __init__(self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: VineRecipe) -> None:
         super().__init__(observation_space, action_space)
         inputs, shape = flatdim(observation_space), recipe.network
         hidden, activation = list(shape.policy), ACTIVATIONS[shape.activation]
@@ -104,8 +102,8 @@ class AveragedActor(Deterministic):
 
     @torch.no_grad()
     def means(self, observation: Float32s) -> Float32s:
-        found: Float32s = self.learning(torch.from_numpy(observation))[:, 0].numpy()
-        return found
+        means: Float32s = self.learning(torch.from_numpy(observation))[:, 0].numpy()
+        return means
 
     def expect(self, observation: Float32s) -> Floats:
         assert self.scout is not None

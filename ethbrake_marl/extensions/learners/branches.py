@@ -173,8 +173,8 @@ def counted_harm(engine: Engine, count: HarmCount) -> Floats:
     declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
     if declared is None:
         return np.broadcast_to(engine.ledger.world_harm(count)[:, np.newaxis], shape)
-    found = objective_harm(engine.ledger, count, objectives_of(declared, engine.scenario.vehicles))
-    return found[:, list(engine.learners)]
+    harm = objective_harm(engine.ledger, count, objectives_of(declared, engine.scenario.vehicles))
+    return harm[:, list(engine.learners)]
 
 
 def other_count(count: HarmCount) -> HarmCount:

@@ -13,12 +13,12 @@ from torch import Tensor, nn
 
 from ethbrake_marl.extensions.learners.optimizer import adam
 from ethbrake_marl.extensions.learners.scout import Scout
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.policies.network_spec import Float32s
 from ethbrake_marl.training.networks import ACTIVATIONS
 
 
-class AveragedGate(nn.Module):
+class AveragedGatingNetwork(nn.Module):
     """Gating network, which chooses one of K experts (networks that drive) from an observation of F features.
 
     It has two copies: ``learning`` is in training, and ``average``, with the running average of its weights, chooses.
@@ -29,7 +29,7 @@ class AveragedGate(nn.Module):
     Args:
         inputs: number of features of an observation.
         rate: learning rate as a function of the remaining share of the training, from 1 to 0.
-        recipe: recipe with the key ``modes``.
+        recipe: recipe with the key ``experts``.
 
     """
 
@@ -37,19 +37,19 @@ class AveragedGate(nn.Module):
     more: Tensor  # [M, K] extra cost of each expert over the best one at these decisions
     compared: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
 
-    def __init__(self, inputs: int, rate: Schedule, recipe: CounterfactualRecipe) -> None:
+    def __init__(self, inputs: int, rate: Schedule, recipe: VineRecipe) -> None:
         super().__init__()
-        plan = recipe.modes
+        plan = recipe.experts
         assert plan is not None
-        layers = create_mlp(inputs, plan.networks, list(plan.gate), ACTIVATIONS[recipe.network.activation])
-        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until the gate learns, the first expert acts
+        layers = create_mlp(inputs, plan.networks, list(plan.gating), ACTIVATIONS[recipe.network.activation])
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, the first expert acts
         nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
         self.scout = Scout(inputs) if recipe.focus > 0.0 else None
         self.optimizer = adam(rate(1.0), self.learning, self.scout)
-        self.register_buffer("seen", torch.zeros(plan.gate_memory, inputs))
-        self.register_buffer("more", torch.zeros(plan.gate_memory, plan.networks))
+        self.register_buffer("seen", torch.zeros(plan.gating_memory, inputs))
+        self.register_buffer("more", torch.zeros(plan.gating_memory, plan.networks))
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
@@ -64,7 +64,7 @@ class AveragedGate(nn.Module):
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return the index of the expert that the averaged gate chooses for each of the observations [rows, F]."""
+        """Return the index of the expert that the averaged weights choose for each of the observations [rows, F]."""
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

@@ -23,10 +23,10 @@ def limit_that_cuts(sizes: Floats, share: float) -> float:
     is the limit for the share 1/3.
     """
     rising = np.sort(sizes)
-    kept = (
+    remaining = (
         np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising
-    )  # remaining sum if the limit is each size in turn
-    return float(np.interp((1.0 - share) * kept[-1], kept, rising))
+    )  # sum of all sizes if the limit is each size in turn
+    return float(np.interp((1.0 - share) * remaining[-1], remaining, rising))
 
 
 def smallest_offset(measured: Floats, least: float, most: float) -> float:

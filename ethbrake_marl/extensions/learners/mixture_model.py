@@ -14,10 +14,10 @@ from ethbrake_marl.engine.state import State
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor
 from ethbrake_marl.extensions.learners.branches import moving_rows, other_count, visit
-from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.mixture_policy import ExpertsPolicy
 from ethbrake_marl.extensions.learners.mixture_stages import Stage, stages_of
 from ethbrake_marl.extensions.learners.mixture_worlds import (
-    NoOtherMode,
+    NoBetterTemplate,
     Shown,
     drive_from,
     explore,
@@ -27,51 +27,52 @@ from ethbrake_marl.extensions.learners.mixture_worlds import (
 from ethbrake_marl.extensions.learners.optimizer import adam, descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
 from ethbrake_marl.extensions.learners.trust_radius import Tried
-from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_model import VineModel
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.network_spec import Float32s
 
 
-class ModesModel(CounterfactualModel):
-    """Model that trains a mixture of experts: several networks that drive, and a gate that chooses one of them.
+class ExpertsModel(VineModel):
+    """Model that trains a mixture of experts: several networks that drive, and a gating network that chooses.
 
-    It trains the first expert alone, further experts in worlds of their own, the gate, then all together. The key
-    ``modes`` of the recipe configures it. The arguments are the environment of the training, and the recipe.
+    It trains the first expert in all worlds, the other experts in worlds of their own, the gating network, then all
+    networks jointly. The key ``experts`` of the recipe configures it. The arguments are the environment of the
+    training, and the recipe.
     """
 
-    policy: ModesPolicy  # type: ignore[assignment]
+    policy: ExpertsPolicy  # type: ignore[assignment]
 
-    def __init__(self, environment: EthBrakeVecEnv, recipe: CounterfactualRecipe) -> None:
-        assert recipe.modes is not None
-        self.plan = recipe.modes
+    def __init__(self, environment: EthBrakeVecEnv, recipe: VineRecipe) -> None:
+        assert recipe.experts is not None
+        self.plan = recipe.experts
         self._stage: Stage | None = None
         self._own: State | None = None  # starting states of the worlds of the stage's expert
         self._rate_share = 1.0
         super().__init__(environment, recipe)
 
-    def _update(self, told: BaseCallback, total: int) -> None:
+    def _update(self, callback: BaseCallback, total: int) -> None:
         each = self.n_envs * self.recipe.n_steps
         number, policy = self.num_timesteps // each, self.policy
         stage = next(s for s in stages_of(self.plan, -(-total // each)) if s.first <= number < s.end)
         if stage != self._stage:
             self._enter(stage, number)
         member = policy.actors[stage.network]
-        if stage.does == "further":  # whole episodes in some of the expert's own worlds
+        if stage.trains == "other":  # whole episodes in some of the expert's own worlds
             assert self._own is not None
             some = torch.randint(len(self._own.motion), (self.n_envs,)).numpy()
-            found, moments = visit(self.engine.branch(self._own.take(some)), member.act)
-            seen = found.reshape(1, -1, found.shape[2])
+            visited, moments = visit(self.engine.branch(self._own.take(some)), member.act)
+            seen = visited.reshape(1, -1, visited.shape[2])
             self.num_timesteps += each
         else:
-            seen, moments = self._visit(told, member.act if stage.does == "alone" else policy.act)
-        told.on_rollout_end()
+            seen, moments = self._visit(callback, member.act if stage.trains == "first" else policy.act)
+        callback.on_rollout_end()
         self._update_current_progress_remaining(number - stage.first, stage.end - stage.first)
-        self._rate_share = self.plan.together_rate if stage.does == "together" else 1.0
-        if stage.does in ("alone", "further"):
+        self._rate_share = self.plan.joint_rate if stage.trains == "joint" else 1.0
+        if stage.trains in ("first", "other"):
             self._train(member, self._try_out(seen, moments, member))
             return
-        if stage.does == "together":  # each expert learns from the decisions at which the gate chooses it
+        if stage.trains == "joint":  # each expert learns from the decisions at which it is chosen
             tried = self._try_out(seen, moments, policy)
             chosen = policy.gate.choose(tried.seen)
             for k, actor in enumerate(policy.actors):
@@ -89,27 +90,27 @@ class ModesModel(CounterfactualModel):
     def _enter(self, stage: Stage, number: int) -> None:
         """Prepare a stage of the training that begins, or is resumed, at update ``number``.
 
-        For a further expert, find the worlds that it will be trained in, and let it imitate templates (random braking
-        profiles) that do better than the experts so far.
+        For an expert after the first, find the worlds that it will be trained in, and let it imitate templates (random
+        braking profiles) that do better than the experts so far.
 
         The result depends only on finished experts, so it is the same after a resume.
         """
         self._stage, self._own = stage, None
-        if stage.does != "further":
+        if stage.trains != "other":
             return
         engine, gamma = self.engine, self.recipe.gamma
-        before = [actor.act for actor in self.policy.actors[: stage.network]]
-        found = explore(engine, self.plan, before, gamma)
+        earlier = [actor.act for actor in self.policy.actors[: stage.network]]
+        explored = explore(engine, self.plan, earlier, gamma)
         seed = int(self.seed or 0)
-        shown = show_templates(engine, self.plan, found, gamma, seed)
+        shown = show_templates(engine, self.plan, explored, gamma, seed)
         pupil = copy.deepcopy(self.policy.actors[0])
         self._imitate(pupil, shown, seed + stage.network)
-        self._own = own_worlds(engine, self.plan, found, pupil.act, gamma)
+        self._own = own_worlds(engine, self.plan, explored, pupil.act, gamma)
         if len(shown.action) == 0 or len(self._own.motion) == 0:
-            raise NoOtherMode(
-                f"modes: network {stage.network + 1}: in none of {self.plan.worlds:,} worlds did one of"
-                f" {self.plan.templates} templates do better by {self.plan.gain:g}; leave out modes, or have"
-                " fewer networks"
+            raise NoBetterTemplate(
+                f"experts: network {stage.network + 1}: in none of {self.plan.worlds:,} worlds does one of"
+                f" {self.plan.templates} templates do better than the experts before by {self.plan.gain:g}; set fewer"
+                " networks, or leave experts out"
             )
         if number == stage.first:
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
@@ -145,7 +146,7 @@ class ModesModel(CounterfactualModel):
         observed = seen.reshape(-1, seen.shape[2])
         actions = np.stack([act(observed) for act in members])
         differ = (np.ptp(actions, axis=0) > 1e-2) & moving_rows(moments)
-        count, scout = self.plan.gate_states, self.policy.gate.scout
+        count, scout = self.plan.gating_states, self.policy.gate.scout
         expect = None if scout is None else scout.expect
         rows, importance = choose_rows(observed, np.flatnonzero(differ), count, self.recipe.focus, expect)
         other = other_count(engine.reward.harm_count)
@@ -180,11 +181,11 @@ class ModesModel(CounterfactualModel):
                 descend(gate.optimizer, gate.scout.loss(*(array[batch] for array in arrays)))
         if len(rows):
             regret = np.take_along_axis(more[rows], gate.choose(seen[rows])[:, np.newaxis], axis=1)
-            self.logger.record("gate/regret", float((regret[:, 0] * importance[rows]).mean()))
+            self.logger.record("gating/regret", float((regret[:, 0] * importance[rows]).mean()))
         if int(gate.compared) == 0:
             return
         losses = []
-        for _ in range(self.plan.gate_steps):
+        for _ in range(self.plan.gating_steps):
             inputs, costlier = gate.recall(self.recipe.batch_size)
             scores = gate.learning(inputs)
             best = scores.gather(1, costlier.argmin(dim=1, keepdim=True))
@@ -192,4 +193,4 @@ class ModesModel(CounterfactualModel):
             descend(gate.optimizer, loss)
             follow(gate.average.parameters(), gate.learning, self.recipe.averaging)
             losses.append(loss.item())
-        self.logger.record("gate/loss", float(np.mean(losses)))
+        self.logger.record("gating/loss", float(np.mean(losses)))

@@ -1,4 +1,4 @@
-"""The recipe's key ``modes``: how a mixture of experts is trained."""
+"""The recipe's key ``experts``: how a mixture of experts is trained."""
 
 from __future__ import annotations
 
@@ -11,53 +11,49 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 class Shares(FileModel):
     """Share, 0 to 1, of all updates that each stage of training a mixture of experts has; the shares sum to 1."""
 
-    alone: Fraction  # share for the first expert, in all worlds
-    further: Fraction  # share for the further experts, one after the other, each in worlds of its own
-    gate: Fraction  # share for the gating network, which chooses an expert at each decision
-    together: Fraction  # share for all experts and the gate; each expert learns where the gate chooses it
+    pretraining_first: Fraction  # share for the first expert, in all worlds
+    pretraining_others: Fraction  # share for the other experts, one after the other, each in worlds of its own
+    gating: Fraction  # share for the gating network, which chooses an expert at each decision
+    joint: Fraction  # share for all experts and the gating network; each expert learns where it is chosen
 
     @model_validator(mode="after")
     def _everything(self) -> Shares:
-        total = self.alone + self.further + self.gate + self.together
+        total = self.pretraining_first + self.pretraining_others + self.gating + self.joint
         if not abs(total - 1.0) <= 1e-9:
-            raise ValueError(f"alone, further, gate and together are {total:g} in all; must be 1")
+            raise ValueError(f"the sum of the shares is {total:g}; must be 1")
         return self
 
 
-class ModesPlan(FileModel):
-    """Settings of a mixture of experts: several networks that drive, and a gate that chooses one at each decision.
+class ExpertsPlan(FileModel):
+    """Settings of a mixture of experts: several networks that drive, and a gating network that chooses one of them.
 
-    A further expert first imitates templates (random braking profiles) in worlds where one of them does better than all
-    networks before. It is then trained in worlds of its own, those in which it is hardly worse than these networks.
+    Each expert after the first is pre-trained in two steps. It imitates templates (random braking profiles) in worlds
+    where one of them does better than all experts before. It is then trained in worlds of its own: those in which it is
+    hardly worse than these experts.
     """
 
-    networks: int = Field(ge=2, le=16, description="how many")  # number of networks (experts)
-    gate: Layers = Field(description="hidden layers of the gate")
-    # Number of worlds, from the first of the training on, in which templates are compared with the networks so far.
-    worlds: int = Field(ge=1, le=1_000_000, description="worlds of the training in which a mode is looked for")
-    # Number of templates (random braking profiles) that are drawn in each of these worlds.
-    templates: int = Field(ge=1, le=100_000, description="how many templates are drawn in each of them")
-    # A template is imitated if its return exceeds the return of every earlier network by more than this.
+    networks: int = Field(ge=2, le=16, description="number of experts")
+    gating: Layers = Field(description="hidden layers of the gating network")
+    # Number of worlds, the first of the training, in which templates are compared with the experts so far.
+    worlds: int = Field(ge=1, le=1_000_000, description="worlds in which templates are compared with the experts")
+    templates: int = Field(ge=1, le=100_000, description="templates (random braking profiles) drawn in each world")
+    # A template is imitated if its return exceeds the return of every earlier expert by more than this.
     gain: NonNegative = Field(
-        description="return by which a template must be better than every network before, to be imitated"
+        description="a template is imitated if its return exceeds that of every earlier expert by this"
     )
-    # A world belongs to a new network if its return there is at most this much below the best earlier network.
+    # A world belongs to a new expert if its return there is at most this much below the best earlier expert.
     margin: Positive = Field(
-        description="return by which a network may be worse than those before it in a world of its own"
+        description="an expert is trained in worlds where its return is at most this below the best earlier expert"
     )
-    # Number of passes over the decisions of the imitated templates.
-    imitation_epochs: int = Field(ge=1, le=1000, description="how often the shown decisions are gone through")
-    # Number of decisions in each update at which every network is played to the end, for the gate to learn from.
-    gate_states: int = Field(
-        ge=1, le=1_000_000, description="decisions of an update at which the networks are compared"
-    )
-    # Number of such decisions that the gate keeps in memory.
-    gate_memory: int = Field(ge=1, le=1_000_000, description="how many compared decisions are remembered")
-    gate_steps: int = Field(ge=1, le=100_000, description="steps of the gate's optimiser in each update")
+    imitation_epochs: int = Field(ge=1, le=1000, description="passes over the decisions of the imitated templates")
+    # Number of decisions in each update at which every expert is played to the end, for the gating network to learn.
+    gating_states: int = Field(ge=1, le=1_000_000, description="decisions of an update at which experts are compared")
+    gating_memory: int = Field(ge=1, le=1_000_000, description="compared decisions that are kept in memory")
+    gating_steps: int = Field(ge=1, le=100_000, description="gradient steps of the gating network in each update")
     # Weight, in that comparison, of harm under the count that the reward does not use (first impacts or all).
-    tie_break: NonNegative = Field(description="weight of the other count's harm in that comparison")
-    # Factor on the learning rate in the last stage, in which all networks learn.
-    together_rate: Rate = Field(
-        description="share of the learning rate in the last stage, where noise undoes what was learned"
+    tie_break: NonNegative = Field(
+        description="weight, in this comparison, of harm in the count that the reward does not use"
     )
-    shares: Shares = Field(description="share of all updates that each stage has, 1 in all")
+    # Factor on the learning rate in the last stage, in which all networks learn.
+    joint_rate: Rate = Field(description="factor on the learning rate in the last stage, in which all networks learn")
+    shares: Shares = Field(description="share of all updates that each stage has; their sum is 1")

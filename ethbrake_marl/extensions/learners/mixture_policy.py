@@ -13,44 +13,42 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
-from ethbrake_marl.extensions.learners.gating_network import AveragedGate
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.gating_network import AveragedGatingNetwork
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.training.networks import tensors_of_layers
 
 
-class ModesPolicy(Deterministic):
+class ExpertsPolicy(Deterministic):
     """Mixture of experts: at each decision a gating network chooses which of several actors (experts) acts.
 
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
         rate: learning rate as a function of the remaining share of the training, from 1 to 0.
-        recipe: recipe with the key ``modes``.
+        recipe: recipe with the key ``experts``.
 
     """
 
-    def __init__(
-        self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: CounterfactualRecipe
-    ) -> None:
+    def __init__(self, observation_space: Space[Any], action_space: Any, rate: Schedule, recipe: VineRecipe) -> None:
         super().__init__(observation_space, action_space)
-        assert recipe.modes is not None
-        networks = range(recipe.modes.networks)
+        assert recipe.experts is not None
+        networks = range(recipe.experts.networks)
         self.actors = [AveragedActor(observation_space, action_space, rate, recipe) for _ in networks]
         self.members = nn.ModuleList(self.actors)
-        self.gate = AveragedGate(flatdim(observation_space), rate, recipe)
+        self.gate = AveragedGatingNetwork(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """Return for each observation [rows, F] one value, [rows], from the actor that the gate chooses for it.
+        """Return for each observation [rows, F] one value, [rows], from the actor that the gating network chooses.
 
         ``ask`` is a method of the actors from observations to values, such as ``AveragedActor.means``.
         """
-        chosen, found = self.gate.choose(observation), np.empty(len(observation))
+        chosen, values = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):
             rows = np.flatnonzero(chosen == number)
-            found[rows] = ask(actor, observation[rows])
-        return found
+            values[rows] = ask(actor, observation[rows])
+        return values
 
     def means(self, observation: Float32s) -> Float32s:
         return self._chosen(observation, AveragedActor.means).astype(np.float32)  # lossless: the means are float32
@@ -59,12 +57,12 @@ class ModesPolicy(Deterministic):
         return self._chosen(observation, AveragedActor.expect)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        found = tensors_of_layers("gate", self.gate.average)
+        tensors = tensors_of_layers("gate", self.gate.average)
         for name, actor in zip(network.actors, self.actors, strict=True):
-            found |= tensors_of_layers(
+            tensors |= tensors_of_layers(
                 name, nn.Sequential(*actor.mlp_extractor["policy_net"].children(), actor.action_net)
             )
-        return found
+        return tensors
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the actions [rows, 1] of the averaged networks for observations [rows, F]."""

@@ -5,34 +5,36 @@ from __future__ import annotations
 import math
 from typing import Literal, NamedTuple
 
-from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 
 ROUNDING = 1e-6  # tolerance for rounding in sums of shares, in updates
+
+
+Trains = Literal["first", "other", "gating", "joint"]
 
 
 class Stage(NamedTuple):
     """One stage of training a mixture of experts: a range of updates, and what they train."""
 
-    # The first expert (``alone``), a further expert, the gating network (``gate``), or all of them ``together``.
-    does: Literal["alone", "further", "gate", "together"]
-    network: int  # index of the expert that a stage ``further`` trains, from 1; 0 in other stages
+    trains: Trains  # the first expert, one of the others, the gating network, or all networks jointly
+    network: int  # index of the expert that a stage ``other`` trains, from 1; 0 in other stages
     first: int  # first update, counted from 0
     end: int  # first update after the stage
 
 
-def stages_of(plan: ModesPlan, updates: int) -> tuple[Stage, ...]:
+def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
     """Return the stages of a training with this number of updates, in order; a stage may be empty.
 
-    ``plan`` is the key ``modes`` of the recipe, with the share of each stage.
+    ``plan`` is the key ``experts`` of the recipe, with the share of each stage.
     """
-    shares, more = plan.shares, plan.networks - 1
-    parts: list[tuple[Literal["alone", "further", "gate", "together"], int, float]] = [("alone", 0, shares.alone)]
-    parts += [("further", k + 1, shares.further / more) for k in range(more)]
-    parts += [("gate", 0, shares.gate), ("together", 0, shares.together)]
-    found, done, first = [], 0.0, 0
-    for does, network, share in parts:
+    shares, others = plan.shares, plan.networks - 1
+    parts: list[tuple[Trains, int, float]] = [("first", 0, shares.pretraining_first)]
+    parts += [("other", k + 1, shares.pretraining_others / others) for k in range(others)]
+    parts += [("gating", 0, shares.gating), ("joint", 0, shares.joint)]
+    stages, done, first = [], 0.0, 0
+    for trains, network, share in parts:
         done += share
         end = min(math.ceil(done * updates - ROUNDING), updates)
-        found.append(Stage(does, network, first, end))
+        stages.append(Stage(trains, network, first, end))
         first = end
-    return tuple(found)
+    return tuple(stages)

@@ -15,7 +15,7 @@ from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.engine.state import State
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, counted_harm, play_on, play_to_the_end
-from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 from ethbrake_marl.extensions.search.problem import minimising
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.actions import command_to_action
@@ -43,12 +43,12 @@ class Shown(NamedTuple):
     action: Float32s  # [m] actions in [-1, 1]
 
 
-def explore(engine: Engine, plan: ModesPlan, acts: Sequence[Act], gamma: float) -> Explored:
+def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
     """Let every expert drive the first ``plan.worlds`` worlds of the training, and return the best results.
 
     Args:
         engine: engine of the training; it is not changed.
-        plan: the key ``modes`` of the recipe.
+        plan: the key ``experts`` of the recipe.
         acts: function of each expert from observations [rows, F] to actions [rows].
         gamma: discount of one time step.
 
@@ -83,32 +83,32 @@ def drive_from(
     return gained, counted_harm(rows, engine.reward.harm_count if count is None else count)[:, 0]
 
 
-def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: float, seed: int) -> Shown:
+def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
     """Draw templates (random braking profiles), and return the actions of those that do better than all experts.
 
     In each world the best of ``plan.templates`` is taken, if its return exceeds every expert's by ``plan.gain``.
 
     Args:
         engine: engine of the training; it is not changed.
-        plan: the key ``modes`` of the recipe.
-        found: worlds and results of the experts, from ``explore``.
+        plan: the key ``experts`` of the recipe.
+        explored: worlds and results of the experts, from ``explore``.
         gamma: discount of one time step.
         seed: seed of the templates.
 
     """
     (vehicle,) = engine.learners
     problem = profile_problem(
-        found.alert,
+        explored.alert,
         [vehicle],
         harm_count=engine.reward.harm_count,
         horizon_s=engine.scenario.horizon_s,
         time_step_s=engine.scenario.time_step_s,
-        others_mps2=found.start.wanted,
+        others_mps2=explored.start.wanted,
     )
-    problem = minimising(problem, found.alert, engine.reward.objective or "total", [vehicle])
-    commands, steps = best_templates(problem, found.harm, number=plan.templates, seed=seed)
+    problem = minimising(problem, explored.alert, engine.reward.objective or "total", [vehicle])
+    commands, steps = best_templates(problem, explored.harm, number=plan.templates, seed=seed)
     rows = np.flatnonzero(steps > 0)
-    worlds = found.alert.take(rows).vehicles
+    worlds = explored.alert.take(rows).vehicles
     each = [command_to_action(commands[rows, t], worlds, vehicle) for t in range(commands.shape[1])]
     actions = np.stack(each, axis=1)  # [rows, T]
     seen_then: list[Observations] = []
@@ -120,16 +120,16 @@ def show_templates(engine: Engine, plan: ModesPlan, found: Explored, gamma: floa
         wanted: Floats = actions[some, number][:, np.newaxis]
         return wanted
 
-    gained = play_on(engine.branch(found.start.take(rows)), decide, gamma)[:, 0]
-    better: Bools = gained > found.gained[rows] + plan.gain
+    gained = play_on(engine.branch(explored.start.take(rows)), decide, gamma)[:, 0]
+    better: Bools = gained > explored.gained[rows] + plan.gain
     if not where:
         return Shown(np.zeros((0, engine.observation.size), np.float32), np.zeros(0, np.float32))
     wanted = np.concatenate([actions[some, number] for number, some in enumerate(where)]).astype(np.float32)
-    kept = better[np.concatenate(where)]
-    return Shown(np.concatenate(seen_then)[kept], wanted[kept])
+    shown = better[np.concatenate(where)]
+    return Shown(np.concatenate(seen_then)[shown], wanted[shown])
 
 
-def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma: float) -> State:
+def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, gamma: float) -> State:
     """Return the starting states of the worlds in which a new expert is to be trained.
 
     These are the worlds in which its return is at most ``plan.margin`` below the best of the earlier experts. Worlds in
@@ -138,20 +138,17 @@ def own_worlds(engine: Engine, plan: ModesPlan, found: Explored, act: Act, gamma
 
     Args:
         engine: engine of the training; it is not changed.
-        plan: the key ``modes`` of the recipe.
-        found: worlds and results of the earlier experts, from ``explore``.
+        plan: the key ``experts`` of the recipe.
+        explored: worlds and results of the earlier experts, from ``explore``.
         act: the new expert, from observations [rows, F] to actions [rows].
         gamma: discount of one time step.
 
     """
-    gained, _ = drive_from(engine, found.start, act, gamma)
-    more = gained - found.gained
-    rows = np.flatnonzero((more > -plan.margin) & (np.abs(more) > NO_DIFFERENCE) & (found.harm > 0.0))
-    return found.start.take(rows)
+    gained, _ = drive_from(engine, explored.start, act, gamma)
+    more = gained - explored.gained
+    rows = np.flatnonzero((more > -plan.margin) & (np.abs(more) > NO_DIFFERENCE) & (explored.harm > 0.0))
+    return explored.start.take(rows)
 
 
-class NoOtherMode(EthBrakeError, ValueError):
-    """Raised if no template (random braking profile) does better than the experts so far.
-
-    A further expert would then have nothing to learn.
-    """
+class NoBetterTemplate(EthBrakeError, ValueError):
+    """No template (random braking profile) does better than the experts so far, so another has nothing to learn."""

@@ -32,8 +32,8 @@ Holds = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict
 
 Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # with 1 the average would never change
 
-AVERAGING = "share of itself that the average of the weights, which drives, keeps in each gradient step"
+AVERAGING = "share of the averaged weights that a gradient step keeps; the average is what drives"
 
-NO_SHAPING = "must be 0: what is tried is played to the end, where shaping tells nothing more"
+NO_SHAPING = "must be 0: tried actions are played to the end of the episode, where shaping adds nothing"
 
 Focus = Annotated[float, Field(ge=0.0, le=0.99, exclude_if=not_)]

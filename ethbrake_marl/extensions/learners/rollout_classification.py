@@ -1,6 +1,6 @@
 """The algorithm rollout classification: try several actions at a decision and learn to choose the cheapest one.
 
-Source: Lagoudakis and Parr 2003. Recipes call it ``algorithm: options``.
+Source: Lagoudakis and Parr 2003, Reinforcement Learning as Classification.
 """
 
 from __future__ import annotations
@@ -8,29 +8,29 @@ from __future__ import annotations
 from typing import Any
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.rollout_classification_model import OptionsModel
-from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
+from ethbrake_marl.extensions.learners.rollout_classification_model import RolloutClassificationModel
+from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
 from ethbrake_marl.extensions.learners.start_weights import padded
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.training import Training
 
 
-class Options(Algorithm):
+class RolloutClassification(Algorithm):
     """The algorithm rollout classification, with one actor for all learners."""
 
-    def build(self, training: Training, environment: EthBrakeVecEnv) -> OptionsModel:
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
         """Return a new model for a training, which learns in ``environment``.
 
-        Before it learns, it brakes fully, or acts as the first policy of the recipe's key ``among``.
+        Before it learns, it brakes fully, or acts as the first policy of the recipe's key ``policies``.
         """
         recipe = training.recipe
-        assert isinstance(recipe, OptionsRecipe)
+        assert isinstance(recipe, RolloutClassificationRecipe)
         environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
-        among = [padded(policy, training, "among") for policy in recipe.policies]
-        return OptionsModel(environment, recipe, among)
+        weights = [padded(policy, training, "policies") for policy in recipe.loaded_policies]
+        return RolloutClassificationModel(environment, recipe, weights)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
-        found: dict[str, Float32s] = actor.tensors(network)
-        return found
+        tensors: dict[str, Float32s] = actor.tensors(network)
+        return tensors

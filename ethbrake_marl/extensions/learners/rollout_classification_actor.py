@@ -16,7 +16,7 @@ from torch.nn.functional import softplus
 
 from ethbrake_marl.extensions.learners.averaged_actor import Deterministic
 from ethbrake_marl.extensions.learners.optimizer import adam
-from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
+from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
 from ethbrake_marl.extensions.learners.scout import draw_rows
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.actor import Actor
@@ -38,17 +38,17 @@ class _TorchActor(Actor):
         for number, (weight, bias) in enumerate(layers, start=1):
             y = torch.addmm(torch.from_numpy(bias)[:, None], torch.from_numpy(weight), y)
             y = y if number == len(layers) else activation(y)
-        found: Float32s = y.numpy()
-        return found
+        outputs: Float32s = y.numpy()
+        return outputs
 
 
 class ChoosingActor(Deterministic):
-    """Actor whose network scores a number of options; it takes the option with the highest score.
+    """Actor whose network scores a number of choices; it takes the choice with the highest score.
 
-    The first ``first`` options are policies, which then choose the action; the others are actions, evenly from -1 to 1.
+    The first ``first`` choices are policies, which then act; the others are actions, evenly spaced from -1 to 1.
     The network ``learning`` is in training; ``average``, with the running average of its weights, drives.
 
-    The memory of M places holds the last decisions at which C options were tried, and how much more each cost than the
+    The memory of M places holds the last decisions at which C choices were tried, and how much more each cost than the
     best one. F is the number of features.
 
     Args:
@@ -56,29 +56,29 @@ class ChoosingActor(Deterministic):
         action_space: Gymnasium space of an action.
         rate: learning rate as a function of the remaining share of the training, from 1 to 0.
         recipe: the recipe.
-        among: for each trained policy that the actor can choose instead of an action, its weights by name.
+        policies: for each trained policy that the actor can choose instead of an action, its weights by name.
         members: number of scenarios in the training's mixture; 1 without a mixture.
 
     """
 
     seen: Tensor  # [M, F] observations in memory
-    tried: Tensor  # [M, C] numbers of the tried options; the actor itself took the first of the C
-    more: Tensor  # [M, C] extra cost of each tried option over the best one
+    tried: Tensor  # [M, C] numbers of the tried choices; the actor itself took the first of the C
+    more: Tensor  # [M, C] extra cost of each tried choice over the best one
     known: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
-    usual: Tensor  # [members] mean cost of the best tried option in each scenario of a mixture; 0: not measured yet
+    usual: Tensor  # [members] mean cost of the best tried choice in each scenario of a mixture; 0: not measured yet
 
     def __init__(
         self,
         observation_space: Space[Any],
         action_space: Any,
         rate: Schedule,
-        recipe: OptionsRecipe,
-        among: Sequence[Mapping[str, Float32s]],
+        recipe: RolloutClassificationRecipe,
+        policies: Sequence[Mapping[str, Float32s]],
         members: int,
     ) -> None:
         super().__init__(observation_space, action_space)
         inputs, shape, room = flatdim(observation_space), recipe.network, (recipe.memory, 1 + recipe.others)
-        self.first, scores = len(among), len(among) + shape.choices  # numbers below ``first`` stand for policies
+        self.first, scores = len(policies), len(policies) + shape.choices  # numbers below ``first`` stand for policies
         layers = create_mlp(inputs, scores, list(shape.policy), ACTIVATIONS[shape.activation])
         nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, all scores are equal and it
         nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # takes number 0: a policy, or full braking
@@ -86,8 +86,8 @@ class ChoosingActor(Deterministic):
         self.learning = copy.deepcopy(self.average)
         self.optimizer = adam(rate(1.0), self.learning)
         spec = recipe.network_spec(inputs)
-        tensors = {f"among_{m}.{name}": each[name] for m, each in enumerate(among, 1) for name in each}
-        self._among = tuple(tensors)
+        tensors = {f"among_{m}.{name}": each[name] for m, each in enumerate(policies, 1) for name in each}
+        self._names = tuple(tensors)  # of the tensors of the policies
         for name, tensor in tensors.items():
             self.register_buffer(name.replace(".", "_"), torch.from_numpy(tensor))
         chooser = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors if row.name not in tensors}
@@ -100,7 +100,7 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Return the number of the option with the highest score, [rows], for each of the observations [rows, F].
+        """Return the number of the choice with the highest score, [rows], for each of the observations [rows, F].
 
         Numbers below the attribute ``first`` stand for policies. The other numbers stand for actions, evenly spread:
         ``first`` is the action -1, and the largest number is the action 1.
@@ -109,24 +109,24 @@ class ChoosingActor(Deterministic):
         return chosen
 
     def act(self, observation: Float32s) -> Float32s:
-        found: Float32s = self.take(self.choose(observation), observation.T)[0]
-        return found
+        actions: Float32s = self.take(self.choose(observation), observation.T)[0]
+        return actions
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the actions [rows, 1] of the averaged network for observations [rows, F]."""
         return torch.from_numpy(self.act(observation.numpy()))[:, None]
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        among = {name: copy_of(self.get_buffer(name.replace(".", "_"))) for name in self._among}
-        return {**tensors_of_layers("policy", self.average), **among}
+        of_policies = {name: copy_of(self.get_buffer(name.replace(".", "_"))) for name in self._names}
+        return {**tensors_of_layers("policy", self.average), **of_policies}
 
     def remember(self, seen: Float32s, tried: Ints, more: Floats) -> None:
         """Add m decisions to the memory.
 
         Args:
             seen: [m, F] observations.
-            tried: [m, C] numbers of the tried options, as from ``choose``; the actor itself took the first of the C.
-            more: [m, C] extra cost of each tried option over the best one.
+            tried: [m, C] numbers of the tried choices, as from ``choose``; the actor itself took the first of the C.
+            more: [m, C] extra cost of each tried choice over the best one.
 
         """
         places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
@@ -171,5 +171,5 @@ class ChoosingActor(Deterministic):
         scores = self.learning(self.seen[some]).gather(1, self.tried[some])
         best = scores.gather(1, more.argmin(dim=1, keepdim=True))
         expected = (scores.softmax(dim=1) * more).sum(dim=1)
-        found: Tensor = (importance * (expected + guide * (more * softplus(scores - best)).sum(dim=1))).mean()
-        return found
+        loss: Tensor = (importance * (expected + guide * (more * softplus(scores - best)).sum(dim=1))).mean()
+        return loss

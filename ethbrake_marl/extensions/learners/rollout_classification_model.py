@@ -13,8 +13,8 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.branches import counted_harm, moving_rows, other_count, play_on
 from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.rollout_classification_actor import ChoosingActor
-from ethbrake_marl.extensions.learners.rollout_classification_recipe import OptionsRecipe
-from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.rollout_classification_recipe import RolloutClassificationRecipe
+from ethbrake_marl.extensions.learners.vine_model import VineModel
 from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
@@ -28,23 +28,26 @@ USUAL_KEPT = 0.98  # share of itself that the running mean of costs keeps in eac
 LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with almost no harm
 
 
-class OptionsModel(CounterfactualModel):
+class RolloutClassificationModel(VineModel):
     """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs.
 
     Args:
         environment: environment of the training.
         recipe: the recipe.
-        among: for each trained policy that the actor can choose instead of an action, its weights by name.
+        policies: for each trained policy that the actor can choose instead of an action, its weights by name.
 
     """
 
     policy: ChoosingActor  # type: ignore[assignment]
-    recipe: OptionsRecipe  # type: ignore[assignment]
+    recipe: RolloutClassificationRecipe  # type: ignore[assignment]
 
     def __init__(
-        self, environment: EthBrakeVecEnv, recipe: OptionsRecipe, among: Sequence[Mapping[str, Float32s]]
+        self,
+        environment: EthBrakeVecEnv,
+        recipe: RolloutClassificationRecipe,
+        policies: Sequence[Mapping[str, Float32s]],
     ) -> None:
-        self._among = among
+        self._policies = policies
         super().__init__(environment, recipe)  # type: ignore[arg-type]  # it has all keys that the base class reads
 
     def _setup_model(self) -> None:
@@ -52,22 +55,22 @@ class OptionsModel(CounterfactualModel):
         self.set_random_seed(self.seed)
         members = len(as_scenario(self.engine.scenario).members) or 1
         self.policy = ChoosingActor(
-            self.observation_space, self.action_space, self.lr_schedule, self.recipe, self._among, members
+            self.observation_space, self.action_space, self.lr_schedule, self.recipe, self._policies, members
         )
 
-    def _update(self, told: BaseCallback, total: int) -> None:
+    def _update(self, callback: BaseCallback, total: int) -> None:
         recipe, actor = self.recipe, self.policy
-        seen, moments = self._visit(told, actor.act)
-        told.on_rollout_end()
+        seen, moments = self._visit(callback, actor.act)
+        callback.on_rollout_end()
         self._update_current_progress_remaining(self.num_timesteps, total)
         self._update_learning_rate(actor.optimizer)
         observed, tried, costs = self._try_actions(seen, moments)
         more = costs - costs.min(axis=1, keepdims=True)
-        telling = np.flatnonzero(more.max(axis=1) > 1e-9)
+        differ = np.flatnonzero(more.max(axis=1) > 1e-9)  # decisions at which the choice matters
         more = np.minimum(more, recipe.largest_cost)
-        actor.remember(observed[telling], tried[telling], more[telling])
+        actor.remember(observed[differ], tried[differ], more[differ])
         self.logger.record("train/regret", float(more[:, 0].mean()) if len(more) else 0.0)
-        self.logger.record("train/telling", len(telling))
+        self.logger.record("train/differ", len(differ))
         losses = []
         steps = recipe.gradient_steps if int(actor.known) else 0
         for some, importance in actor.draw(steps, recipe.batch_size, recipe.focus):
@@ -79,14 +82,14 @@ class OptionsModel(CounterfactualModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try several options (actions, or policies that act) at some visited decisions, each to the episode's end.
+        """Try several choices (actions, or policies that act) at some visited decisions, each to the episode's end.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
 
-        Returns for B decisions and C options at each: observations [B, F], numbers of the options [B, C] as from
-        ``ChoosingActor.choose``, and their costs [B, C]. The first option is the one that the actor takes. A cost is
+        Returns for B decisions and C choices at each: observations [B, F], numbers of the choices [B, C] as from
+        ``ChoosingActor.choose``, and their costs [B, C]. The first choice is the one that the actor takes. A cost is
         minus the return, changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
 
         """
@@ -129,13 +132,13 @@ class OptionsModel(CounterfactualModel):
         other = other_count(engine.reward.harm_count)
         before = counted_harm(engine, other)
         gained = play_on(engine, decide, recipe.gamma, at_least=max(recipe.holds))
-        found = -gained[np.arange(len(row)), learner]
+        cost = -gained[np.arange(len(row)), learner]
         if recipe.tie_break:
-            found += recipe.tie_break * (counted_harm(engine, other) - before)[np.arange(len(row)), learner]
-        costs = found[back].reshape(tried.shape)
+            cost += recipe.tie_break * (counted_harm(engine, other) - before)[np.arange(len(row)), learner]
+        costs = cost[back].reshape(tried.shape)
         if recipe.caution:
             done = 1.0 - self._current_progress_remaining
-            costs += recipe.caution * done * np.maximum(costs - found[len(each) :, np.newaxis], 0.0)
+            costs += recipe.caution * done * np.maximum(costs - cost[len(each) :, np.newaxis], 0.0)
         good = np.isfinite(costs).all(axis=1)
         rows, tried, costs = rows[good], tried[good], costs[good]
         if recipe.relative and len(rows):
@@ -147,7 +150,7 @@ class OptionsModel(CounterfactualModel):
 
         Args:
             rows: [B] indices of the decisions' worlds among all visited worlds.
-            least: [B] cost of the best tried option at each decision.
+            least: [B] cost of the best tried choice at each decision.
 
         The result [B] has a lower limit, so that costs can be divided by it.
 
@@ -165,5 +168,5 @@ class OptionsModel(CounterfactualModel):
         for m in np.unique(member):
             mean = float(least[member == m].mean())
             usual[m] = USUAL_KEPT * usual[m] + (1.0 - USUAL_KEPT) * mean if usual[m] else mean
-        found: Floats = np.maximum(usual[member], LEAST_USUAL)
-        return found
+        divisors: Floats = np.maximum(usual[member], LEAST_USUAL)
+        return divisors

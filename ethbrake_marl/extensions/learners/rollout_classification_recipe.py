@@ -1,4 +1,4 @@
-"""The recipe of rollout classification (``algorithm: options``)."""
+"""The recipe of the algorithm ``rollout-classification``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ class ChoosingShape(Shape):
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
-    choices: int = Field(ge=2, le=4096, description="how many actions, evenly from -1 to 1, the network scores")
+    choices: int = Field(
+        ge=2, le=4096, description="number of actions that the network scores, evenly spaced from -1 to 1"
+    )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
         """Return the description of the network in a policy bundle: an actor that takes the action of highest score.
@@ -36,13 +38,13 @@ class ChoosingShape(Shape):
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
-PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
+PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+@.+$", max_length=4096)]
 
 
-class OptionsRecipe(TrainingRecipe):
+class RolloutClassificationRecipe(TrainingRecipe):
     """Recipe of rollout classification: the policy learns from several actions, each tried to the end of its episode.
 
-    It learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the policies ``among``. In
+    It learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the ``policies``. In
     a round (``n_envs x n_steps`` decisions, then an update), ``tried`` of the decisions are tried with: the action that
     the policy takes; one below and one above it for each distance of ``near``; the actions ``fixed``; and ``drawn``
     random ones (policies if there are any, else actions). The *cost* of an action is minus the return after it.
@@ -50,35 +52,33 @@ class OptionsRecipe(TrainingRecipe):
 
     most_decisions = 2**22
 
-    algorithm: Literal["options"]
-    # Trained policies, each of which can act at a decision. One that chooses among policies is replaced by those.
-    among: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
-        (), description="policies of which one can act at each decision; one that chooses among others stands for them"
+    algorithm: Literal["rollout-classification"]
+    # Trained policies that the network can choose instead of an action. A policy that itself chooses between policies
+    # is replaced by these.
+    policies: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
+        (), description="trained policies, one of which can be chosen to act at a decision; left out: none"
     )
     # Number of consecutive decisions in each world between two updates.
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
-    tried: int = Field(ge=1, description="how many of the decisions of a round are tried with other actions")
+    tried: int = Field(ge=1, description="decisions of a round that are tried with other actions")
     # Ranges of distances; from each, one is drawn, and the actions this far below and above the taken one are tried.
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)] = Field(
-        description="ranges of distances to the action taken, each tried below and above it; the logarithm drawn is"
-        " uniform"
+        description="ranges of distances, drawn uniformly in the logarithm; the actions this far below and above the"
+        " policy's are tried"
     )
     # Actions that are tried at every such decision; each is rounded to the nearest of the ``choices`` of the network.
     fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)] = Field(
-        description="actions tried at each of these decisions, from -1 (full braking) to 1; the nearest of the choices"
-        " is"
+        description="actions tried at each of these decisions, -1 (full braking) to 1; rounded to the network's choices"
     )
-    # Number of random options that are tried: policies of ``among``, or if it is empty actions.
+    # Number of random choices that are tried: ``policies``, or actions if there are none.
     drawn: int = Field(
-        ge=0,
-        le=16,
-        description="how many more are tried there: of the policies among, or where there are none of the choices",
+        ge=0, le=16, description="number of random choices tried as well: policies, or actions if there are none"
     )
     # Numbers of steps, one of which is drawn at each decision; a tried action is held for so long.
-    holds: Holds = Field(description="for how many steps an action is tried, one of these")
+    holds: Holds = Field(description="numbers of steps, one of which is drawn; a tried action is held for so long")
     # Upper limit of an action's extra cost over the best tried action, so that rare large costs do not dominate.
     largest_cost: Positive = Field(
-        description="an action that costs more than this beyond the best one counts as this much more"
+        description="largest extra cost of an action over the best one; larger ones are cut to it"
     )
     # Factor, growing from 0 to this value during the training, of an additional cost: by how much more an action costs
     # than braking fully from this decision on.
@@ -87,8 +87,7 @@ class OptionsRecipe(TrainingRecipe):
         ge=0.0,
         allow_inf_nan=False,
         exclude_if=not_,
-        description="how many times the excess over full braking from there on counts besides, at the end; it grows"
-        " from 0",
+        description="weight of an action's extra cost over full braking from there on; grows from 0 to this at the end",
     )
     # Weight, in the cost, of the line's harm under the count that the reward does not use (first impacts or all).
     tie_break: float = Field(
@@ -96,23 +95,25 @@ class OptionsRecipe(TrainingRecipe):
         ge=0.0,
         allow_inf_nan=False,
         exclude_if=not_,
-        description="weight of the whole line's harm in the other count, beside the reward",
+        description="weight of the line's harm in the count that the reward does not use",
     )
     # Whether costs are divided by the mean cost in the same scenario of a mixture, so that all scenarios count alike.
     relative: bool = Field(
-        False, exclude_if=not_, description="true: in a mixture, costs count beside the usual ones of the same scenario"
+        False,
+        exclude_if=not_,
+        description="true: in a mixture, costs are divided by the mean cost in the same scenario",
     )
     # Share of the decisions to learn from that are drawn in proportion to how much the tried actions differ in cost.
-    focus: Focus = Field(0.0, description="share of what is learned from that is drawn where a choice matters most")
+    focus: Focus = Field(
+        0.0, description="share of the decisions to learn from that are drawn where the costs differ most"
+    )
     # Weight of a convex term in the loss, which keeps gradients alive where the policy is nearly certain.
     guide: NonNegative = Field(
-        description="weight of the convex part of the loss, without which learning can stand still at the beginning"
+        description="weight of the convex part of the loss, without which learning can stall at the beginning"
     )
     # Number of decisions in memory, from which the network learns: the latest with a difference between the costs.
     memory: int = Field(
-        ge=1,
-        le=500_000,
-        description="how many decisions are learned from: the last ones at which the tried actions differ in cost",
+        ge=1, le=500_000, description="decisions to learn from: the last ones at which the tried actions differ in cost"
     )
     gradient_steps: int = Field(ge=1, le=100_000, description="steps of the optimiser in one update")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
@@ -120,7 +121,7 @@ class OptionsRecipe(TrainingRecipe):
     network: ChoosingShape = Field(description=NETWORK)
 
     @model_validator(mode="after")
-    def _keys_fit(self) -> OptionsRecipe:
+    def _keys_fit(self) -> RolloutClassificationRecipe:
         if self.reward.shaping > 0.0:
             refuse(("reward", "shaping"), self.reward.shaping, NO_SHAPING)
         visited = self.n_envs * self.n_steps
@@ -129,7 +130,7 @@ class OptionsRecipe(TrainingRecipe):
         if not self.memory >= self.tried:
             refuse(("memory",), self.memory, f"must be at least tried = {self.tried}")
         if not self.others:
-            refuse(("near",), list(self.near), "must hold a range where there are neither fixed nor drawn actions")
+            refuse(("near",), list(self.near), "must hold a range if there are neither fixed nor drawn actions")
         return self
 
     @property
@@ -143,35 +144,39 @@ class OptionsRecipe(TrainingRecipe):
         ``observation_size`` is the number of features of an observation.
         """
         several = {"observation_size": observation_size, "value_hidden": ()}
-        among = tuple(each.manifest.network.model_copy(update=several) for each in self.policies)
-        return self.network.spec(observation_size, among=among)
+        networks = tuple(each.manifest.network.model_copy(update=several) for each in self.loaded_policies)
+        return self.network.spec(observation_size, among=networks)
 
     @cached_property
-    def policies(self) -> tuple[Policy, ...]:
-        """The policies that the key ``among`` names, loaded once.
+    def loaded_policies(self) -> tuple[Policy, ...]:
+        """The policies that the key ``policies`` names, loaded once.
 
-        A policy that itself chooses among policies is replaced by those.
+        A policy that itself chooses between policies is replaced by these.
 
         Raises ``InvalidInput`` with the name of a policy that cannot be used.
         """
-        found: list[Policy] = []
-        for name in self.among:
+        loaded: list[Policy] = []
+        for name in self.policies:
             kind, _, path = name.partition("@")
             policy = load_named_policy(path)
-            where, by = f"recipe {self.name!r}: among: {name}", policy.manifest.algorithm
+            where, by = f"recipe {self.name!r}: policies: {name}", policy.manifest.algorithm
             if path == SHIPPED or kind not in ("policy", by):
                 raise InvalidInput(f"{where}: give policy@shipped/NAME, or {by}@ and its path")
-            found += policy.among or [policy]
-        if found and not self.drawn <= len(found):
-            raise InvalidInput(f"recipe {self.name!r}: drawn = {self.drawn}: must be at most the {len(found)} of among")
-        return tuple(found)
+            loaded += policy.among or [policy]
+        if loaded and not self.drawn <= len(loaded):
+            raise InvalidInput(
+                f"recipe {self.name!r}: drawn = {self.drawn}: must be at most the number of policies, {len(loaded)}"
+            )
+        return tuple(loaded)
 
 
-OPTIONS = Part(OptionsRecipe, "ethbrake_marl.extensions.learners.rollout_classification:Options")
+ROLLOUT_CLASSIFICATION = Part(
+    RolloutClassificationRecipe, "ethbrake_marl.extensions.learners.rollout_classification:RolloutClassification"
+)
 
-OPTIONS_AGENT = Part(
+ROLLOUT_CLASSIFICATION_AGENT = Part(
     make_policy_agent,
-    form="options@PATH",
-    about="a policy trained by options: a run, a bundle, or shipped",
+    form="rollout-classification@PATH",
+    about="a policy trained by rollout classification: a run, a bundle, or shipped",
     knows=Source.MESSAGES,
 )

@@ -35,14 +35,14 @@ class Scout(nn.Module):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the logarithm of the expected gradient size, [rows], for observations [rows, F]; at most 20."""
-        found: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
-        return found
+        logarithm: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
+        return logarithm
 
     def expect(self, observation: Float32s) -> Floats:
         """Return the expected size [rows], above 0, for observations [rows, F]."""
         with torch.no_grad():
-            found: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
-        return found
+            size: Floats = np.exp(self(torch.from_numpy(observation)).numpy().astype(np.float64))
+        return size
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
         """Return a loss whose minimum is reached by predicting the mean size.
@@ -56,8 +56,8 @@ class Scout(nn.Module):
 
         """
         logarithm = self(observation)
-        found: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
-        return found
+        loss: Tensor = (importance * (logarithm.exp() - size * logarithm)).mean()
+        return loss
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:

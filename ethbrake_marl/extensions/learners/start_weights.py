@@ -17,14 +17,17 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
     feature of the policy, or has another network.
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
-    found = policy.manifest.network
-    if found.networks > 1:
-        raise InvalidInput(f"recipe {recipe.name!r}: start: has {found.networks} networks; give a policy of one")
+    network = policy.manifest.network
+    if network.networks > 1:
+        raise InvalidInput(
+            f"recipe {recipe.name!r}: start: this policy is a mixture of {network.networks} networks; give a"
+            " policy with one network"
+        )
     for name in ("policy_hidden", "activation", "output"):
-        if getattr(found, name) != getattr(wanted, name):
+        if getattr(network, name) != getattr(wanted, name):
             raise InvalidInput(
-                f"recipe {recipe.name!r}: network: {name} is {getattr(wanted, name)}, but {getattr(found, name)} in the"
-                " policy to start from; they must be the same"
+                f"recipe {recipe.name!r}: network: {name} is {getattr(wanted, name)}, but {getattr(network, name)} in"
+                " the policy to start from; they must be the same"
             )
     return padded(policy, training, "start")
 
@@ -41,11 +44,11 @@ def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np
     if missing:
         raise InvalidInput(
             f"recipe {training.recipe.name!r}: observation: lacks {', '.join(missing[:5])}, which the policy of {key}"
-            " observes; list what it observes, and more"
+            " observes; list all of its features"
         )
-    found = {name: tensor.copy() for name, tensor in policy.tensors.items() if not name.startswith("value.")}
-    for name in [name for name in found if name.endswith(".0.weight")]:
-        first = np.zeros((len(found[name]), len(names)), np.float32)
-        first[:, [names.index(feature) for feature in known]] = found[name]
-        found[name] = first
-    return found
+    weights = {name: tensor.copy() for name, tensor in policy.tensors.items() if not name.startswith("value.")}
+    for name in [name for name in weights if name.endswith(".0.weight")]:
+        first = np.zeros((len(weights[name]), len(names)), np.float32)
+        first[:, [names.index(feature) for feature in known]] = weights[name]
+        weights[name] = first
+    return weights

@@ -1,7 +1,6 @@
 """The algorithm ``vine``: gradients of the return, measured by continuing from the same moment in two ways.
 
 Vine is the sampling scheme of Schulman et al. 2015 (TRPO): branches from visited states with common random numbers.
-Recipes call it ``algorithm: counterfactual``.
 """
 
 from __future__ import annotations
@@ -12,50 +11,50 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.optim import Optimizer
 
 from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.extensions.learners.mixture_model import ModesModel
+from ethbrake_marl.extensions.learners.mixture_model import ExpertsModel
 from ethbrake_marl.extensions.learners.start_weights import widened
-from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_model import VineModel
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 from ethbrake_marl.policies.shipped import load_named_policy
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.training import Training
 
 
-class Counterfactual(Algorithm):
+class Vine(Algorithm):
     """The algorithm vine: it measures gradients of the return, and trains an actor with them.
 
     All learners share one actor; a single learner may have a mixture of experts instead.
     """
 
-    def build(self, training: Training, environment: EthBrakeVecEnv) -> CounterfactualModel:
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         """Return a new model for a training, which learns in ``environment``.
 
         It begins with the weights of the policy that the recipe's key ``start`` names, or with random weights.
         """
         recipe = training.recipe
-        assert isinstance(recipe, CounterfactualRecipe)
+        assert isinstance(recipe, VineRecipe)
         environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
-        model = (CounterfactualModel if recipe.modes is None else ModesModel)(environment, recipe)
+        model = (VineModel if recipe.experts is None else ExpertsModel)(environment, recipe)
         start = recipe.policy_to_start_from(training.scenario)
         if start is not None:
             kind, _, path = start.partition("@")
             policy = load_named_policy(path, kind, training.scenario, recipe.reward.harm_count)
-            first = model.policy.actors[0] if isinstance(model, ModesModel) else model.policy
+            first = model.policy.actors[0] if isinstance(model, ExpertsModel) else model.policy
             first.take_over(widened(policy, training))
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
-        found: dict[str, Float32s] = actor.tensors(network)
-        return found
+        tensors: dict[str, Float32s] = actor.tensors(network)
+        return tensors
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
         """Return the model's optimisers by name.
 
         The only one is ``policy``, or in a mixture there are ``network_1``, ``network_2``, ..., and ``gate``.
         """
-        if not isinstance(model, ModesModel):
+        if not isinstance(model, ExpertsModel):
             return {"policy": model.policy.optimizer}
         members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}
         return {**members, "gate": model.policy.gate.optimizer}

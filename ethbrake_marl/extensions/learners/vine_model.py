@@ -16,16 +16,16 @@ from ethbrake_marl.envs.sb3 import EthBrakeVecEnv
 from ethbrake_marl.extensions.learners.averaged_actor import AveragedActor, Deterministic
 from ethbrake_marl.extensions.learners.branches import Act, Offsets, moving_rows, play_to_the_end
 from ethbrake_marl.extensions.learners.gradient_limit import CUT, REMEMBERED, limit_that_cuts, smallest_offset
-from ethbrake_marl.extensions.learners.mixture_policy import ModesPolicy
+from ethbrake_marl.extensions.learners.mixture_policy import ExpertsPolicy
 from ethbrake_marl.extensions.learners.optimizer import descend, follow
 from ethbrake_marl.extensions.learners.scout import choose_rows
 from ethbrake_marl.extensions.learners.trust_radius import Tried, trusted_targets
-from ethbrake_marl.extensions.learners.vine_recipe import CounterfactualRecipe
+from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.policies.network_spec import Float32s
 
 
-class CounterfactualModel(BaseAlgorithm):
+class VineModel(BaseAlgorithm):
     """Model that visits decisions with a deterministic actor, tries two actions at some of them, and learns from that.
 
     One of the two actions is higher than the actor's, the other is lower. The difference of the returns measures the
@@ -39,7 +39,7 @@ class CounterfactualModel(BaseAlgorithm):
 
     policy: AveragedActor
 
-    def __init__(self, environment: EthBrakeVecEnv, recipe: CounterfactualRecipe) -> None:
+    def __init__(self, environment: EthBrakeVecEnv, recipe: VineRecipe) -> None:
         super().__init__(
             AveragedActor,
             environment,
@@ -55,7 +55,7 @@ class CounterfactualModel(BaseAlgorithm):
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        kind: Any = AveragedActor if self.recipe.modes is None else ModesPolicy
+        kind: Any = AveragedActor if self.recipe.experts is None else ExpertsPolicy
         self.policy = kind(self.observation_space, self.action_space, self.lr_schedule, self.recipe)
         if self.recipe.gradient_limit == "auto":  # a buffer, so that a checkpoint saves it
             self.policy.register_buffer("measured", torch.zeros(REMEMBERED, 2, dtype=torch.float64))
@@ -65,32 +65,32 @@ class CounterfactualModel(BaseAlgorithm):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 1,
-        tb_log_name: str = "counterfactual",
+        tb_log_name: str = "vine",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
         """Train until the learners have made ``total_timesteps`` decisions; arguments as in Stable-Baselines3."""
-        total, told = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        told.on_training_start(locals(), globals())
+        total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        callback.on_training_start(locals(), globals())
         while self.num_timesteps < total:
-            told.on_rollout_start()
-            self._update(told, total)
-        told.on_training_end()
+            callback.on_rollout_start()
+            self._update(callback, total)
+        callback.on_training_end()
         return self
 
-    def _update(self, told: BaseCallback, total: int) -> None:
+    def _update(self, callback: BaseCallback, total: int) -> None:
         """Do one update of the training: collect decisions, and learn from them.
 
-        ``told`` is the training's callback, ``total`` the number of decisions in the whole training.
+        ``callback`` is the training's; ``total`` is the number of decisions in the whole training.
         """
         actor = self.policy
-        seen, moments = self._visit(told, actor.act)
-        told.on_rollout_end()
+        seen, moments = self._visit(callback, actor.act)
+        callback.on_rollout_end()
         self._update_current_progress_remaining(self.num_timesteps, total)
         self._train(actor, self._try_out(seen, moments, actor))
 
-    def _visit(self, told: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions with the policy ``act``, and report them to the callback ``told``.
+    def _visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
+        """Drive all worlds for ``n_steps`` decisions with the policy ``act``, and report each to ``callback``.
 
         Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
         """
@@ -106,8 +106,8 @@ class CounterfactualModel(BaseAlgorithm):
                 [infos[row] for row in np.flatnonzero(dones)], dones[dones]
             )  # only ended episodes have statistics
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
-            told.update_locals(locals())
-            told.on_step()
+            callback.update_locals(locals())
+            callback.on_step()
         self._numbers = np.concatenate(numbers)  # index of each visited world in the training
         return np.stack(seen), State.join(moments)
 
@@ -125,7 +125,7 @@ class CounterfactualModel(BaseAlgorithm):
         recipe, learners = self.recipe, len(self.engine.learners)
         moving = np.flatnonzero(moving_rows(moments).repeat(learners))
         observed = seen.reshape(-1, seen.shape[2])
-        rows, importance = choose_rows(observed, moving, recipe.counterfactuals, recipe.focus, actor.expect)
+        rows, importance = choose_rows(observed, moving, recipe.tried, recipe.focus, actor.expect)
         least, most = recipe.offset.smallest, recipe.offset.largest
         memory: Tensor | None = getattr(self.policy, "measured", None)  # only if the gradient limit is auto
         if memory is not None:
@@ -167,13 +167,13 @@ class CounterfactualModel(BaseAlgorithm):
             for batch in torch.split(torch.randperm(len(wanted)), recipe.batch_size):
                 means = actor.learning(seen[batch])[:, 0]
                 loss = (weights[batch] * (means - wanted[batch]) ** 2).mean()
-                found = [loss]
+                losses_of_step = [loss]
                 if actor.scout is not None:
-                    found.append(actor.scout.loss(seen[batch], sizes[batch], importance[batch]))
-                descend(actor.optimizer, *found)
+                    losses_of_step.append(actor.scout.loss(seen[batch], sizes[batch], importance[batch]))
+                descend(actor.optimizer, *losses_of_step)
                 follow(actor.average, actor.learning, recipe.averaging)
                 losses.append(loss.item())
         self._n_updates += recipe.n_epochs
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
         self.logger.record("train/gradient", float(np.abs(tried.gradient).mean()) if len(wanted) else 0.0)
-        self.logger.record("train/counterfactuals", len(wanted))
+        self.logger.record("train/tried", len(wanted))

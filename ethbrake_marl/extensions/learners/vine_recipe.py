@@ -1,4 +1,4 @@
-"""The recipe of ``vine`` (``algorithm: counterfactual``)."""
+"""The recipe of the algorithm ``vine``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
 from ethbrake_marl.files.model import refuse
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
@@ -22,7 +22,7 @@ from ethbrake_marl.training.agents import make_policy_agent
 from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, Positive, Rate, Shape, TrainingRecipe
 from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
-_RIGHT_START = "must be ppo@, counterfactual@ or universal@ and a policy, for instance ppo@shipped or ppo@runs/my-run"
+_RIGHT_START = "must be ppo@, vine@ or universal@ and a policy, for instance ppo@shipped or ppo@runs/my-run"
 
 
 class ActorShape(Shape):
@@ -31,47 +31,48 @@ class ActorShape(Shape):
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
     initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda v: v is None)] = Field(
-        None, description="about what the network does at first, [-1, 1]; left out: 0, which coasts"
+        None, description="action of the untrained network, [-1, 1], about; left out: 0, which coasts"
     )
 
 
-class CounterfactualRecipe(TrainingRecipe):
+class VineRecipe(TrainingRecipe):
     """Recipe of vine: some decisions are tried with a higher and a lower action, each to the end of its episode.
 
-    A round has ``n_envs x n_steps`` decisions; ``counterfactuals`` of them are tried. The policy learns from the
+    A round has ``n_envs x n_steps`` decisions; ``tried`` of them are tried. The policy learns from the
     differences of the returns. ``start`` names a trained policy to continue from; without it the weights are random.
     ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
     """
 
     most_decisions = 2**22
 
-    algorithm: Literal["counterfactual"]
-    start: Annotated[str, Field(pattern=r"^(ppo|counterfactual|universal)@.+$", max_length=4096)] | None = Field(
-        None,
-        description="a policy to go on from, ppo@shipped (random weights where none ships); left out: random weights",
+    algorithm: Literal["vine"]
+    start: Annotated[str, Field(pattern=r"^(ppo|vine|universal)@.+$", max_length=4096)] | None = Field(
+        None, description="policy to start from: ppo@shipped (random weights if none ships); left out: random weights"
     )
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
-    counterfactuals: int = Field(ge=1, description="how many of the decisions of a round are tried in two ways")
-    offset: OffsetRange = Field(
-        description="how far an action is moved to see what comes of it; the logarithm of what is drawn is uniform"
-    )
-    holds: Holds = Field(description="for how many steps an action is tried, one of these")
+    tried: int = Field(ge=1, description="decisions of a round that are tried with a higher and a lower action")
+    offset: OffsetRange = Field(description="range of the change of the tried action; drawn uniformly in its logarithm")
+    holds: Holds = Field(description="numbers of steps, one of which is drawn; the action is changed for so long")
     # Largest size of a measured gradient (return per unit of action); larger ones, at jumps of the harm, are cut to it.
     gradient_limit: Positive | Literal["auto"] = Field(
-        description="a larger gradient, at a jump, counts as this one; return per action; auto: as measured"
+        description="largest gradient, in return per action; larger ones are cut to it; auto: as measured"
     )
     # Largest distance from an action to the target that it is trained towards in one update.
-    trust_radius: Rate = Field(description="farthest that one update asks an action to move")
+    trust_radius: Rate = Field(description="largest change of an action that one update aims at")
     # Weight that holds actions where they are; the larger, the less small gradients move them.
-    anchor: Positive = Field(description="how much an action that makes no difference holds to where it is")
-    n_epochs: int = Field(ge=1, le=1000, description="how often an update goes through what was collected")
+    anchor: Positive = Field(
+        description="weight that holds an action in place; the larger, the less small gradients move it"
+    )
+    n_epochs: int = Field(ge=1, le=1000, description="passes of an update over the tried decisions")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     averaging: Averaging = Field(description=AVERAGING)
     # Share of the tried decisions that are drawn in proportion to the gradient that a small network expects there.
-    focus: Focus = Field(0.0, description="share of what is tried that a scout draws, where a choice matters most")
+    focus: Focus = Field(
+        0.0, description="share of the tried decisions drawn where a small network expects large gradients"
+    )
     network: ActorShape = Field(description=NETWORK)
-    modes: Annotated[ModesPlan | None, Field(exclude_if=not_)] = Field(
-        None, description="several networks and a gate between them; left out: one network"
+    experts: Annotated[ExpertsPlan | None, Field(exclude_if=not_)] = Field(
+        None, description="mixture of experts: several networks and a gating network; left out: one network"
     )
 
     @field_validator("start", mode="wrap")
@@ -92,22 +93,22 @@ class CounterfactualRecipe(TrainingRecipe):
         raise ValueError("must be auto or a finite number above 0")
 
     @model_validator(mode="after")
-    def _keys_fit(self) -> CounterfactualRecipe:
+    def _keys_fit(self) -> VineRecipe:
         if self.reward.shaping > 0.0:
             refuse(("reward", "shaping"), self.reward.shaping, NO_SHAPING)
         visited = self.n_envs * self.n_steps
-        if not self.counterfactuals <= visited:
-            refuse(("counterfactuals",), self.counterfactuals, f"must be at most n_envs x n_steps = {visited}")
+        if not self.tried <= visited:
+            refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network in a policy bundle: an actor, or several actors and a gate.
+        """Return the description of the network in a policy bundle: an actor, or several actors and a gating network.
 
         ``observation_size`` is the number of features of an observation.
         """
-        modes = self.modes
-        several = {} if modes is None else {"networks": modes.networks, "gate_hidden": modes.gate}
-        return self.network.spec(observation_size, **several)
+        plan = self.experts
+        mixture = {} if plan is None else {"networks": plan.networks, "gate_hidden": plan.gating}
+        return self.network.spec(observation_size, **mixture)
 
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
         """Return the spec of the policy whose weights a training on ``scenario`` begins with.
@@ -130,16 +131,15 @@ class CounterfactualRecipe(TrainingRecipe):
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` for several networks with several learners; the gate serves one learner only."""
-        if self.modes is not None and learners != 1:
-            raise InvalidInput(f"recipe {self.name!r}: modes: are for one learner, not for {learners}; leave modes out")
+        """Raise ``InvalidInput`` for a mixture of experts with several learners; it is for one learner only."""
+        if self.experts is not None and learners != 1:
+            raise InvalidInput(
+                f"recipe {self.name!r}: experts: a mixture is for one learner, not for {learners}; leave experts out"
+            )
 
 
-COUNTERFACTUAL = Part(CounterfactualRecipe, "ethbrake_marl.extensions.learners.vine:Counterfactual")
+VINE = Part(VineRecipe, "ethbrake_marl.extensions.learners.vine:Vine")
 
-COUNTERFACTUAL_AGENT = Part(
-    make_policy_agent,
-    form="counterfactual@PATH",
-    about="a policy trained by counterfactuals: a run or a bundle",
-    knows=Source.MESSAGES,
+VINE_AGENT = Part(
+    make_policy_agent, form="vine@PATH", about="a policy trained by vine: a run or a bundle", knows=Source.MESSAGES
 )

@@ -33,7 +33,7 @@ RECIPE = eb.load_recipe("cooperation-ppo").replace(
         (["--scenario", "cooperation-3-pear"], False, "did you mean 'cooperation-3-pair'?"),
         (["--recipe", "sac"], False, "recipe 'sac': is for SAC; MAPPO needs one for PPO"),
         (["--steps", "-5"], False, "total_steps = -5: must be greater than or equal to 1"),
-        (["--output", "there"], True, "there: is there already, and is no run; give another name"),
+        (["--output", "there"], True, "there: exists already and is not a run; give another name"),
         (["--scenario", "cooperation-0-sensors"], True, "no vehicle learns"),
     ],
 )

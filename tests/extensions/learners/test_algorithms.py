@@ -1,4 +1,4 @@
-"""Learning from counterfactuals, several networks with a gate, and options."""
+"""The algorithms vine, with a mixture of experts too, and rollout classification."""
 
 import copy
 import itertools
@@ -18,10 +18,10 @@ import ethbrake_marl as eb
 from ethbrake_marl.engine.profiles import profile_problem
 from ethbrake_marl.extensions.learners.branches import visit
 from ethbrake_marl.extensions.learners.gradient_limit import limit_that_cuts, smallest_offset
-from ethbrake_marl.extensions.learners.mixture_plan import ModesPlan
+from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 from ethbrake_marl.extensions.learners.mixture_stages import stages_of
 from ethbrake_marl.extensions.learners.mixture_worlds import (
-    NoOtherMode,
+    NoBetterTemplate,
     Shown,
     drive_from,
     explore,
@@ -32,7 +32,7 @@ from ethbrake_marl.extensions.learners.optimizer import Adam
 from ethbrake_marl.extensions.learners.scout import Scout, choose_rows, draw_rows
 from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.extensions.learners.trust_radius import Tried, trusted_targets
-from ethbrake_marl.extensions.learners.vine_model import CounterfactualModel
+from ethbrake_marl.extensions.learners.vine_model import VineModel
 from ethbrake_marl.extensions.search.templates import best_templates
 from ethbrake_marl.game.objectives import scored
 from ethbrake_marl.scenario.sampling import members_of
@@ -42,19 +42,16 @@ from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from ethbrake_marl.training.session import train
 from ethbrake_marl.training.training import Training
 from tests.evaluation.test_rollout import check_beyond
-from tests.extensions.learners.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS
+from tests.extensions.learners.tiny import EXPERTS, TINY_EXPERTS, TINY_ROLLOUTS, TINY_VINE
 from tests.policies.test_networks import check_mixture
 
 SCENARIO = eb.load_scenario("paper-random")
 
 
-SHIPPED = load_recipe("counterfactual")
+SHIPPED = load_recipe("vine")
 
 
-SMALL = {
-    name: getattr(TINY_COUNTERFACTUAL, name)
-    for name in ("n_envs", "n_steps", "counterfactuals", "batch_size", "evaluation")
-}
+SMALL = {name: getattr(TINY_VINE, name) for name in ("n_envs", "n_steps", "tried", "batch_size", "evaluation")}
 
 
 STILL = {"learning_rate": {"start": 1e-12, "end": 1e-12}, "total_steps": 1}
@@ -83,10 +80,10 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     old, new = (found.outcome(name).first_impact_harm for name in agents)
     np.testing.assert_allclose(old, new, atol=1e-3)
     manifest = policy.manifest
-    assert (manifest.algorithm, manifest.network.value_hidden) == ("counterfactual", ())
+    assert (manifest.algorithm, manifest.network.value_hidden) == ("vine", ())
     assert len(manifest.observation.features) == 57 and policy.observation.time_step_s == 0.1
     assert policy.tensors["policy.log_std"].shape == (1,)
-    assert eb.make_agent(f"counterfactual@{tmp_path / 'run'}").name == f"counterfactual@{tmp_path / 'run'}"
+    assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
 
 
 @pytest.mark.parametrize("name", ["cooperation-4-all", "cooperation-2-five"])
@@ -118,13 +115,13 @@ SCRIPTED = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "pla
 @pytest.mark.parametrize(
     ("recipe", "scenario"),
     [
-        (TINY_COUNTERFACTUAL.replace(**CONTACT), SCENARIO.with_learners(["vehicle_2", "vehicle_3"])),
-        (TINY_COUNTERFACTUAL.replace(**CONTACT), SCENARIO.with_learners(["vehicle_3"])),
-        (TINY_COUNTERFACTUAL.replace(**CONTACT), eb.load_scenario("cooperation-2-five")),
-        (TINY_COUNTERFACTUAL, SCENARIO.replace(early_impacts="keep", roles=SCRIPTED)),  # a script that remembers
-        (TINY_MODES.replace(**OWN, modes={**MODES, "networks": 3}), eb.load_scenario("cooperation-2-five")),
-        (TINY_OPTIONS.replace(**CONTACT), SCENARIO.with_learners(["vehicle_2", "vehicle_3"])),
-        (TINY_OPTIONS.replace(**OWN), eb.load_scenario("cooperation-2-five")),
+        (TINY_VINE.replace(**CONTACT), SCENARIO.with_learners(["vehicle_2", "vehicle_3"])),
+        (TINY_VINE.replace(**CONTACT), SCENARIO.with_learners(["vehicle_3"])),
+        (TINY_VINE.replace(**CONTACT), eb.load_scenario("cooperation-2-five")),
+        (TINY_VINE, SCENARIO.replace(early_impacts="keep", roles=SCRIPTED)),  # a script that remembers
+        (TINY_EXPERTS.replace(**OWN, experts={**EXPERTS, "networks": 3}), eb.load_scenario("cooperation-2-five")),
+        (TINY_ROLLOUTS.replace(**CONTACT), SCENARIO.with_learners(["vehicle_2", "vehicle_3"])),
+        (TINY_ROLLOUTS.replace(**OWN), eb.load_scenario("cooperation-2-five")),
     ],
 )
 def test_training__of_any_learners_objective_and_line(recipe: Any, scenario: Any, tmp_path: Path) -> None:
@@ -132,7 +129,7 @@ def test_training__of_any_learners_objective_and_line(recipe: Any, scenario: Any
     result = train(recipe, scenario, tmp_path / "run", steps=8 * 32 * len(scenario.learners), on_progress=told.append)
     assert told[-1].harm.partition(" harm ")[0] == {"first": "first-impact", "total": "total"}[recipe.reward.harm_count]
     assert result.status == "finished" and result.updates == 8
-    networks = 3 if getattr(recipe, "modes", None) else 1
+    networks = 3 if getattr(recipe, "experts", None) else 1
     assert eb.load_policy(tmp_path / "run").manifest.network.networks == networks
 
 
@@ -142,15 +139,15 @@ FROM_SCRATCH = {
 }  # fmt: skip
 
 
-SHARES = {"alone": 0.0, "further": 0.25, "gate": 0.5, "together": 0.25}
+SHARES = {"pretraining_first": 0.0, "pretraining_others": 0.25, "gating": 0.5, "joint": 0.25}
 
 
-MANY_TRIED = {"n_steps": 8, "counterfactuals": 256, "total_steps": 30 * 512}
+MANY_TRIED = {"n_steps": 8, "tried": 256, "total_steps": 30 * 512}
 
 
 GATED = {
     "total_steps": 16 * 256,
-    "modes": MODES | {"worlds": 400, "imitation_epochs": 20, "gate_states": 512, "shares": SHARES},
+    "experts": EXPERTS | {"worlds": 400, "imitation_epochs": 20, "gating_states": 512, "shares": SHARES},
 }
 
 
@@ -165,27 +162,27 @@ CHOOSING = {
     "recipe",
     [
         SHIPPED.replace(start=None, **FROM_SCRATCH, **MANY_TRIED),
-        TINY_MODES.replace(**FROM_SCRATCH, **GATED),
-        TINY_OPTIONS.replace(**FROM_SCRATCH | CHOOSING),
+        TINY_EXPERTS.replace(**FROM_SCRATCH, **GATED),
+        TINY_ROLLOUTS.replace(**FROM_SCRATCH | CHOOSING),
     ],
 )
 def test_training__gets_better_from_scratch(recipe: Any, tmp_path: Path) -> None:
-    """Random weights hardly act: much of the harm is gone by trying, or by imitating templates and a gate."""
+    """Random weights hardly act: much of the harm is gone by trying, or by imitating templates."""
     result = train(recipe, SCENARIO, tmp_path / "run")
     first, last = (result.evaluations[k]["first_impact_harm"] for k in (0, -1))
     assert last < 0.7 * first
 
 
 def test_training__numbers_that_are_not_finite_stop_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, calls = CounterfactualModel._try_out, itertools.count(1)
+    real, calls = VineModel._try_out, itertools.count(1)
 
-    def broken(self: CounterfactualModel, seen: Any, moments: Any, actor: Any) -> Tried:
+    def broken(self: VineModel, seen: Any, moments: Any, actor: Any) -> Tried:
         tried = real(self, seen, moments, actor)
         return tried._replace(mean=tried.mean * np.float32(np.nan if next(calls) == 3 else 1.0))
 
-    monkeypatch.setattr(CounterfactualModel, "_try_out", broken)
+    monkeypatch.setattr(VineModel, "_try_out", broken)
     with pytest.raises(TrainingDiverged, match="not finite"):
-        train(TINY_COUNTERFACTUAL, SCENARIO, tmp_path / "run", measure=None)
+        train(TINY_VINE, SCENARIO, tmp_path / "run", measure=None)
     kept = eb.load_policy(tmp_path / "run" / "policy-last")
     assert all(np.isfinite(tensor).all() for tensor in kept.tensors.values())
 
@@ -200,8 +197,8 @@ def new_model(recipe: TrainingRecipe, scenario: eb.Scenario = SCENARIO) -> Any:
 
 
 def choosing(scenario: eb.Scenario = SCENARIO, **changes: Any) -> Any:
-    """A new model that chooses among actions."""
-    return new_model(TINY_OPTIONS.replace(**changes), scenario)
+    """A new model of rollout classification."""
+    return new_model(TINY_ROLLOUTS.replace(**changes), scenario)
 
 
 def constant(value: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -212,9 +209,15 @@ _full_brake, _coast = constant(-1.0), constant(0.0)
 
 
 def test_stages__share_the_updates_and_leave_none_out() -> None:
-    plan = ModesPlan(**{**MODES, "networks": 3, "shares": {"alone": 0.5, "further": 0.2, "gate": 0.1, "together": 0.2}})
-    expected = [("alone", 0, 0, 10), ("further", 1, 10, 12), ("further", 2, 12, 14), ("gate", 0, 14, 16),
-                ("together", 0, 16, 20)]  # fmt: skip
+    plan = ExpertsPlan(
+        **{
+            **EXPERTS,
+            "networks": 3,
+            "shares": {"pretraining_first": 0.5, "pretraining_others": 0.2, "gating": 0.1, "joint": 0.2},
+        }
+    )
+    expected = [("first", 0, 0, 10), ("other", 1, 10, 12), ("other", 2, 12, 14), ("gating", 0, 14, 16),
+                ("joint", 0, 16, 20)]  # fmt: skip
     assert [*stages_of(plan, 20)] == expected
     for updates in range(1, 30):
         found = stages_of(plan, updates)
@@ -233,7 +236,7 @@ def test_templates__are_played_as_they_were_found_and_depend_on_no_batch() -> No
 
 
 def test_shown__is_what_gains_more_than_every_network() -> None:
-    model = new_model(TINY_MODES)
+    model = new_model(TINY_EXPERTS)
     engine = model.engine
     found = explore(engine, model.plan, [_full_brake, _coast], 1.0)
     each = [drive_from(engine, found.start, act, 1.0) for act in (_full_brake, _coast)]
@@ -241,12 +244,12 @@ def test_shown__is_what_gains_more_than_every_network() -> None:
     assert np.array_equal(found.harm, -found.gained)  # the recipe's reward is minus the harm by its own count
     shown = show_templates(engine, model.plan, found, 1.0, 0)
     assert len(shown.seen) == len(shown.action) > 50 and (np.abs(shown.action) <= 1.0).all()
-    picky = ModesPlan(**{**MODES, "gain": 1e6})
+    picky = ExpertsPlan(**{**EXPERTS, "gain": 1e6})
     assert len(show_templates(engine, picky, found, 1.0, 0).action) == 0
 
 
 def test_own_worlds__are_those_within_the_margin() -> None:
-    model = new_model(TINY_MODES)
+    model = new_model(TINY_EXPERTS)
     engine = model.engine
     found = explore(engine, model.plan, [_full_brake], 1.0)
     gained, _ = drive_from(engine, found.start, _coast, 1.0)
@@ -256,7 +259,7 @@ def test_own_worlds__are_those_within_the_margin() -> None:
 
 
 def test_visit__every_decision_of_every_episode() -> None:
-    engine = new_model(TINY_MODES).engine
+    engine = new_model(TINY_EXPERTS).engine
     _, start = engine.first_moments(20)
     seen, moments = visit(engine.branch(start), _full_brake)
     assert seen.shape == (len(moments.motion), 1, 27)
@@ -267,9 +270,9 @@ def test_visit__every_decision_of_every_episode() -> None:
 
 def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
     """Of two kinds of decisions that look alike the gate is right where being wrong costs more, or counts for more."""
-    modes = {**MODES, "gate_memory": 1000, "gate_steps": 20}
+    plan = {**EXPERTS, "gating_memory": 1000, "gating_steps": 20}
     fast = {"learning_rate": {"start": 1e-2, "end": 1e-2}, "averaging": 0.9, "batch_size": 128}
-    model = new_model(TINY_MODES.replace(**fast, modes=modes))
+    model = new_model(TINY_EXPERTS.replace(**fast, experts=plan))
     seen = np.repeat(np.eye(27, dtype=np.float32)[[0, 1, 1, 2, 2]], 100, axis=0)
     costs = np.repeat([[0.0, 1.0], [5.0, 0.0], [0.0, 1.0], [2.0, 0.0], [0.0, 4.0]], 100, axis=0)
     importance = np.repeat(np.float32([1.0, 1.0, 1.0, 4.0, 0.5]), 100)
@@ -280,7 +283,7 @@ def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
 
 
 def test_imitation__draws_from_the_stream_of_its_own_seed() -> None:
-    model = new_model(TINY_MODES.replace(batch_size=8))
+    model = new_model(TINY_EXPERTS.replace(batch_size=8))
     rng, taught = np.random.default_rng(0), []
     shown = Shown(rng.random((32, 27), np.float32), rng.random(32, np.float32))
     for seed in (1, 1, 2):
@@ -290,9 +293,9 @@ def test_imitation__draws_from_the_stream_of_its_own_seed() -> None:
     assert taught[0] == taught[1] != taught[2]
 
 
-def test_training__says_that_there_is_no_other_mode(tmp_path: Path) -> None:
-    with pytest.raises(NoOtherMode, match="network 2: in none of 64 worlds did one of 20 templates do better by 1e"):
-        train(TINY_MODES.replace(modes={**MODES, "gain": 1e6}), SCENARIO, tmp_path / "run", measure=None)
+def test_training__says_that_no_template_does_better(tmp_path: Path) -> None:
+    with pytest.raises(NoBetterTemplate, match="network 2: in none of 64 worlds does one of 20 templates do better"):
+        train(TINY_EXPERTS.replace(experts={**EXPERTS, "gain": 1e6}), SCENARIO, tmp_path / "run", measure=None)
     assert eb.load_policy(tmp_path / "run" / "policy-last").manifest.network.networks == 2
 
 
@@ -338,7 +341,7 @@ def test_scout__learns_the_mean_size_of_what_is_to_be_expected() -> None:
 def test_gradients__are_cut_at_their_limit_and_the_share_is_told() -> None:
     found = {}
     for limit in (0.01, 1e9):
-        model = new_model(TINY_COUNTERFACTUAL.replace(gradient_limit=limit))
+        model = new_model(TINY_VINE.replace(gradient_limit=limit))
         torch.manual_seed(5)
         tried = model._try_out(model._last_obs[np.newaxis], model.engine.moment(), model.policy)
         found[limit] = tried.gradient, model.logger.name_to_value["train/gradient_cut"]
@@ -361,7 +364,7 @@ def test_automatic_limit__cuts_its_share_and_offsets_grow_where_harm_jumps() -> 
 
 
 @pytest.mark.parametrize(("objective", "learners"), [("total", ["vehicle_2"]), ("own", ["vehicle_2", "vehicle_3"])])
-def test_options__costs_are_those_of_the_moved_learner_in_episodes_driven_so(
+def test_rollout_classification__costs_are_those_of_the_moved_learner_in_episodes_driven_so(
     objective: str, learners: list[str]
 ) -> None:
     """Full braking of all but for what is tried: each action for its steps, then the policy, to the end."""
@@ -394,7 +397,7 @@ def test_options__costs_are_those_of_the_moved_learner_in_episodes_driven_so(
     np.testing.assert_allclose(cautious, costs + beyond, rtol=1e-12, atol=1e-12)
 
 
-def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
+def test_rollout_classification__loss_by_hand_and_what_is_remembered_last() -> None:
     actor = choosing(
         tried=2, memory=2, near=[], fixed=[0.0, 1.0], drawn=0, network={"policy": [8], "choices": 3}
     ).policy
@@ -415,12 +418,12 @@ def test_options__loss_by_hand_and_what_is_remembered_last() -> None:
     assert [float(importance[rows == row].sum()) / 1000 for row in (0, 1)] == pytest.approx([1.0, 1.0], abs=0.2)
 
 
-def test_options__among_policies_drive_as_alone_and_costs_are_beside_those_usual_in_each_scenario() -> None:
+def test_rollout_classification__policies_drive_as_alone_and_costs_are_beside_those_usual_in_each_scenario() -> None:
     line = eb.load_scenario(
         {"name": "two", "mixture": [{"scenario": "paper-random"}, {"scenario": "paper-delay-high"}]}
     )
-    among, shape = ["policy@shipped/ppo", "policy@shipped/sac"], {"policy": [8], "choices": 2}
-    model = choosing(line, among=among, tried=8, near=[], fixed=[-1.0], drawn=2, holds=[1000], network=shape)
+    policies, shape = ["policy@shipped/ppo", "policy@shipped/sac"], {"policy": [8], "choices": 2}
+    model = choosing(line, policies=policies, tried=8, near=[], fixed=[-1.0], drawn=2, holds=[1000], network=shape)
     start = model.engine.moment()
     model._numbers = model.engine.roster.numbers.copy()
     torch.manual_seed(5)
@@ -472,8 +475,8 @@ def test_widened_policy__keeps_the_weights_of_its_features_and_nothing_of_new_on
 
 @pytest.mark.parametrize("around", ["+episode", "+step", "+search"])
 def test_mixture__drives_shielded_and_searched(around: str, mixture: eb.Policy, tmp_path: Path) -> None:
-    check_mixture("counterfactual", around, mixture, tmp_path)
+    check_mixture("vine", around, mixture, tmp_path)
 
 
 def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once() -> None:
-    check_beyond("options@shipped/options-paper-random-obstacle-total", SCENARIO, "no obstacle_gap_m")
+    check_beyond("rollout-classification@shipped/options-paper-random-obstacle-total", SCENARIO, "no obstacle_gap_m")

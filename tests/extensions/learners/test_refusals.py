@@ -11,24 +11,25 @@ from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.session import train
+from ethbrake_marl.training.settings import read_settings
 from ethbrake_marl.training.training import Training
-from tests.extensions.learners.tiny import TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS
+from tests.extensions.learners.tiny import TINY_EXPERTS, TINY_ROLLOUTS, TINY_VINE
 from tests.fixtures.policies import make_policy
 from tests.refused import refused
 
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")
 
 
-def modes(**changes: Any) -> Any:
-    """The recipe of several networks, with changes in how they are trained."""
-    return TINY_MODES.replace(modes=TINY_MODES.model_dump(mode="json")["modes"] | changes)
+def experts(**changes: Any) -> Any:
+    """The recipe of a mixture of experts, with changes."""
+    return TINY_EXPERTS.replace(experts=TINY_EXPERTS.model_dump(mode="json")["experts"] | changes)
 
 
 def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> None:
-    turned = load_recipe("counterfactual").replace(observation=["own", "front_1", "contact"])
+    turned = load_recipe("vine").replace(observation=["own", "front_1", "contact"])
     with refused("observation: lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
         widened(eb.load_shipped("ppo"), Training.of(turned, PAPER))
-    smaller = load_recipe("counterfactual").replace(network={"policy": [64, 64]})
+    smaller = load_recipe("vine").replace(network={"policy": [64, 64]})
     with refused(
         "network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; they must be the same"
     ):
@@ -37,59 +38,77 @@ def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> No
 
 def test_policy_to_start_from__has_one_network(empty_folder: Path) -> None:
     several = {"networks": 3, "gate_hidden": (6,), "value_hidden": ()}
-    several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "counterfactual", **several)
+    several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "vine", **several)
     several.save(Path("first"))
-    with refused("recipe 'counterfactual': start: has 3 networks; give a policy of one"):
-        train(TINY_MODES.replace(start="counterfactual@first"), PAPER, Path("run"))
+    with refused("recipe 'vine': start: this policy is a mixture of 3 networks"):
+        train(TINY_EXPERTS.replace(start="vine@first"), PAPER, Path("run"))
 
 
 def test_tried_actions__are_at_most_the_decisions_of_an_update() -> None:
-    assert TINY_COUNTERFACTUAL.replace(counterfactuals=32).counterfactuals == 8 * 4
-    with refused("counterfactuals = 33: must be at most n_envs x n_steps = 32"):
-        TINY_COUNTERFACTUAL.replace(counterfactuals=33)
-    assert TINY_OPTIONS.replace(tried=32, memory=99).tried == 8 * 4
+    assert TINY_VINE.replace(tried=32).tried == 8 * 4
     with refused("tried = 33: must be at most n_envs x n_steps = 32"):
-        TINY_OPTIONS.replace(tried=33, memory=99)
+        TINY_VINE.replace(tried=33)
+    assert TINY_ROLLOUTS.replace(tried=32, memory=99).tried == 8 * 4
+    with refused("tried = 33: must be at most n_envs x n_steps = 32"):
+        TINY_ROLLOUTS.replace(tried=33, memory=99)
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "algorithm = trpo: must be one of counterfactual, options, ppo, sac": lambda: TINY_OPTIONS.replace(
+    "algorithm = trpo: must be one of ppo, rollout-classification, sac, vine": lambda: TINY_ROLLOUTS.replace(
         algorithm="trpo"
     ),
-    "recipe 'options': averaging = 1: must be less than 1": lambda: load_recipe("options").replace(averaging=1.0),
-    "recipe 'options': near = [{smallest: 0.1, largest: 1}, {smallest: 0.1, largest: 1}...": lambda: load_recipe(
-        "options"
-    ).replace(near=[{"smallest": 0.1, "largest": 1.0}] * 9),
-    "recipe 'counterfactual': reward.shaping = 0.1: must be 0: what is tried is played to the end": lambda: (
-        TINY_COUNTERFACTUAL.replace(reward={"harm": 1.0, "shaping": 0.1})
+    "averaging = 1: must be less than 1": lambda: load_recipe("rollout-classification").replace(averaging=1.0),
+    "near = [{smallest: 0.1, largest: 1}, {smallest: 0.1, largest: 1}...": lambda: TINY_ROLLOUTS.replace(
+        near=[{"smallest": 0.1, "largest": 1.0}] * 9
     ),
-    "recipe 'counterfactual': offset.largest = 0.1: must be at least smallest = 0.3": lambda: (
-        TINY_COUNTERFACTUAL.replace(offset={"smallest": 0.3, "largest": 0.1})
+    "recipe 'vine': reward.shaping = 0.1: must be 0: tried actions are played to the end": lambda: TINY_VINE.replace(
+        reward={"harm": 1.0, "shaping": 0.1}
     ),
-    "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: (
-        TINY_COUNTERFACTUAL.replace(gradient_limit="often")
+    "recipe 'vine': offset.largest = 0.1: must be at least smallest = 0.3": lambda: TINY_VINE.replace(
+        offset={"smallest": 0.3, "largest": 0.1}
     ),
-    "must be ppo@, counterfactual@ or universal@": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
-    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_COUNTERFACTUAL.replace(n_envs=2**22),
-    "must be single, shared, independent or centralised": lambda: TINY_COUNTERFACTUAL.replace(scheme="centralized"),
-    "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_OPTIONS.replace(memory=15),
-    "must hold a range where there are neither fixed": lambda: TINY_OPTIONS.replace(near=[], fixed=[], drawn=0),
-    "recipe 'counterfactual': modes.networks = 1: must be greater than or equal to 2": lambda: modes(networks=1),
-    "recipe 'counterfactual': modes.shares = {alone: 0.5, further: 0.5, gate: 0.5, together: 0}: alone": lambda: modes(
-        shares={"alone": 0.5, "further": 0.5, "gate": 0.5, "together": 0.0}
+    "recipe 'vine': gradient_limit = often: must be auto or a finite number above 0": lambda: TINY_VINE.replace(
+        gradient_limit="often"
     ),
-    "recipe 'counterfactual': modes.gat: unknown key; did you mean gate?": lambda: modes(gat=[8]),
+    "must be ppo@, vine@ or universal@": lambda: TINY_VINE.replace(start="sac@shipped"),
+    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_VINE.replace(n_envs=2**22),
+    "must be single, shared, independent or centralised": lambda: TINY_VINE.replace(scheme="centralized"),
+    "memory = 15: must be at least tried = 16": lambda: TINY_ROLLOUTS.replace(memory=15),
+    "must hold a range if there are neither fixed": lambda: TINY_ROLLOUTS.replace(near=[], fixed=[], drawn=0),
+    "recipe 'vine': experts.networks = 1: must be greater than or equal to 2": lambda: experts(networks=1),
+    "the sum of the shares is 1.5; must be 1": lambda: experts(
+        shares={"pretraining_first": 0.5, "pretraining_others": 0.5, "gating": 0.5, "joint": 0.0}
+    ),
+    "recipe 'vine': experts.gatin: unknown key; did you mean gating?": lambda: experts(gatin=[8]),
     "runs/mine: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run": lambda: train(
-        load_recipe("counterfactual").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
+        load_recipe("vine").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
     ),
-    "recipe 'options': drawn = 2: must be at most the 1 of among": lambda: train(
-        load_recipe("options").replace(among=["policy@shipped/ppo"]), "paper-random", "new"
+    "drawn = 2: must be at most the number of policies, 1": lambda: train(
+        load_recipe("rollout-classification").replace(policies=["policy@shipped/ppo"]), "paper-random", "new"
     ),
-    "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
-        load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
+    "policies: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
+        load_recipe("rollout-classification").replace(policies=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
     ),
-    "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_MODES, PAIR, Path("run")),
+    "recipe 'vine': experts: a mixture is for one learner, not for 2": lambda: train(TINY_EXPERTS, PAIR, Path("run")),
 }
+
+
+RENAMED: dict[str, Callable[[], object]] = {
+    "unknown recipe 'modes'; it is now called 'experts'": lambda: load_recipe("modes"),
+    "recipe 'vine': algorithm = options: is now called rollout-classification": lambda: TINY_VINE.replace(
+        algorithm="options"
+    ),
+    "recipe 'vine': counterfactuals: unknown key; it is now called tried": lambda: TINY_VINE.replace(counterfactuals=8),
+    "recipe 'vine': experts.gate_states: unknown key; it is now called gating_states": lambda: experts(gate_states=8),
+    "unknown agent 'counterfactual'; it is now called 'vine'": lambda: eb.make_agent("counterfactual@runs/mine"),
+    "unknown setting 'modes'; it is now called 'experts'": lambda: read_settings(["modes.worlds=9"], [TINY_VINE]),
+}
+
+
+@pytest.mark.parametrize("message", RENAMED)
+def test_old_name__is_refused_with_the_new_one(message: str) -> None:
+    with refused(message):
+        RENAMED[message]()
 
 
 @pytest.mark.usefixtures("empty_folder")
@@ -101,4 +120,8 @@ def test_recipe_or_training__is_refused(message: str) -> None:
 
 def test_policy_to_choose_among__is_one_that_ships(empty_folder: Path) -> None:
     with refused("unknown shipped policy 'nobody'", UnknownName):
-        train(load_recipe("options").replace(among=["policy@shipped/nobody"], drawn=1), "paper-random", "new")
+        train(
+            load_recipe("rollout-classification").replace(policies=["policy@shipped/nobody"], drawn=1),
+            "paper-random",
+            "new",
+        )

@@ -4,7 +4,7 @@ import pytest
 
 from tests.agents.test_roles import SCENARIOS, check_role
 
-SPECS = {"counterfactual": ["counterfactual@shipped"], "options": ["options@shipped"]}
+SPECS = {"vine": ["vine@shipped"], "rollout-classification": ["rollout-classification@shipped"]}
 
 
 @pytest.mark.parametrize("kind", SPECS)

@@ -1,17 +1,25 @@
 """Trainings by these algorithms: recipes, and going on to the same bits."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.errors import RENAMED
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.files.store import remove_folder
 from ethbrake_marl.training import session as train_module
+from ethbrake_marl.training.checkpoint import TrainingState, checkpoint_folders, read_checkpoint, write_checkpoint
 from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.training.run_folder import RunDirectory
+from ethbrake_marl.training.training import Training
 from tests.cli.test_scenarios import check_new_recipe
-from tests.extensions.learners.tiny import MODES, TINY_COUNTERFACTUAL, TINY_MODES, TINY_OPTIONS
-from tests.learning.test_runs import MIXTURE, Whole, check_one_update, check_resumed, trained_once
+from tests.extensions.learners.tiny import EXPERTS, TINY_EXPERTS, TINY_ROLLOUTS, TINY_VINE
+from tests.fixtures.policies import make_policy
+from tests.learning.test_runs import MIXTURE, Whole, check_one_update, check_resumed, measure, stop, trained_once
 from tests.learning.test_teams import check_meanings, check_shipped
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of those who read event files
@@ -31,13 +39,13 @@ def test_quick__ends_near_the_best_known_for_every_seed(seed: int, tmp_path: Pat
 
 
 def test_recipe__tells_only_the_keys_that_it_has() -> None:
-    told = TINY_COUNTERFACTUAL.model_dump(mode="json")
-    assert {"focus", "modes"} & told.keys() == set()
+    told = TINY_VINE.model_dump(mode="json")
+    assert {"focus", "experts"} & told.keys() == set()
     assert "initial_action" not in told["network"]
-    assert TINY_COUNTERFACTUAL.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
+    assert TINY_VINE.replace(focus=0.75).model_dump(mode="json")["focus"] == 0.75
 
 
-OF_THEIR_KIND = ("cooperation", "modes")  # others differ in numbers
+OF_THEIR_KIND = ("cooperation", "experts")  # others differ in numbers
 RECIPES = [name for name, file in TrainingRecipe.shipped().items() if file.parent.name == "learners"]
 
 
@@ -47,7 +55,7 @@ RECIPES = [name for name, file in TrainingRecipe.shipped().items() if file.paren
 def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
     """By the fewest worlds whose decisions can be split into batches and tried."""
     recipe = load_recipe(name)
-    most = max(recipe.batch_size, recipe.tried if recipe.algorithm == "options" else recipe.counterfactuals)
+    most = max(recipe.batch_size, recipe.tried)
     check_one_update(recipe.replace(n_envs=-(-most // recipe.rounds)), tmp_path / "run")
 
 
@@ -61,19 +69,19 @@ def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(name: str,
     check_new_recipe(name, tmp_path / "mine.yaml")
 
 
-@pytest.mark.parametrize("algorithm", ["counterfactual", "options"])
+@pytest.mark.parametrize("algorithm", ["vine", "rollout-classification"])
 def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> None:
     check_meanings(algorithm)
 
 
-AMONG = {"among": ["policy@shipped/ppo", "policy@shipped/sac"], "drawn": 2, "near": [], "focus": 0.5,
+CHOOSING_POLICIES = {"policies": ["policy@shipped/ppo", "policy@shipped/sac"], "drawn": 2, "near": [], "focus": 0.5,
          "relative": True, "tie_break": 0.5, "observation": ["own", "front_1", "rear_1", "contact"]}  # fmt: skip
 TRAININGS = {
-    "counterfactual": (TINY_COUNTERFACTUAL.replace(gradient_limit="auto"), SCENARIO),
-    "modes": (TINY_MODES, SCENARIO),
-    "options": (TINY_OPTIONS, SCENARIO),
-    "among": (TINY_OPTIONS.replace(**AMONG), MIXTURE),
-    "scout": (TINY_MODES.replace(focus=0.75, modes=MODES | {"tie_break": 0.0}), SCENARIO),
+    "vine": (TINY_VINE.replace(gradient_limit="auto"), SCENARIO),
+    "experts": (TINY_EXPERTS, SCENARIO),
+    "rollout-classification": (TINY_ROLLOUTS, SCENARIO),
+    "policies": (TINY_ROLLOUTS.replace(**CHOOSING_POLICIES), MIXTURE),
+    "scout": (TINY_EXPERTS.replace(focus=0.75, experts=EXPERTS | {"tie_break": 0.0}), SCENARIO),
 }
 
 
@@ -85,9 +93,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 @pytest.mark.parametrize(
     ("name", "at"),
     [
-        *((name, ("update", 5)) for name in ("counterfactual", "modes", "among")),
+        *((name, ("update", 5)) for name in ("vine", "experts", "policies")),
         *(pytest.param(name, ("update", number), marks=pytest.mark.slow)
-          for name, numbers in (("modes", (3, 7)), ("scout", (5,))) for number in numbers),  # in its other stages
+          for name, numbers in (("experts", (3, 7)), ("scout", (5,))) for number in numbers),  # in its other stages
     ],
     ids=str,
 )  # fmt: skip
@@ -95,3 +103,35 @@ def test_resume__after_ctrl_c_everything_is_as_if_nobody_had_stopped_it(
     name: str, at: tuple[str, int], whole: Whole, tmp_path: Path
 ) -> None:
     check_resumed(TRAININGS[name], tmp_path / "run", at, *whole(name))
+
+
+OLD_NAMES = {new: old for old, new in RENAMED.items()}
+
+
+def with_old_names(value: Any) -> Any:
+    """What an earlier version wrote of a recipe: names of keys and algorithm."""
+    if isinstance(value, dict):
+        return {OLD_NAMES.get(key, key): with_old_names(each) for key, each in value.items()}
+    return OLD_NAMES.get(value, value) if isinstance(value, str) else value
+
+
+@pytest.mark.parametrize("name", ["experts", "policies"])
+def test_resume__run_of_an_earlier_version_continues_to_the_same_bits(name: str, whole: Whole, tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    stop(TRAININGS[name], run.path, ("update", 5))
+    config, content = json.loads(run.config.read_text()), Training.of(*TRAININGS[name]).content()
+    for part in (config, content):
+        part["recipe"] = with_old_names(part["recipe"])
+    assert config["recipe"]["algorithm"] in ("counterfactual", "options")
+    run.write_json(run.config, config)
+    for folder in checkpoint_folders(run.checkpoints):
+        numbers, arrays = read_checkpoint(folder)
+        remove_folder(folder)
+        write_checkpoint(folder, TrainingState({**numbers, "training": Training.identity_of(content)}, arrays))
+    resumed, (_, expected) = train_module.resume(run.path, measure=measure), whole(name)
+    assert resumed.last.manifest.weights_sha256 == expected.last.manifest.weights_sha256
+
+
+def test_policy__of_an_earlier_version_has_the_new_name_of_its_algorithm(tmp_path: Path) -> None:
+    make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "counterfactual").save(tmp_path / "bundle")
+    assert eb.load_policy(tmp_path / "bundle").manifest.algorithm == "vine"

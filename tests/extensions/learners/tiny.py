@@ -2,19 +2,19 @@
 
 import ethbrake_marl as eb
 
-TINY_COUNTERFACTUAL = eb.load_recipe("counterfactual").replace(
+TINY_VINE = eb.load_recipe("vine").replace(
     start=None,
     observation=None,
     n_envs=8,
     n_steps=4,
-    counterfactuals=16,
+    tried=16,
     batch_size=8,
     network={"policy": [8]},
     total_steps=256,
     evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
     checkpoint_every_updates=3,
 )
-TINY_OPTIONS = eb.load_recipe("options").replace(
+TINY_ROLLOUTS = eb.load_recipe("rollout-classification").replace(
     observation=None,
     n_envs=8,
     n_steps=4,
@@ -27,19 +27,19 @@ TINY_OPTIONS = eb.load_recipe("options").replace(
     evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
     checkpoint_every_updates=3,
 )
-MODES = {
+EXPERTS = {
     "networks": 2,
-    "gate": [4],
+    "gating": [4],
     "worlds": 64,
     "templates": 20,
     "gain": 0.0,
     "margin": 5.0,
     "imitation_epochs": 2,
-    "gate_states": 32,
-    "gate_memory": 100,
-    "gate_steps": 4,
+    "gating_states": 32,
+    "gating_memory": 100,
+    "gating_steps": 4,
     "tie_break": 0.05,
-    "together_rate": 0.5,
-    "shares": {"alone": 0.25, "further": 0.25, "gate": 0.25, "together": 0.25},
+    "joint_rate": 0.5,
+    "shares": {"pretraining_first": 0.25, "pretraining_others": 0.25, "gating": 0.25, "joint": 0.25},
 }
-TINY_MODES = TINY_COUNTERFACTUAL.replace(modes=MODES)
+TINY_EXPERTS = TINY_VINE.replace(experts=EXPERTS)
