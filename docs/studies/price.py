@@ -26,7 +26,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
-POLICY = "ppo@shipped/ppo"
+POLICY = "ppo"
 ALONE = ("full_brake", POLICY)  # who says nothing of ``believed``
 LIMITS = {  # who decides on what was received -> the same one that reads the line as it is
     "e_v2x_bm:believed": "e_v2x_bm",

@@ -398,7 +398,9 @@ def agent_list(as_json: JsonOption = False) -> None:
 
 @agent_group.command("export", epilog=example("agent export runs/early --onnx early.onnx"))
 def agent_export(
-    policy: Annotated[str, typer.Argument(metavar="FOLDER", help="A run, a policy bundle, or shipped/NAME.")],
+    policy: Annotated[
+        str, typer.Argument(metavar="NAME|PATH", help="A shipped policy's name, a run, or a policy bundle.")
+    ],
     onnx: Annotated[Path, typer.Option(metavar="FILE", help="The ONNX model to write.")],
     force: ForceOption = False,
 ) -> None:

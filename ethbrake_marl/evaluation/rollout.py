@@ -64,7 +64,7 @@ def evaluate(
     Args:
         worlds: worlds at the alert, or a sample that ``scenario.sample`` drew; None: draw ``episodes`` worlds from
             ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), which minimise first-impact
+        agents: specs as on the command line (``"full_brake,ppo"``, or a list), which minimise first-impact
             harm; or a mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the
             originals do not change.
         scenario: scenario of the worlds, also by name or path.
@@ -163,7 +163,7 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
         )
     if not isinstance(agents, Mapping):
         raise InvalidInput(
-            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo@shipped', or a mapping of agents"
+            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo', or a mapping of agents"
         )
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")

@@ -289,7 +289,7 @@ def test_paper__its_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_dis
         assert [row[column].split(" [")[0] for column in (1, 2, 4)] == list(cells)
 
 
-@pytest.mark.parametrize(("spec", "name"), [("full_brake", "Non-ethical (full braking)"), ("ppo@shipped/ppo", "PPO")])
+@pytest.mark.parametrize(("spec", "name"), [("full_brake", "Non-ethical (full braking)"), ("ppo", "PPO")])
 def test_paper__harms_at_three_delays_are_as_committed(spec: str, name: str) -> None:
     (row,) = (row for row in RESULTS["harm-delays"].tables[0].rows if row[0].value == name)
     state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}

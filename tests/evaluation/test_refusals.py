@@ -80,7 +80,7 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
         advance(WORLDS, -WORLDS.vehicles.braking_capacity_mps2, until_s=0.1)[0], BRAKE, scenario=PAPER
     ),
     "must be worlds or a sample, as scenario.sample(n, seed) gives": lambda: eb.evaluate(5, BRAKE, scenario=PAPER),
-    "must be specs such as 'full_brake,ppo@shipped', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
+    "must be specs such as 'full_brake,ppo', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
     "agent 5: must be name or name:argument": lambda: eb.evaluate(agents=[5], scenario=PAPER, episodes=2),
     "the worlds are given; leave one of the two out": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER, episodes=2),
     "number of worlds = 0: must be a whole number, at least 1": lambda: eb.evaluate(

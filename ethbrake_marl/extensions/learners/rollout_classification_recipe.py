@@ -9,12 +9,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, refuse_shipped_path
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
 from ethbrake_marl.files.model import refuse
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy
+from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.agents import make_policy_agent
 from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, NonNegative, Positive, Shape, TrainingRecipe
@@ -36,7 +37,7 @@ class ChoosingShape(Shape):
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
-PolicyName = Annotated[str, Field(pattern=r"^[a-z]+@.+$", max_length=4096)]
+PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 
 
 class OptionsRecipe(TrainingRecipe):
@@ -157,10 +158,11 @@ class OptionsRecipe(TrainingRecipe):
         found: list[Policy] = []
         for name in self.among:
             kind, _, path = name.partition("@")
-            policy = load_named_policy(path)
-            where, by = f"recipe {self.name!r}: among: {name}", policy.manifest.algorithm
-            if path == SHIPPED or kind not in ("policy", by):
-                raise InvalidInput(f"{where}: give policy@shipped/NAME, or {by}@ and its path")
+            refuse_shipped_path(path, kind)
+            policy = load_policy(path) if path else load_shipped(kind)
+            by = policy.manifest.algorithm
+            if path and kind not in ("policy", by):
+                raise InvalidInput(f"recipe {self.name!r}: among: {name}: must be {by}@{path}")
             found += policy.among or [policy]
         if found and not self.drawn <= len(found):
             raise InvalidInput(f"recipe {self.name!r}: drawn = {self.drawn}: must be at most the {len(found)} of among")
@@ -172,6 +174,6 @@ OPTIONS = Part(OptionsRecipe, "ethbrake_marl.extensions.learners.rollout_classif
 OPTIONS_AGENT = Part(
     make_policy_agent,
     form="options@PATH",
-    about="a policy trained by options: a run, a bundle, or shipped",
+    about="a policy trained by options: a run or a bundle",
     knows=Source.MESSAGES,
 )

@@ -91,7 +91,7 @@ def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_const
     assert (harm <= bound + 1e-6).all()
 
 
-@pytest.mark.parametrize("spec", ["coast+step:believed", "coast+robust:believed", "ppo@shipped/ppo+episode:believed"])
+@pytest.mark.parametrize("spec", ["coast+step:believed", "coast+robust:believed", "ppo+episode:believed"])
 def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
     worlds = PERIODIC.sample(5, 3).worlds
     whole = drive(worlds, make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final

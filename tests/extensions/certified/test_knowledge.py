@@ -17,7 +17,7 @@ from tests.agents.test_knowledge import PAPER, agent_of, changed_decisions, chec
 BLOCKED = eb.load_scenario("cooperation-2-blocked")
 
 
-@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
+@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo+episode:believed"])
 @pytest.mark.parametrize("leak", ["known", "speed_mps"])
 def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
     honest = Told.to
@@ -159,11 +159,11 @@ STATED = {
     "coast+step:believed": (SENSORS, BELIEFS),
     "coast+robust:believed": (SENSORS, BELIEFS),
     "coast+robust:interior:believed": (SENSORS, BELIEFS),
-    "ppo@shipped/ppo+step:believed": (MESSAGES, BELIEFS),
-    "ppo@shipped/ppo+episode:believed": (MESSAGES, BELIEFS),
-    "ppo@shipped/ppo+episode:pairwise:believed": (MESSAGES, BELIEFS),
-    "ppo@shipped/ppo+robust": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+robust:interior": (MESSAGES, MODEL),
+    "ppo+step:believed": (MESSAGES, BELIEFS),
+    "ppo+episode:believed": (MESSAGES, BELIEFS),
+    "ppo+episode:pairwise:believed": (MESSAGES, BELIEFS),
+    "ppo+robust": (MESSAGES, MODEL),
+    "ppo+robust:interior": (MESSAGES, MODEL),
 }
 HONEST, SEEING = in_two(STATED)
 

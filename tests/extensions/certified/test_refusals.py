@@ -213,9 +213,7 @@ def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
 SLOW = PAPER.replace(brake_rate_mps3=9)
 PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 AGENTS: dict[str, Callable[[], object]] = {
-    "agent 'ppo@shipped+robust': mode robust needs an uncertainty": lambda: make_agent(
-        "ppo@shipped+robust", scenario=PAPER
-    ),
+    "agent 'ppo+robust': mode robust needs an uncertainty": lambda: make_agent("ppo+robust", scenario=PAPER),
     "agent 'e_v2x_bm:believed': needs a scenario: make_agent('e_v2x_bm:believed'": lambda: make_agent(
         "e_v2x_bm:believed"
     ),
@@ -253,5 +251,5 @@ def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
 
 
 def test_evaluation__of_a_robust_shield_needs_an_uncertainty(refuse: Refuse) -> None:
-    told = "agent 'ppo@shipped+robust': mode robust needs an uncertainty"
-    refuse("evaluate --agents ppo@shipped+robust", told)
+    told = "agent 'ppo+robust': mode robust needs an uncertainty"
+    refuse("evaluate --agents ppo+robust", told)

@@ -50,7 +50,7 @@ def test_believed__of_a_missing_piece_is_the_middle_of_its_range() -> None:
     )
 
 
-@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
+@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo+episode:believed"])
 def test_believed__messages_that_contain_everything_change_nothing(spec: str) -> None:
     harms = []
     for scenario in (BASE, telling([*USUAL_PIECES]), telling([*PIECES])):

@@ -54,9 +54,9 @@ def same(one, other):
     [
         ("full_brake", "paper-random"),
         ("e_v2x_bm", "paper-random"),
-        ("ppo@shipped", "paper-random"),
+        ("ppo", "paper-random"),
         ("r157_human", "paper-random"),
-        ("ppo@shipped+step", "paper-random"),
+        ("ppo+step", "paper-random"),
         ("planner:8+step:believed", "paper-random"),
         ("constant:3+episode", "paper-random"),
         ("full_brake+step", "cooperation-3-pair"),
@@ -120,7 +120,7 @@ class Jittery(Bench):
 
 def test_host__with_a_jittery_clock_gives_the_same_bits():
     worlds = PAPER.sample(100, 7).worlds
-    for agent in ("ppo@shipped+step:believed", "r157_human"):
+    for agent in ("ppo+step:believed", "r157_human"):
         driver = eb.make_agent(agent, scenario=PAPER)
         one, other = (drive_host(make(worlds), driver, PAPER, worlds).outcome for make in (Bench, Jittery))
         assert same(one.ledger, other.ledger) and one.ledger.collided.any()

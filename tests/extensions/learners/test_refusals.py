@@ -69,7 +69,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "recipe 'counterfactual': gradient_limit = often: must be auto or a finite number above 0": lambda: (
         TINY_COUNTERFACTUAL.replace(gradient_limit="often")
     ),
-    "must be ppo@, counterfactual@ or universal@": lambda: TINY_COUNTERFACTUAL.replace(start="sac@shipped"),
+    "start = sac@x: must be the name of a shipped policy, for instance ppo, or": lambda: TINY_COUNTERFACTUAL.replace(
+        start="sac@x"
+    ),
+    "'ppo@shipped' is now written ppo": lambda: TINY_COUNTERFACTUAL.replace(start="ppo@shipped"),
     "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_COUNTERFACTUAL.replace(n_envs=2**22),
     "must be single, shared, independent or centralised": lambda: TINY_COUNTERFACTUAL.replace(scheme="centralized"),
     "recipe 'options': memory = 15: must be at least tried = 16": lambda: TINY_OPTIONS.replace(memory=15),
@@ -83,10 +86,10 @@ REFUSED: dict[str, Callable[[], object]] = {
         load_recipe("counterfactual").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
     ),
     "recipe 'options': drawn = 2: must be at most the 1 of among": lambda: train(
-        load_recipe("options").replace(among=["policy@shipped/ppo"]), "paper-random", "new"
+        load_recipe("options").replace(among=["ppo"]), "paper-random", "new"
     ),
-    "recipe 'options': among: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
-        load_recipe("options").replace(among=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
+    "'policy@shipped/ppo' is now written ppo": lambda: train(
+        load_recipe("options").replace(among=["policy@shipped/ppo"], drawn=1), "paper-random", "new"
     ),
     "recipe 'counterfactual': modes: are for one learner, not for 2": lambda: train(TINY_MODES, PAIR, Path("run")),
 }
@@ -101,4 +104,4 @@ def test_recipe_or_training__is_refused(message: str) -> None:
 
 def test_policy_to_choose_among__is_one_that_ships(empty_folder: Path) -> None:
     with refused("unknown shipped policy 'nobody'", UnknownName):
-        train(load_recipe("options").replace(among=["policy@shipped/nobody"], drawn=1), "paper-random", "new")
+        train(load_recipe("options").replace(among=["nobody"], drawn=1), "paper-random", "new")

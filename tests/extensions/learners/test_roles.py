@@ -4,7 +4,7 @@ import pytest
 
 from tests.agents.test_roles import SCENARIOS, check_role
 
-SPECS = {"counterfactual": ["counterfactual@shipped"], "options": ["options@shipped"]}
+SPECS = {"counterfactual": ["counterfactual@mine"], "options": ["options@mine"]}
 
 
 @pytest.mark.parametrize("kind", SPECS)

@@ -12,9 +12,9 @@ STATED = {
     "planner:20": (MODEL,),
     "best_harm:20": (MODEL,),
     "planner:20:believed": (BELIEFS,),
-    "ppo@shipped/ppo+search+episode": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+search+step": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+search": (MESSAGES, MODEL),
+    "ppo+search+episode": (MESSAGES, MODEL),
+    "ppo+search+step": (MESSAGES, MODEL),
+    "ppo+search": (MESSAGES, MODEL),
 }
 USUAL = {"planner": "planner:20", "planner:believed": "planner:20:believed", "best_harm": "best_harm:20"}  # budgets
 HONEST, SEEING = in_two(STATED)
