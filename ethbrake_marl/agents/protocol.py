@@ -25,7 +25,7 @@ class Source(StrEnum):
 
     SENSORS = "own sensors"  # the own vehicle, and the neighbours that its sensors see
     MESSAGES = "messages"  # the messages that have reached it
-    BELIEFS = "believed model"  # also the scenario's ranges, scripts and physics, but no hidden values
+    ESTIMATES = "estimated model"  # also the scenario's ranges, scripts and physics, but no hidden values
     STATE = "true state"  # the other vehicles' true states, capacities and latencies, received or not
     MODEL = "true model"  # also masses, restitution, scripts: all that an exact simulation of the line needs
     UNSTATED = "not stated"  # the agent does not state its knowledge

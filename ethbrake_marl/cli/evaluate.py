@@ -104,7 +104,7 @@ def evaluate_command(
     `ethbrake agent list` shows all agents; ladder stands for all of them from coast to best_harm. Behind any agent:
     +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
     PATH is a run or a policy bundle. +robust needs an uncertainty, which is given in Python;
-    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
+    +robust:estimated needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
     impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
     """
     from ethbrake_marl.agents.spec import split_specs

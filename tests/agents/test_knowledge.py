@@ -78,7 +78,7 @@ class Hosted:
     def begin(self, alert: eb.Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
         shield = options.shield(scenario, vehicle, scripts)
-        if getattr(options, "believed", False):
+        if getattr(options, "estimated", False):
             shield.begin(alert, np.arange(alert.n))
         else:
             shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
@@ -88,7 +88,7 @@ class Hosted:
         (shield, *_), policy = memory
         proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
         proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
-        if getattr(self.driver.options, "believed", False):
+        if getattr(self.driver.options, "estimated", False):
             applied = shield.decide(worlds, proposed, proposer)
         else:
             applied = shield.decide(
@@ -99,8 +99,8 @@ class Hosted:
 
 PAPER = eb.load_scenario("paper-random")
 BLOCKED = eb.load_scenario("cooperation-2-blocked")
-SENSORS, MESSAGES, BELIEFS, STATE, MODEL = (
-    Source.SENSORS, Source.MESSAGES, Source.BELIEFS, Source.STATE, Source.MODEL,
+SENSORS, MESSAGES, ESTIMATES, STATE, MODEL = (
+    Source.SENSORS, Source.MESSAGES, Source.ESTIMATES, Source.STATE, Source.MODEL,
 )  # fmt: skip
 STATED = {  # every agent of the core: all of the registry, and what ``make_lineup`` makes of policies
     "full_brake": (SENSORS,),
@@ -207,7 +207,7 @@ def test_knowledge__every_agent_of_the_registry_stands_in_the_table():
 
 def check_stated(spec, agent, knows):
     assert Knowledge.of(agent) == knows
-    if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
+    if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":estimated"):
         assert Knowledge.of(find_entry(parse_spec(spec))) == knows, "`ethbrake agent list` says something else"
 
 
@@ -219,7 +219,7 @@ def test_knowledge__every_agent_states_it(spec, knows):
 def with_channels(honest):
     """Each of these agents in each channel that hides something.
 
-    What goes around an agent, or believes, sees what it is told; the fast ones are three kinds of telling.
+    What goes around an agent, or estimates, sees what it is told; the fast ones are three kinds of telling.
     """
     return [
         pytest.param(*spec.values, channel, marks=[*spec.marks, *slow])

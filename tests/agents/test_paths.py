@@ -73,7 +73,7 @@ def test_folder__that_is_not_there_separates_as_before():
 def test_folder__that_is_called_like_a_list_of_agents_is_none_of_them():
     put("full_brake,coast")
     assert split_specs("full_brake,coast") == ["full_brake", "coast"]
-    assert split_specs("coast+robust:believed,coast+step") == ["coast+robust:believed", "coast+step"]
+    assert split_specs("coast+robust:estimated,coast+step") == ["coast+robust:estimated", "coast+step"]
     put("a")
     put("b")
     assert split_specs("ppo@a,ppo@b,coast") == ["ppo@a", "ppo@b", "coast"]

@@ -314,7 +314,7 @@ def test_knowledge__is_of_known_kinds(knows: Any) -> None:
     agent = Own(len)
     agent.knows = knows
     with refused(
-        f"agent 'own': knows = {knows!r}: must be one or several of 'own sensors', 'messages', 'believed model'"
+        f"agent 'own': knows = {knows!r}: must be one or several of 'own sensors', 'messages', 'estimated model'"
     ):
         Knowledge.of(agent)
 

@@ -69,9 +69,9 @@ def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
 def test_price__is_nothing_where_everything_is_known():
     found = price.drive(BASE, 12, {"paper": {"preset": "paper"}})["paper"]
     for count in price.COUNTS:
-        assert price.price(found, "e_v2x_bm:believed", count).value == pytest.approx(0.0, abs=1e-4)
-    assert price.above(found, "e_v2x_bm:believed") is None
-    assert price.above(found, f"{price.POLICY}+step:believed").value == 0.0
+        assert price.price(found, "e_v2x_bm:estimated", count).value == pytest.approx(0.0, abs=1e-4)
+    assert price.above(found, "e_v2x_bm:estimated") is None
+    assert price.above(found, f"{price.POLICY}+step:estimated").value == 0.0
 
 
 def test_price__is_paired_by_world_and_told_of_both_counts():
@@ -79,11 +79,11 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
     over = BASE.replace(v2x="sensors-only")
     harm = {
         spec: drive(over.sample(30, 7).worlds, make_agent(spec, scenario=over), over, 1).ledger
-        for spec in ("e_v2x_bm", "e_v2x_bm:believed")
+        for spec in ("e_v2x_bm", "e_v2x_bm:estimated")
     }
     for count in price.COUNTS:
-        told = price.price(found["sensors-only"], "e_v2x_bm:believed", count)
-        difference = harm["e_v2x_bm:believed"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
+        told = price.price(found["sensors-only"], "e_v2x_bm:estimated", count)
+        difference = harm["e_v2x_bm:estimated"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
         assert told.value == pytest.approx(difference.mean(), abs=1e-9)
     heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
     tables = [table for table in BASELINES if table.columns[0] == "channel"]

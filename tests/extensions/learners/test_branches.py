@@ -121,7 +121,7 @@ def test_first_moments__are_where_the_episodes_begin(script: str) -> None:
     ("make", "given"),
     [
         *((scripted, script) for script in SCRIPTS),
-        *((shielded, options) for options in ({}, {"believed": True}, {"mode": "episode"})),
+        *((shielded, options) for options in ({}, {"estimated": True}, {"mode": "episode"})),
         (shielded, {"mode": "robust", "uncertainty": "gaps_m=0.5"}),
     ],
     ids=lambda each: getattr(each, "__name__", str(each)),

@@ -93,7 +93,7 @@ def test_left_out__worlds_are_named_and_left_out_for_all_agents() -> None:
 
 
 def test_lineup__of_the_ladder_is_every_rung() -> None:
-    assert list(make_lineup(["ladder", "constant:5", "e_v2x_bm:pairwise:believed"], PAPER)) == [
+    assert list(make_lineup(["ladder", "constant:5", "e_v2x_bm:pairwise:estimated"], PAPER)) == [
         "coast",
         "full_brake",
         "e_v2x_bm:pairwise",
@@ -101,5 +101,5 @@ def test_lineup__of_the_ladder_is_every_rung() -> None:
         "planner",
         "best_harm",
         "constant:5",
-        "e_v2x_bm:pairwise:believed",
+        "e_v2x_bm:pairwise:estimated",
     ]
