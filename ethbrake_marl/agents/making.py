@@ -76,7 +76,7 @@ def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
         settings, entry = replace(settings, spec=f"{settings.spec}+{each}"), around_entry(each)
         if isinstance(driver, Team) and not entry.teams:
             raise InvalidInput(
-                f"agent {settings.spec!r}: is a team, and +{each} is for one driven vehicle, the others following"
+                f"agent {settings.spec!r}: is a team, and +{each} is for one controlled vehicle, the others following"
                 " scripts (--set roles.vehicle_3=full_brake); +step goes around a team; else name one policy of the"
                 " team (ppo@RUN/policy/vehicle_2)"
             )

@@ -115,7 +115,7 @@ def test_role__does_what_a_driver_does_in_an_evaluation(name):
 
 @pytest.mark.parametrize("around", ["+episode", "+step"])
 def test_role__has_nothing_around_it(around):
-    """Two that roll themselves out would ask each other for ever, and a shield stands around who is driven."""
+    """Two that roll themselves out would ask each other for ever, and a shield stands around the controlled vehicle."""
     check_nothing_around("e_v2x_bm:pairwise", around)
 
 

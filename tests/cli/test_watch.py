@@ -103,7 +103,9 @@ def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) ->
         registry.AGENTS.loaded, "team", Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     )
     assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
-    with pytest.raises(InvalidInput, match=r"'team@run\+episode': is a team, and \+episode is for one driven vehicle"):
+    with pytest.raises(
+        InvalidInput, match=r"'team@run\+episode': is a team, and \+episode is for one controlled vehicle"
+    ):
         make_lineup(["team@run+episode"], scenario)
 
 

@@ -34,8 +34,9 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``: the same shield for the ranges of what the
-    vehicle did not receive.
+    """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
+
+    It is the same shield, for the ranges of what the vehicle did not receive.
 
     Args:
         policy: the agent to shield.
@@ -71,8 +72,9 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 in the estimated
-    world.
+    """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``.
+
+    It is the paper's Algorithm 1 in the estimated world.
 
     At the first decision it predicts the harm of ``policy`` and of E-V2X-BM (the best constant deceleration) in that
     world; the better one controls the whole episode.
@@ -92,8 +94,9 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``: E-V2X-BM (the best constant deceleration)
-    in the estimated world.
+    """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
+
+    It is E-V2X-BM (the best constant deceleration) in the estimated world.
 
     ``argument`` is ``pairwise`` or None; ``settings`` hold the scenario.
     """

@@ -39,8 +39,7 @@ class RobustGuard(StepGuard):
 
 
 class EstimatedGuard(ShieldGuard):
-    """Guard of modes ``step`` and ``robust`` in the estimated world: lets an ``EstimatedShield`` decide on the actions in
-    each step of a running engine.
+    """Guard of modes ``step`` and ``robust`` in the estimated world: an ``EstimatedShield`` decides on the actions.
 
     Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
     with the prediction, because an estimate may be wrong without a fault of the system.

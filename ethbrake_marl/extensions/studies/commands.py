@@ -178,7 +178,10 @@ def _end_study(out: Out, told: str, *, interrupted: bool, failed: bool) -> None:
 @study_group.command("falsify", epilog=example("study falsify --agent ppo --against e_v2x_bm --output worst.yaml"))
 def falsify_command(
     agent: Annotated[
-        str | None, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.", show_default="universal")
+        str | None,
+        typer.Option(
+            help="Agent that controls the vehicle; any agent of `ethbrake evaluate`.", show_default="universal"
+        ),
     ] = None,
     measure: Annotated[
         str | None,

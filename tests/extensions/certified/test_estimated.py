@@ -1,4 +1,4 @@
-"""Shields over estimated worlds: the bound where the world is a corner of what is open, and what they are without it."""
+"""Shields over estimated worlds: the bound in worlds that are corners of what is open, and in others."""
 
 from typing import Any
 
@@ -35,7 +35,7 @@ def test_robust__at_the_corners_no_world_is_above_the_first_bound(name: str, way
 
 
 def test_robust__between_the_corners_some_worlds_are_above_though_trusted_and_none_inside_the_box() -> None:
-    """The counterexample of docs/extensions/certified.md: whoever proposes to coast, in the first world of seed 5006."""
+    """The counterexample of docs/extensions/certified.md: coasting, in the first world of seed 5006."""
     harm, bound = {}, {}
     for robust in ("members", "interior"):
         settings = {"robust": "interior"} if robust == "interior" else {}
@@ -126,7 +126,7 @@ def test_estimated__shields_other_lines(scenario: eb.Scenario, robust: str | Non
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("script", ["coast", "e_v2x_bm"])
-def test_estimated__the_script_of_the_driven_vehicle_itself_does_not_count(spec: str, script: str) -> None:
+def test_estimated__the_script_of_the_controlled_vehicle_itself_does_not_count(spec: str, script: str) -> None:
     scripted = BASE.replace(roles={"vehicle_1": "full_brake", "vehicle_2": script, "vehicle_3": "full_brake"})
     worlds = scripted.sample(3, 1).worlds
     harms = [

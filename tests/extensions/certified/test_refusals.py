@@ -204,7 +204,7 @@ def test_interior__takes_no_script_that_it_cannot_enclose() -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
     gentle = PAPER.replace(early_impacts="keep", roles=roles)
     with refused(
-        "vehicle_3 is driven by 'e_v2x_bm:pairwise', which it cannot enclose; full_brake, coast and constant:A"
+        "vehicle_3 is controlled by 'e_v2x_bm:pairwise', which it cannot enclose; full_brake, coast and constant:A"
     ):
         RobustShield(gentle, 1, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior")
 
@@ -237,7 +237,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     ":estimated: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
         evaluated(make_agent("full_brake+step:estimated", scenario=PIECES), PIECES)
     ),
-    "shield: robust interior: vehicle_1 is driven by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
+    "shield: robust interior: vehicle_1 is controlled by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
         make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES
     ),
 }
@@ -257,7 +257,7 @@ def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
     team = Team.of(make_agent("coast"), [1, 2])
     entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     monkeypatch.setitem(registry.AGENTS.loaded, "team", entry)
-    with refused("'team@run+robust': is a team, and +robust is for one driven vehicle"):
+    with refused("'team@run+robust': is a team, and +robust is for one controlled vehicle"):
         make_lineup(["team@run+robust"], PAIR)
 
 

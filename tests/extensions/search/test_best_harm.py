@@ -439,7 +439,7 @@ def test_known_limits__are_the_proof_and_the_best_known() -> None:
 def test_known_limits__say_why_nothing_is_proven() -> None:
     coasts = load_scenario("cooperation-3-pair").replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})
     for task, why in (
-        (Task(SCENARIO, ()), "driven are: none; avoidability is proven for one vehicle"),
+        (Task(SCENARIO, ()), "controlled are: none; avoidability is proven for one vehicle"),
         (Task(coasts, (1, 2)), "vehicle_1 follows coast; harm is bounded where it follows full_brake"),
     ):
         assert known_limits(LISTED, task) == Unproven(why)
