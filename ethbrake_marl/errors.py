@@ -36,6 +36,18 @@ RENAMED: dict[str, str] = {  # old name -> new name, for messages
     "alone": "pretraining_first",
     "further": "pretraining_others",
     "together": "joint",
+    "believed": "estimated",
+    "ppo-paper-random-obstacle": "ppo-obstacle",
+    "options-paper-random-obstacle-total": "rollout-obstacle",
+    "counterfactual-paper-random-preference": "vine-preference",
+    "counterfactual-cooperation-1-front": "vine-front",
+    "counterfactual-cooperation-3-pair": "vine-pair",
+    "counterfactual-cooperation-4-all": "vine-all",
+    "ppo@shipped": "ppo (ppo-obstacle on paper-random-obstacle)",
+    "policy@shipped": "universal (the policies for one scenario: docs/reference/policies.md)",
+    "team@shipped": "universal (the policies for one scenario: docs/reference/policies.md)",
+    "options@shipped": "rollout-obstacle",
+    "counterfactual@shipped": "vine-preference, vine-front, vine-pair or vine-all",
 }
 
 
@@ -276,6 +288,17 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     own = "; one of your own must be registered or installed first (docs/extending.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
+
+
+def refuse_shipped_path(path: str, agent: str = "") -> None:
+    """Raise ``UnknownName`` if ``path`` is ``shipped`` or ``shipped/NAME``; that was how to write a shipped policy.
+
+    ``agent``: the name before the ``@``, in ``agent@path``; "" for a path alone.
+    """
+    folder, _, name = path.partition("/")
+    if folder == "shipped":
+        old, name = f"{agent}@{path}" if agent else path, name or f"{agent}@{path}"
+        raise UnknownName(f"{old!r} is now written {RENAMED.get(name, name.partition('@')[0])}")
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:

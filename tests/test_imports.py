@@ -170,7 +170,7 @@ for name in ("train", "resume", "TrainResult", "make_sb3_vec_env", "EthBrakeVecE
         assert str(error).endswith({line!r})
     else:
         sys.exit(f"{{name}} was imported")
-lineup = "ppo@shipped,ppo@shipped+episode,e_v2x_bm"
+lineup = "ppo,ppo+episode,e_v2x_bm"
 assert run_command(["evaluate", "--agents", lineup, "--episodes", "20", "--json"]) == 0
 assert run_command(["doctor", "speed", "--quick"]) == 2
 sys.exit(run_command(["train", "--steps", "1"]))

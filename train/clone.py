@@ -1,11 +1,11 @@
 """Behaviour cloning: a network that does what an agent did, learnt from a dataset alone. Read it from top to bottom.
 
-    write_dataset("runs/ppo.parquet", "ppo@shipped", scenario="paper-random", episodes=10_000, seed=1)  # in Python
+    write_dataset("runs/ppo.parquet", "ppo", scenario="paper-random", episodes=10_000, seed=1)  # in Python
     python train/clone.py runs/ppo.parquet --output runs/clone
-    ethbrake evaluate --agents full_brake,ppo@shipped,train/clone.py:make_agent:runs/clone,best_harm --episodes 2000
+    ethbrake evaluate --agents full_brake,ppo,train/clone.py:make_agent:runs/clone,best_harm --episodes 2000
 
 The worlds of the list of seed 1 are others than those of seed 7, on which `ethbrake evaluate` measures. What a clone
-can reach depends on whom it watches: ppo@shipped sees what the clone sees; best_harm chose with hindsight.
+can reach depends on whom it watches: ppo sees what the clone sees; best_harm chose with hindsight.
 """
 
 from __future__ import annotations
@@ -132,4 +132,4 @@ if __name__ == "__main__":
         train(given.dataset, given.seed, given.output)
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
-    print(f"cloned: {given.output}; ethbrake evaluate --agents ppo@shipped,{__file__}:make_agent:{given.output}")
+    print(f"cloned: {given.output}; ethbrake evaluate --agents ppo,{__file__}:make_agent:{given.output}")

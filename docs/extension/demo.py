@@ -21,8 +21,8 @@ OWN = "A shipped policy"
 AGENTS = {
     "Full braking": "full_brake",
     "E-V2X-BM": "e_v2x_bm",
-    "PPO trained for the main test": "ppo@shipped/ppo",
-    OWN: "policy@shipped",
+    "PPO trained for the main test": "ppo",
+    OWN: "universal",
     "Best known, with hindsight": "best_harm",
 }
 TESTS: dict[str, tuple[str, HarmCount]] = {  # scenario, the harm to read

@@ -16,12 +16,7 @@ from ethbrake_marl.physics.advance import advance
 
 WORLDS, SEARCHED, SEED = 1_000, 400, 7
 BASE = eb.load_scenario("paper-random")
-AGENTS = {
-    "full_brake": "full_brake",
-    "e_v2x_bm": "e_v2x_bm",
-    "universal": "universal@shipped",
-    "main": "ppo@shipped/ppo",
-}
+AGENTS = {"full_brake": "full_brake", "e_v2x_bm": "e_v2x_bm", "universal": "universal", "main": "ppo"}
 AT_ONCE = 1e6
 CASES = {
     "at once": (AT_ONCE,) * 3,

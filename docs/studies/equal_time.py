@@ -26,7 +26,7 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 
 AGENTS = (
-    "ppo@shipped+search", "ppo@shipped", "universal@shipped", "full_brake+search", "e_v2x_bm",
+    "ppo+search", "ppo", "universal", "full_brake+search", "e_v2x_bm",
     *(f"best_harm:{candidates}" for candidates in (1000, 3000, 10_000, 40_000)),
     *(f"planner:{candidates}" for candidates in (64, 256, 1024)),
 )  # fmt: skip

@@ -26,13 +26,13 @@ from ethbrake_marl.scenario.schema import Scenario
 
 SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
-POLICY = "ppo@shipped/ppo"
-ALONE = ("full_brake", POLICY)  # who says nothing of ``believed``
+POLICY = "ppo"
+ALONE = ("full_brake", POLICY)  # who says nothing of ``estimated``
 LIMITS = {  # who decides on what was received -> the same one that reads the line as it is
-    "e_v2x_bm:believed": "e_v2x_bm",
-    "planner:128:believed": "planner:128",
-    f"{POLICY}+step:believed": f"{POLICY}+step",
-    f"{POLICY}+robust:believed": f"{POLICY}+step",  # no robust shield knows all
+    "e_v2x_bm:estimated": "e_v2x_bm",
+    "planner:128:estimated": "planner:128",
+    f"{POLICY}+step:estimated": f"{POLICY}+step",
+    f"{POLICY}+robust:estimated": f"{POLICY}+step",  # no robust shield knows all
 }
 COUNTS = ("first", "total")
 CAPTION = (

@@ -53,7 +53,7 @@ def single_times(decisions: int) -> list[float]:
 
 def policy_times(decisions: int, later: bool) -> list[float]:
     """Processor seconds per decision of a learned policy behind the shield, one world at a time."""
-    (policy,) = make_agents(["ppo@shipped"], SCENARIO).values()
+    (policy,) = make_agents(["ppo"], SCENARIO).values()
     took: list[float] = []
     world = 0
     while len(took) < decisions:
@@ -75,8 +75,8 @@ def main(decisions: int = 5_000) -> None:
         print(f"{members} members a world ({intervals or 'step mode'}): {rate:,.0f} decisions/s batched", flush=True)
     for told, took in (
         ("one decision", single_times(decisions)),
-        ("ppo@shipped behind it, inference included, with later rollouts", policy_times(decisions, True)),
-        ("ppo@shipped behind it, inference included, without", policy_times(decisions, False)),
+        ("ppo behind it, inference included, with later rollouts", policy_times(decisions, True)),
+        ("ppo behind it, inference included, without", policy_times(decisions, False)),
     ):
         middle, slow = np.quantile(took, [0.5, 0.99]) * 1e6
         print(f"{told}: p50 {middle:.0f} us, p99 {slow:.0f} us", flush=True)

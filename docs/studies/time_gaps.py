@@ -20,7 +20,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 WORLDS, SEED = 2000, 7
 GAPS_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4)
-AGENTS = ("full_brake", "e_v2x_bm", "idm", "universal@shipped", "best_harm")
+AGENTS = ("full_brake", "e_v2x_bm", "idm", "universal", "best_harm")
 SCENARIOS = ("paper-random", "realistic-motorway")
 LEAST = 0.05  # mean harm of full braking (m2/s2) below which no share of it is shown
 

@@ -121,8 +121,8 @@ def episode_engine(
         for_one = ", ".join(f"+{name}" for name in around_one_vehicle())
         raise InvalidInput(
             f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
-            f" {', '.join(undriven)} of scenario {scenario.name!r} must be driven too. An agent that rolls itself out"
-            f" ({for_one}) can drive one learner, the others need scripts"
+            f" {', '.join(undriven)} of scenario {scenario.name!r} must be controlled too. An agent that rolls itself"
+            f" out ({for_one}) can drive one learner, the others need scripts"
         )
     scripts = script_agents(scenario, except_for=drivers)
     shield = team.shield

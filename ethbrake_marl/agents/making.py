@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team, check_agent
-from ethbrake_marl.agents.registry import AGENTS, PROFILE, Entry, agent_names, around_entry, group_names
+from ethbrake_marl.agents.registry import AGENTS, PROFILE, Entry, agent_names, around_entry, group_names, variants_of
 from ethbrake_marl.agents.settings import HORIZON_S, AgentSettings
 from ethbrake_marl.agents.spec import AgentSpec, parse_spec
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
+from ethbrake_marl.errors import RENAMED, EthBrakeError, InvalidInput, describe_error, unknown_name
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.catalogue import load_scenario
@@ -35,11 +35,10 @@ def make_agent(
 
     Args:
         spec: ``name[:argument][@policy]`` and wrappers, for example ``constant:3.5``, ``planner:64``,
-            ``ppo@shipped+search+step``; ``ethbrake agent list`` lists all. ``my_file.py:make_agent`` runs that file,
+            ``ppo+search+step``; ``ethbrake agent list`` lists all. ``my_file.py:make_agent`` runs that file,
             which can do whatever you can: its function gets the arguments of a factory (see ``register_agent``), or
             none.
-        scenario: scenario, its name or the path of its file; needed by teams, by wrappers, and to find the shipped
-            policy for this scenario.
+        scenario: scenario, its name or the path of its file; needed by teams and by wrappers.
         harm_count: impacts whose harm an optimising agent minimises: ``first`` (each pair's first) or ``total`` (all).
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: upper limit for the candidates of a search, to try an agent out quickly.
@@ -51,8 +50,8 @@ def make_agent(
     or horizon, and for a missing scenario.
 
     >>> import ethbrake_marl as eb
-    >>> eb.make_agent("ppo@shipped+step", scenario="paper-random").name
-    'ppo@shipped+step'
+    >>> eb.make_agent("ppo+step", scenario="paper-random").name
+    'ppo+step'
 
     """
     check_harm_count(harm_count)
@@ -77,7 +76,7 @@ def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
         settings, entry = replace(settings, spec=f"{settings.spec}+{each}"), around_entry(each)
         if isinstance(driver, Team) and not entry.teams:
             raise InvalidInput(
-                f"agent {settings.spec!r}: is a team, and +{each} is for one driven vehicle, the others following"
+                f"agent {settings.spec!r}: is a team, and +{each} is for one controlled vehicle, the others following"
                 " scripts (--set roles.vehicle_3=full_brake); +step goes around a team; else name one policy of the"
                 " team (ppo@RUN/policy/vehicle_2)"
             )
@@ -111,7 +110,7 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
 def find_entry(spec: AgentSpec | str) -> Entry:
     """Return the registry's entry of an agent.
 
-    ``spec`` is a specification such as ``planner:64`` or ``ppo@shipped``, as a text or parsed. Raises ``UnknownName``
+    ``spec`` is a specification such as ``planner:64`` or ``ppo``, as a text or parsed. Raises ``UnknownName``
     with a suggestion for an unknown agent; ``InvalidInput`` for an argument or a policy that the agent does not take.
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
@@ -125,6 +124,9 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     entry = AGENTS[written.name]
     if written.argument is not None and ":" not in entry.whole_form:
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no argument")
+    word = (written.argument or "").rpartition(":")[2]
+    if RENAMED.get(word) in variants_of(written.name):
+        raise unknown_name(f"variant of {written.name}", word, variants_of(written.name))
     if written.policy is not None and "@" not in entry.form:
         own = "" if entry.is_ours else "; register_agent(..., takes_policy=True) says that it does"
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")

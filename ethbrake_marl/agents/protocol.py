@@ -25,7 +25,7 @@ class Source(StrEnum):
 
     SENSORS = "own sensors"  # the own vehicle, and the neighbours that its sensors see
     MESSAGES = "messages"  # the messages that have reached it
-    BELIEFS = "believed model"  # also the scenario's ranges, scripts and physics, but no hidden values
+    ESTIMATES = "estimated model"  # also the scenario's ranges, scripts and physics, but no hidden values
     STATE = "true state"  # the other vehicles' true states, capacities and latencies, received or not
     MODEL = "true model"  # also masses, restitution, scripts: all that an exact simulation of the line needs
     UNSTATED = "not stated"  # the agent does not state its knowledge
@@ -156,7 +156,7 @@ def fixed_commands(
         if not is_fixed(script):
             name = getattr(script, "name", type(script).__name__)
             raise InvalidInput(
-                f"{who}: vehicle_{i + 1} is driven by {name!r}, whose command is not fixed at the alert{advice}"
+                f"{who}: vehicle_{i + 1} is controlled by {name!r}, whose command is not fixed at the alert{advice}"
             )
         command[:, i], _ = ask_script(script, worlds, begin_script(script, worlds, i, scripts), i)
     told = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
@@ -274,7 +274,9 @@ class Team:
             if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not vehicle >= 0:
                 raise InvalidInput(f"team {name!r}: {vehicle!r}: must be the index of a vehicle, 0 or more")
             if not isinstance(agent, Agent):
-                raise InvalidInput(f"team {name!r}: vehicle_{vehicle + 1} is driven by {agent!r}, which is no agent")
+                raise InvalidInput(
+                    f"team {name!r}: vehicle_{vehicle + 1} is controlled by {agent!r}, which is no agent"
+                )
         self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
         self.name, self.shield = name, shield
 

@@ -43,7 +43,7 @@ class Entry:
 
     @property
     def whole_form(self) -> str:
-        """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:believed]``.
+        """``form`` followed by each registered variant in brackets, for example ``e_v2x_bm[:pairwise][:estimated]``.
 
         A variant is a last word that selects another function to make the agent or wrapper.
         """
@@ -51,7 +51,7 @@ class Entry:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Every way to write a wrapper after the ``+`` of a specification, for example ``("step", "step:believed")``.
+        """Every way to write a wrapper after the ``+`` of a specification, for example ``("step", "step:estimated")``.
 
         Only for a wrapper whose ``form`` lists all arguments that it takes.
         """
@@ -71,7 +71,7 @@ class Entry:
 
         Args:
             argument: text after the first colon, such as ``pairwise``; if its last word is a registered variant
-                (``pairwise:believed``), the variant's function is called. None: no argument.
+                (``pairwise:estimated``), the variant's function is called. None: no argument.
             settings: passed on to the function that makes it.
             inside: for a wrapper, the one agent or team that it goes around.
 
@@ -109,7 +109,7 @@ def agent_entries() -> tuple[Entry, ...]:
 def _with_variants(entry: Entry) -> Entry:
     """Return ``entry`` with its variants added to ``form`` and ``about``, as far as they can be loaded.
 
-    A variant is a last word that selects another function: ``e_v2x_bm`` becomes ``e_v2x_bm[:believed]``, with the
+    A variant is a last word that selects another function: ``e_v2x_bm`` becomes ``e_v2x_bm[:estimated]``, with the
     variant's description.
     """
     usable = VARIANTS.usable()
@@ -161,9 +161,9 @@ def shield_modes() -> dict[str, Any]:
 
 
 def variants_of(name: str) -> tuple[str, ...]:
-    """Return the variants of the agent or shield called ``name``, for example ``("believed",)``.
+    """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``.
 
-    A variant is a last word after a further colon, as in ``episode:pairwise:believed``, that selects another function
+    A variant is a last word after a further colon, as in ``episode:pairwise:estimated``, that selects another function
     to make the agent or shield.
     """
     keys = (key.rpartition(".") for key in VARIANTS)
@@ -171,7 +171,7 @@ def variants_of(name: str) -> tuple[str, ...]:
 
 
 def is_variant(form: str) -> bool:
-    """Return whether the last word of ``form`` is a registered variant, as in ``step:believed``.
+    """Return whether the last word of ``form`` is a registered variant, as in ``step:estimated``.
 
     ``form``: an agent or shield with its argument, without ``+``.
     """
@@ -182,7 +182,7 @@ def settings_needed(shield: str | None) -> Mapping[str, object]:
     """Return the settings that a shield requires, each with an example: ``{"uncertainty": "gaps_m=0.5"}``.
 
     ``shield`` is a shield with its argument, such as ``robust`` or ``episode:pairwise``. The result is empty for None
-    and for a variant, such as ``robust:believed``.
+    and for a variant, such as ``robust:estimated``.
     """
     return {} if shield is None or is_variant(shield) else around_entry(shield).needs
 

@@ -53,7 +53,7 @@ Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
 
 
 class Variant(NamedTuple):
-    """Variant of an agent or a shield, selected by a last word: ``believed`` in ``step:believed``."""
+    """Variant of an agent or a shield, selected by a last word: ``estimated`` in ``step:estimated``."""
 
     make: Factory | Wrapper  # makes the agent or wrapper in place of the original function
     about: str  # description in one line

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 
 from ethbrake_marl.agents.registry import SHIELDS, around_entry, around_forms, shield_forms
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, refuse_shipped_path, unknown_name
 from ethbrake_marl.scenario.roles import ScriptSpec
 
 _IN_FILE = re.compile(r":(?P<function>[A-Za-z_]\w*)(:(?P<argument>[^\s@]+))?(@(?P<policy>.+))?")
@@ -25,16 +25,16 @@ _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
 @dataclass(frozen=True, slots=True)
 class AgentSpec:
-    """Parsed agent specification, for example of ``ppo@shipped+search+step``."""
+    """Parsed agent specification, for example of ``ppo+search+step``."""
 
     name: str  # plain name of the agent, or FILE.py:FUNCTION
     argument: str | None  # text after the colon; None without one
-    policy: str | None  # text after the @: a path, or "shipped"; None without one
+    policy: str | None  # text after the @: a path; None without one
     around: tuple[str, ...]  # searches and shields with their arguments, innermost first, as ("search", "step")
 
     @property
     def core(self) -> str:
-        """Specification without the searches and shields around the agent, for example ``ppo@shipped``."""
+        """Specification without the searches and shields around the agent, for example ``ppo@runs/x``."""
         argument = "" if self.argument is None else f":{self.argument}"
         return f"{self.name}{argument}" + ("" if self.policy is None else f"@{self.policy}")
 
@@ -58,7 +58,7 @@ def parse_spec(spec: str) -> AgentSpec:
 
     ``ppo@c+step`` is the folder ``c+step`` if it exists, otherwise the folder ``c`` behind the shield; ``ppo@c/+step``
     is always the latter. Raises ``InvalidInput`` for invalid syntax, two shields or another order; ``UnknownName`` for
-    an unknown wrapper.
+    an unknown wrapper and for ``X@shipped``, an old spelling.
     """
     core, around = _split_around(spec)
     if file := _python_file(core):
@@ -73,6 +73,7 @@ def parse_spec(spec: str) -> AgentSpec:
     name, argument = ScriptSpec.parse(head if at else core)
     if at and not path:
         raise InvalidInput(f"agent {spec!r}: a path is needed after '@'")
+    refuse_shipped_path(path, name)
     return AgentSpec(name, argument, path if at else None, around)
 
 
@@ -92,7 +93,7 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications, such as ``coast,ppo@shipped``.
+    """Split a comma-separated list of agent specifications, such as ``coast,ppo``.
 
     Commas in paths that exist do not split.
     """
@@ -148,7 +149,7 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
         searches = [each for each in around_forms() if around_entry(each).inner]
         raise InvalidInput(
             f"agent {spec!r}: +{', +'.join(searches)} comes first and once, then one shield of"
-            f" +{', +'.join(shield_forms())}; for instance ppo@shipped+search+step"
+            f" +{', +'.join(shield_forms())}; for instance ppo+search+step"
         )
     return core, tuple(around)
 

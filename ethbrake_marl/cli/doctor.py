@@ -34,20 +34,20 @@ EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
 
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluation.worlds=10")
 
-_LINEUP = "ladder,ppo@shipped,ppo@shipped+search+episode,full_brake+step"
+_LINEUP = "ladder,ppo,ppo+search+episode,full_brake+step"
 
 # Small calls of the usual commands, to compile what they use. A single world has another memory layout.
 _DOORS = (
     ("run", "--steps", "128", "--episodes", "20", "--output", "run", *_TINY),
     ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
-    ("evaluate", "--agents", "full_brake,ppo@shipped+episode,full_brake+step", "--episodes", "1"),
+    ("evaluate", "--agents", "full_brake,ppo+episode,full_brake+step", "--episodes", "1"),
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
 
 # Uses the kernels of `ethbrake run`, except for three small ones, and no others; needs no torch.
 _FOR_A_RUN = (
     *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--output", "page", "--report"),
-    *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo@shipped,ppo@shipped+episode"),
+    *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo,ppo+episode"),
 )
 
 _IN_PYTHON = """

@@ -20,7 +20,6 @@ from ethbrake_marl.cli.command import (
     RayOption,
     ScenarioOption,
     SettingsOption,
-    say,
 )
 from ethbrake_marl.cli.pages import page_of
 from ethbrake_marl.errors import InvalidInput, need
@@ -28,7 +27,6 @@ from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_folder, write_output
 
 if TYPE_CHECKING:
-    from ethbrake_marl.agents.protocol import Driver
     from ethbrake_marl.physics.left_out import LeftOutRows
     from ethbrake_marl.scenario.sample import Sample
     from ethbrake_marl.scenario.task import Task
@@ -66,7 +64,7 @@ def _task_of(scenario: str, given: Settings) -> Task:
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Return the agents of a command line by spec (``make_lineup``), and print which policy ``@shipped`` stands for.
+    """Return the agents of a command line by spec (``make_lineup``).
 
     Args:
         agents: specs, as a list or with commas between them.
@@ -74,15 +72,7 @@ def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False)
         bare: refuse agents with a shield, because the command adds its own.
 
     """
-    lineup = evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
-    _tell_shipped(lineup)
-    return lineup
-
-
-def _tell_shipped(lineup: Mapping[str, Driver]) -> None:
-    for spec, driver in lineup.items():
-        if "@shipped" in spec and (meant := getattr(driver, "name", spec)) != spec:
-            say(f"{spec} is {meant}")
+    return evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
 
 
 def evaluate_command(
@@ -113,8 +103,8 @@ def evaluate_command(
 
     `ethbrake agent list` shows all agents; ladder stands for all of them from coast to best_harm. Behind any agent:
     +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
-    PATH is a run or a policy bundle, or shipped. +robust needs an uncertainty, which is given in Python;
-    +robust:believed needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
+    PATH is a run or a policy bundle. +robust needs an uncertainty, which is given in Python;
+    +robust:estimated needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
     impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
     """
     from ethbrake_marl.agents.spec import split_specs
@@ -135,7 +125,6 @@ def evaluate_command(
         lineup = evaluation.Lineup.of(
             split_specs(agents), task.scenario, harm_count=task.harm_count, measures=given.measures
         )
-        _tell_shipped(lineup.make())
         used = {"harm_count": task.harm_count}
         seed = evaluation.LIST_SEED if seed is None else seed
         episodes = evaluation.EPISODES if episodes is None else episodes
@@ -349,7 +338,7 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
 
 
 def shield_command(
-    agents: AgentsOption = "ppo@shipped,full_brake,constant:3",
+    agents: AgentsOption = "ppo,full_brake,constant:3",
     scenario: ScenarioOption = "paper-random",
     episodes: Annotated[int, typer.Option(help="Worlds of the list.")] = 2_000,
     settings: SettingsOption = None,

@@ -391,14 +391,16 @@ def agent_list(as_json: JsonOption = False) -> None:
         out.result(
             told,
             Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
-            "† omniscient: reads what no channel brought. With :believed behind it, it decides on what was received.",
+            "† omniscient: reads what no channel brought. With :estimated behind it, it decides on what was received.",
             "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.",
         )
 
 
 @agent_group.command("export", epilog=example("agent export runs/early --onnx early.onnx"))
 def agent_export(
-    policy: Annotated[str, typer.Argument(metavar="FOLDER", help="A run, a policy bundle, or shipped/NAME.")],
+    policy: Annotated[
+        str, typer.Argument(metavar="NAME|PATH", help="A shipped policy's name, a run, or a policy bundle.")
+    ],
     onnx: Annotated[Path, typer.Option(metavar="FILE", help="The ONNX model to write.")],
     force: ForceOption = False,
 ) -> None:

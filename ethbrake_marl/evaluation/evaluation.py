@@ -80,8 +80,8 @@ class Evaluation:
         drivers += [f"{more} more"] if more else []
         seed = "" if self.seed is None else f" of seed {self.seed}"
         return (
-            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80} driven"
-            f" by {', '.join(drivers)})"
+            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80}"
+            f" controlled by {', '.join(drivers)})"
         )
 
     @property

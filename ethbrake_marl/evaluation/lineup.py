@@ -56,7 +56,7 @@ def make_lineup(
     """Make one agent for each spec, to drive the scenario's learners, and return spec -> agent.
 
     Args:
-        specs: texts that name agents, as ``make_agent`` takes them (``"full_brake"``, ``"ppo@shipped+step"``): a list,
+        specs: texts that name agents, as ``make_agent`` takes them (``"full_brake"``, ``"ppo+step"``): a list,
             or one text with commas between them. A name of a group, such as ``ladder``, stands for several agents.
         scenario: the scenario whose learners they drive.
         harm_count: harm that agents minimise, if they optimise: ``first`` or ``total``.

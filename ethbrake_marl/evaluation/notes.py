@@ -106,7 +106,7 @@ def _knowledge(rows: Sequence[SummaryRow]) -> str:
     if not hidden:
         return ""
     text = (
-        f"In {100 * hidden:.1f} % of these worlds the channel hides something of the line from a driven vehicle at"
+        f"In {100 * hidden:.1f} % of these worlds the channel hides something of the line from a controlled vehicle at"
         " its first decision: news that has not arrived, how late another vehicle will react, or what no message"
         " contains."
     )

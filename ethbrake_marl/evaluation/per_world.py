@@ -125,7 +125,7 @@ _HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "anothe
 SAME = {  # keys that must agree for a comparison; all but the hashes may be missing
     "kind": "another kind of results",
     "worlds_sha256": _HASHES["worlds_sha256"],
-    "controlled_vehicle": "another driven vehicle",
+    "controlled_vehicle": "another controlled vehicle",
     "scenario_sha256": _HASHES["scenario_sha256"],
     "harm_count": "another harm",
 }

@@ -64,7 +64,7 @@ def evaluate(
     Args:
         worlds: worlds at the alert, or a sample that ``scenario.sample`` drew; None: draw ``episodes`` worlds from
             ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo@shipped"``, or a list), which minimise first-impact
+        agents: specs as on the command line (``"full_brake,ppo"``, or a list), which minimise first-impact
             harm; or a mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the
             originals do not change.
         scenario: scenario of the worlds, also by name or path.
@@ -93,7 +93,7 @@ def evaluate(
     if not sample.worlds.n:
         raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
-    vehicles = driven_vehicles(scenario, vehicle, agents)
+    vehicles = controlled_vehicles(scenario, vehicle, agents)
     warn_unfamiliar(agents, sample.worlds, scenario, vehicles)
     parts = []
     for first, part in chunks_of(sample, chunk or CHUNK):
@@ -163,7 +163,7 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
         )
     if not isinstance(agents, Mapping):
         raise InvalidInput(
-            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo@shipped', or a mapping of agents"
+            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo', or a mapping of agents"
         )
     if not agents:
         raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
@@ -174,7 +174,7 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
         check_whole_number("evaluate: chunk", chunk, 1)
 
 
-def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
+def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
     This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. Without learners the
@@ -205,7 +205,7 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     if set(learners) - {vehicle}:
         raise InvalidInput(
             f"scenario {scenario.name!r}: its learners are {', '.join(names)}, but only"
-            f" {scenario.vehicle_names[vehicle]} is driven; give the others a script (scenario.replace(roles=...))"
+            f" {scenario.vehicle_names[vehicle]} is controlled; give the others a script (scenario.replace(roles=...))"
         )
     return int(vehicle)
 

@@ -32,7 +32,9 @@ class Task:
     def vehicle(self) -> int:
         """Index of the single controlled vehicle; raises ``InvalidInput`` unless there is exactly one."""
         if len(self.vehicles) != 1:
-            raise InvalidInput(f"scenario {self.scenario.name!r}: needs one driven vehicle; driven are: {self.names}")
+            raise InvalidInput(
+                f"scenario {self.scenario.name!r}: needs one controlled vehicle; controlled are: {self.names}"
+            )
         return self.vehicles[0]
 
     @property

@@ -92,7 +92,7 @@ class ShieldedDriver(ByPolicy):
         return cls(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return a team behind one shield, in which each of these vehicles is driven by its own copy of the policy.
+        """Return a team behind one shield, in which each of these vehicles is controlled by its own copy of the policy.
 
         ``vehicles`` are indices (0 = front).
         """

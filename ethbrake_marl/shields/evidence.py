@@ -30,8 +30,8 @@ class Review(NamedTuple):
     world: Ints  # [m] row of the world in the batch
     vehicle: Ints  # [m] index of the vehicle whose action was replaced
     step: Ints  # [m] number of the decision
-    realised: Floats  # [m] harm of the episode as it was, with the intervention (m2/s2)
-    without: Floats  # [m] harm if the policy or team had driven unshielded from that decision on (m2/s2)
+    harm: Floats  # [m] harm of the episode as it was, with the intervention (m2/s2)
+    unshielded_harm: Floats  # [m] harm if the policy or team had driven unshielded from that decision on (m2/s2)
     verdict: NDArray[np.str_]  # [m] "needed" (harm is higher without it), "costly" (lower) or "harmless" (the same)
     trusted: Bools  # [m] whether the world behaved as the shield predicted
 
@@ -48,7 +48,7 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 
     The verdict is *needed* if the harm without the intervention is higher, *costly* if it is lower, and *harmless* if
     it is the same. The actual episode is simulated again as well, so that both harms come from the same engine, even
-    where the shield assumed other worlds (``told``).
+    where the shield assumed other worlds.
 
     Args:
         shield: a shield with ``logging``, after the last episodes of ``worlds``. Entries of earlier episodes are
@@ -68,15 +68,15 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
     ]
     world = np.array([entry.world for entry in log], np.int64)
     step = np.array([entry.step for entry in log], np.int64)
-    realised, without = np.zeros(0), np.zeros(0)
+    harm, unshielded = np.zeros(0), np.zeros(0)
     if world.size:
         never = np.full(worlds.n, shield.memory.backup.plan.shape[1])
-        realised = _released_harm(shield, policy, worlds, np.arange(worlds.n), never)[world]
-        without = _released_harm(shield, policy, worlds, world, step)
-    verdict = np.where(without > realised + SAME_HARM, "needed", "harmless")
-    verdict = np.where(without < realised - SAME_HARM, "costly", verdict)
+        harm = _released_harm(shield, policy, worlds, np.arange(worlds.n), never)[world]
+        unshielded = _released_harm(shield, policy, worlds, world, step)
+    verdict = np.where(unshielded > harm + SAME_HARM, "needed", "harmless")
+    verdict = np.where(unshielded < harm - SAME_HARM, "costly", verdict)
     whose = np.array([entry.vehicle for entry in log], np.int64)
-    return Review(world, whose, step, realised, without, verdict, ~shield.memory.distrusted[world])
+    return Review(world, whose, step, harm, unshielded, verdict, ~shield.memory.distrusted[world])
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:

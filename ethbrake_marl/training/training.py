@@ -152,6 +152,9 @@ def _with_new_names(value: Any) -> Any:
         return [_with_new_names(each) for each in value]
     if isinstance(value, str):  # a name, or an agent such as counterfactual@PATH
         name, at, path = value.partition("@")
+        folder, _, shipped = path.partition("/")
+        if folder == "shipped":  # ppo@shipped and policy@shipped/ppo are now ppo
+            name, at, path = shipped or name, "", ""
         return f"{RENAMED.get(name, name)}{at}{path}"
     return value
 

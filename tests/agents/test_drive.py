@@ -23,6 +23,7 @@ from ethbrake_marl.evaluation.motion import follow_episodes
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.physics.state import Floats, Worlds
+from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.shields.drivers import ShieldedDriver
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
 from tests.fixtures.asked import Asked
@@ -86,9 +87,9 @@ def test_drive__a_policy_as_a_role_does_what_it_does_when_it_is_driven():
     def with_roles(**roles):
         return SCENARIO.replace(early_impacts="keep", roles={"vehicle_1": "full_brake", **roles})
 
-    universal, braking = make_agent("universal@shipped"), make_agent("full_brake")
+    universal, braking = make_agent("universal"), make_agent("full_brake")
     driven = with_roles(vehicle_2="learner", vehicle_3="full_brake")
-    role = with_roles(vehicle_2="universal@shipped", vehicle_3="learner")
+    role = with_roles(vehicle_2="universal", vehicle_3="learner")
     both = with_roles(vehicle_2="learner", vehicle_3="learner")
     worlds = driven.sample(20, 7).worlds
     harm = drive(worlds, universal, driven, 1).ledger.world_harm("first")
@@ -109,7 +110,7 @@ def test_drive__shows_every_part_of_a_step_within_which_nobody_decides(swinging)
 
     worlds = swinging.sample(30, 7).worlds
     replay = Replay(worlds)
-    episodes = drive(worlds, make_agent("universal@shipped"), swinging, 1, watched_by=[replay])
+    episodes = drive(worlds, make_agent("universal"), swinging, 1, watched_by=[replay])
     assert np.abs(replay.now.gaps_m - episodes.final.gaps_m).max() < 1e-9
     for k, count in enumerate(("first", "total")):
         assert np.abs(replay.harm[:, k] - episodes.ledger.world_harm(count)).max() < 1e-9
@@ -251,7 +252,7 @@ def asked(spec: str, worlds: Worlds, vehicle: int = 1, **settings) -> Floats:
     [
         ("full_brake", AgentSpec("full_brake", None, None, ())),
         ("constant:-5+step", AgentSpec("constant", "-5", None, ("step",))),
-        ("ppo@shipped+step", AgentSpec("ppo", None, "shipped", ("step",))),
+        ("ppo+step", AgentSpec("ppo", None, None, ("step",))),
         ("ppo@runs/a+b:c@d+episode:pairwise", AgentSpec("ppo", None, "runs/a+b:c@d", ("episode:pairwise",))),
         ("ppo@runs/my+step/", AgentSpec("ppo", None, "runs/my+step/", ())),
         ("mine:x@path+step", AgentSpec("mine", "x", "path", ("step",))),
@@ -298,10 +299,7 @@ def test_e_v2x_bm__drives_by_its_optimum_of_the_count_and_horizon_it_was_given()
 
 @pytest.mark.parametrize(
     "spec",
-    [
-        *("full_brake", "coast", "constant:3.5", "e_v2x_bm", "e_v2x_bm:pairwise"),
-        *("full_brake+episode", "ppo@shipped+episode"),
-    ],
+    [*("full_brake", "coast", "constant:3.5", "e_v2x_bm", "e_v2x_bm:pairwise"), *("full_brake+episode", "ppo+episode")],
 )
 def test_agents__every_row_is_its_own_new_episodes_change_theirs_alone_and_agents_can_be_pickled(spec):
     check_rows(spec)
@@ -324,6 +322,7 @@ def check_rows(spec):
 @pytest.mark.usefixtures("core_alone")
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     names = ("coast", "constant", "e_v2x_bm", "full_brake", "ppo", "sac", "policy", "universal", "team")
+    names = (*names, *(name for name in shipped_policies() if name not in names))
     assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     assert [name for name in (*names, "+episode", "+step") if name not in table] == []

@@ -78,7 +78,7 @@ class Hosted:
     def begin(self, alert: eb.Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         options, scenario = self.driver.options, self.driver.scenario
         shield = options.shield(scenario, vehicle, scripts)
-        if getattr(options, "believed", False):
+        if getattr(options, "estimated", False):
             shield.begin(alert, np.arange(alert.n))
         else:
             shield.begin(alert, np.arange(alert.n), {vehicle: self.policy})
@@ -88,7 +88,7 @@ class Hosted:
         (shield, *_), policy = memory
         proposed, policy = proposed_action(self.policy, worlds, policy, vehicle)
         proposer = Proposer({vehicle: self.policy}, {vehicle: policy}, worlds)
-        if getattr(self.driver.options, "believed", False):
+        if getattr(self.driver.options, "estimated", False):
             applied = shield.decide(worlds, proposed, proposer)
         else:
             applied = shield.decide(
@@ -99,8 +99,8 @@ class Hosted:
 
 PAPER = eb.load_scenario("paper-random")
 BLOCKED = eb.load_scenario("cooperation-2-blocked")
-SENSORS, MESSAGES, BELIEFS, STATE, MODEL = (
-    Source.SENSORS, Source.MESSAGES, Source.BELIEFS, Source.STATE, Source.MODEL,
+SENSORS, MESSAGES, ESTIMATES, STATE, MODEL = (
+    Source.SENSORS, Source.MESSAGES, Source.ESTIMATES, Source.STATE, Source.MODEL,
 )  # fmt: skip
 STATED = {  # every agent of the core: all of the registry, and what ``make_lineup`` makes of policies
     "full_brake": (SENSORS,),
@@ -108,17 +108,22 @@ STATED = {  # every agent of the core: all of the registry, and what ``make_line
     "constant:3": (SENSORS,),
     "e_v2x_bm:pairwise": (STATE,),
     "e_v2x_bm": (MODEL,),
-    "ppo@shipped/ppo": (MESSAGES,),
-    "sac@shipped/sac": (MESSAGES,),
-    "policy@shipped": (MESSAGES,),
-    "universal@shipped": (MESSAGES,),
-    "ppo@shipped/ppo+episode": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+episode:pairwise": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+step": (MESSAGES, MODEL),
+    "ppo": (MESSAGES,),
+    "sac": (MESSAGES,),
+    "universal": (MESSAGES,),
+    "ppo-obstacle": (MESSAGES,),
+    "rollout-obstacle": (MESSAGES,),
+    "vine-preference": (MESSAGES,),
+    "vine-front": (MESSAGES,),
+    "vine-pair": (MESSAGES,),
+    "vine-all": (MESSAGES,),
+    "ppo+episode": (MESSAGES, MODEL),
+    "ppo+episode:pairwise": (MESSAGES, MODEL),
+    "ppo+step": (MESSAGES, MODEL),
 }
-APART = {"team@RUN"}  # they need a run, and have tests of their own
+APART = {"policy@PATH", "team@RUN"}  # they need a run, and have tests of their own
 USUAL: dict[str, str] = {}  # with an argument that the form leaves open, for instance a budget
-WORDS = {"A": "3", "CANDIDATES": "20", "PATH": "shipped", "RUN": "shipped"}
+WORDS = {"A": "3", "CANDIDATES": "20"}
 
 
 def in_two(stated):
@@ -181,7 +186,7 @@ def stands_in_table(form, stated, usual):
     wanted = with_words(form, usual)
     if form.startswith("+"):
         return any(f"+{around}" == wanted for spec in stated for around in parse_spec(spec).around)
-    return wanted in {re.sub("shipped/.*", "shipped", str(replace(parse_spec(spec), around=()))) for spec in stated}
+    return wanted.removesuffix("@PATH") in {str(replace(parse_spec(spec), around=())) for spec in stated}
 
 
 def missing_in(stated, usual, apart):
@@ -202,7 +207,7 @@ def test_knowledge__every_agent_of_the_registry_stands_in_the_table():
 
 def check_stated(spec, agent, knows):
     assert Knowledge.of(agent) == knows
-    if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":believed"):
+    if "+" not in spec and spec != "e_v2x_bm:pairwise" and not spec.endswith(":estimated"):
         assert Knowledge.of(find_entry(parse_spec(spec))) == knows, "`ethbrake agent list` says something else"
 
 
@@ -214,7 +219,7 @@ def test_knowledge__every_agent_states_it(spec, knows):
 def with_channels(honest):
     """Each of these agents in each channel that hides something.
 
-    What goes around an agent, or believes, sees what it is told; the fast ones are three kinds of telling.
+    What goes around an agent, or estimates, sees what it is told; the fast ones are three kinds of telling.
     """
     return [
         pytest.param(*spec.values, channel, marks=[*spec.marks, *slow])
@@ -233,7 +238,7 @@ def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec,
 @pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
 def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_received(channel):
     scenario = eb.load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(v2x=channel)
-    assert changed_decisions(agent_of("ppo@shipped/ppo-paper-random-obstacle", scenario), scenario, n=20) == 0
+    assert changed_decisions(agent_of("ppo-obstacle", scenario), scenario, n=20) == 0
     assert changed_decisions(agent_of("e_v2x_bm:pairwise", scenario), scenario, n=20) > 0
 
 
@@ -285,7 +290,7 @@ def test_hidden__only_where_news_or_a_reaction_is_late(v2x, least, most):
 
 
 def test_knowledge__of_an_agent_of_a_user_and_of_a_team() -> None:
-    team = eb.Team({1: agent_of("ppo@shipped/ppo"), 2: agent_of("full_brake")}, "both")
+    team = eb.Team({1: agent_of("ppo"), 2: agent_of("full_brake")}, "both")
     assert Knowledge.of(team) == (SENSORS, MESSAGES)
     assert Knowledge.of(eb.Team({}, "scripts")).text == "–"
     silent = Acts(lambda worlds, vehicle: np.zeros(worlds.n))

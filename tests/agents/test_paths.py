@@ -55,7 +55,7 @@ def test_policy__in_a_folder_of_any_name_drives_in_python_and_in_commands(name, 
     scenario = eb.load_scenario("paper-random")
     found = eb.evaluate(agents=f"full_brake,ppo@{name}", scenario=scenario, episodes=5)
     assert list(found.outcomes) == ["full_brake", f"ppo@{name}"]
-    ours = eb.evaluate(agents="ppo@shipped", scenario=scenario, episodes=5).outcome("ppo@shipped")
+    ours = eb.evaluate(agents="ppo", scenario=scenario, episodes=5).outcome("ppo")
     assert (found.outcome(f"ppo@{name}").total_harm == ours.total_harm).all()
     assert run_command(["evaluate", "--agents", f"full_brake,ppo@{name}", "--episodes", "5", "--json"]) == 0
     assert "ppo@" in capsys.readouterr().out
@@ -73,7 +73,7 @@ def test_folder__that_is_not_there_separates_as_before():
 def test_folder__that_is_called_like_a_list_of_agents_is_none_of_them():
     put("full_brake,coast")
     assert split_specs("full_brake,coast") == ["full_brake", "coast"]
-    assert split_specs("coast+robust:believed,coast+step") == ["coast+robust:believed", "coast+step"]
+    assert split_specs("coast+robust:estimated,coast+step") == ["coast+robust:estimated", "coast+step"]
     put("a")
     put("b")
     assert split_specs("ppo@a,ppo@b,coast") == ["ppo@a", "ppo@b", "coast"]

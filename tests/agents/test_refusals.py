@@ -78,7 +78,7 @@ SPECS: dict[str, Callable[[], object]] = {
     "agent 'profile:0=3,1=5+step': a profile is a role of a scenario, fixed at the alert; it is no agent": lambda: (
         make_agent("profile:0=3,1=5+step", scenario=PAPER)
     ),
-    "agent 'ppo': a policy is needed: ppo@PATH, where PATH is a run": lambda: make_agent("ppo+step", scenario=PAPER),
+    "agent 'policy': a policy is needed: policy@PATH, where": lambda: make_agent("policy+step", scenario=PAPER),
 }
 
 
@@ -98,9 +98,9 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "vehicle 3: must be an index in 0..2": lambda: optimise_pairwise(WORLDS, 3),
     "deceleration_mps2[0, 1] = -1: must be finite and >= 0": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
     "team 't': 'vehicle_2': must be the index of a vehicle, 0 or more": lambda: Team({"vehicle_2": BRAKE}, "t"),
-    "team 't': vehicle_2 is driven by 'coast', which is no agent": lambda: Team({1: "coast"}, "t"),
+    "team 't': vehicle_2 is controlled by 'coast', which is no agent": lambda: Team({1: "coast"}, "t"),
     "team 't' drives vehicle_2; the vehicles to drive are vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
-    "scenario 'cooperation-3-pair': needs one driven vehicle; driven are: vehicle_2, vehicle_3": lambda: (
+    "scenario 'cooperation-3-pair': needs one controlled vehicle; controlled are: vehicle_2, vehicle_3": lambda: (
         eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle
     ),
     "agent 'coast' drives vehicle_3, but vehicle_2 of scenario 'cooperation-3-pair'": lambda: eb.evaluate(
@@ -300,7 +300,7 @@ def test_agent_that_is_registered__takes_a_policy_only_if_it_says_so() -> None:
     ids=["own", "e_v2x_bm"],
 )
 def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert(drives: Callable[[], object], third: str) -> None:
-    with refused(f"vehicle_3 is driven by '{third}', whose command is not fixed at the alert"):
+    with refused(f"vehicle_3 is controlled by '{third}', whose command is not fixed at the alert"):
         drives()
 
 
@@ -314,7 +314,7 @@ def test_knowledge__is_of_known_kinds(knows: Any) -> None:
     agent = Own(len)
     agent.knows = knows
     with refused(
-        f"agent 'own': knows = {knows!r}: must be one or several of 'own sensors', 'messages', 'believed model'"
+        f"agent 'own': knows = {knows!r}: must be one or several of 'own sensors', 'messages', 'estimated model'"
     ):
         Knowledge.of(agent)
 

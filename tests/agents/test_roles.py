@@ -21,11 +21,17 @@ SPECS = {
     "constant": ["constant:3"],
     "e_v2x_bm": ["e_v2x_bm", "e_v2x_bm:pairwise"],
     "full_brake": ["full_brake"],
-    "policy": ["policy@shipped", "policy@mine", "policy@team"],
-    "ppo": ["ppo@shipped", "ppo@mine", "ppo"],
-    "sac": ["sac@shipped", "sac@mine"],
-    "team": ["team@shipped", "team@team", "team@mine"],
-    "universal": ["universal@shipped", "universal@mine"],
+    "policy": ["policy@mine", "policy@team", "policy"],
+    "ppo": ["ppo", "ppo@mine"],
+    "ppo-obstacle": ["ppo-obstacle"],
+    "rollout-obstacle": ["rollout-obstacle"],
+    "sac": ["sac", "sac@mine"],
+    "team": ["team@team", "team@mine"],
+    "universal": ["universal", "universal@mine"],
+    "vine-all": ["vine-all"],
+    "vine-front": ["vine-front"],
+    "vine-pair": ["vine-pair"],
+    "vine-preference": ["vine-preference"],
     "theirs": ["theirs:2@mine"],
 }
 
@@ -100,8 +106,8 @@ def test_role__does_what_a_driver_does_in_an_evaluation(name):
     harm = [
         eb.evaluate(agents=agents, scenario=scripted(name, role), episodes=20, vehicle=vehicle).outcome("driver")
         for role, vehicle, agents in (
-            ("learner", 1, {"driver": eb.make_agent("policy@shipped", scenario=name)}),
-            ("policy@shipped", 2, {"driver": eb.make_agent("full_brake")}),
+            ("learner", 1, {"driver": eb.make_agent("universal", scenario=name)}),
+            ("universal", 2, {"driver": eb.make_agent("full_brake")}),
         )
     ]
     assert harm[0].total_harm == pytest.approx(harm[1].total_harm, abs=1e-9)
@@ -109,7 +115,7 @@ def test_role__does_what_a_driver_does_in_an_evaluation(name):
 
 @pytest.mark.parametrize("around", ["+episode", "+step"])
 def test_role__has_nothing_around_it(around):
-    """Two that roll themselves out would ask each other for ever, and a shield stands around who is driven."""
+    """Two that roll themselves out would ask each other for ever, and a shield stands around the controlled vehicle."""
     check_nothing_around("e_v2x_bm:pairwise", around)
 
 

@@ -91,7 +91,7 @@ def test_compile_ahead__for_a_run_alone_calls_one_command(monkeypatch) -> None:
     monkeypatch.setattr(doctor, "_call", lambda door, folder: called.append(door) or "")
     assert doctor.compile_ahead(training=False, run_alone=True)[0]
     ((*_, agents),) = called
-    assert set(agents.split(",")) >= {"full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo@shipped+episode"}
+    assert set(agents.split(",")) >= {"full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo+episode"}
 
 
 @pytest.mark.long
@@ -100,7 +100,7 @@ def test_compile__leaves_nothing_to_compile(ethbrake: Command) -> None:
     assert answer.status == 0 and '"name": "compile",\n    "ok": true' in answer.out
     kernels = set(cache_folder().iterdir())
     commands = [
-        ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo@shipped,ppo@shipped+episode", "--episodes", "3"),
+        ("evaluate", "--agents", "full_brake,e_v2x_bm,ppo,ppo+episode", "--episodes", "3"),
         ("shield", "--agents", "full_brake", "--episodes", "3"),
         ("evaluate", "--agents", "full_brake+step", "--episodes", "3"),
     ]

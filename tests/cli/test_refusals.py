@@ -68,20 +68,22 @@ EVALUATIONS = [
         "agent '': must be name or name:argument, the name in lower case letters, digits and _ @ . -",
     ),
     ("evaluate --agents constant:7.5", "agent 'constant:7.5': above the braking capacity 7 m/s2"),
-    ("evaluate --agents ppo", "agent 'ppo': a policy is needed: ppo@PATH, where PATH is a run or a policy bundle"),
+    (
+        "evaluate --agents policy",
+        "agent 'policy': a policy is needed: policy@PATH, where PATH is a run or a policy bundle",
+    ),
     (
         "evaluate --agents ppo@runs/nothing-here",
         "runs/nothing-here: is not a folder; give a policy bundle (manifest.json, weights.safetensors)",
     ),
     (
-        "evaluate --scenario cooperation-0-sensors --agents team@shipped",
+        "evaluate --scenario cooperation-0-sensors --agents vine-pair",
         "scenario 'cooperation-0-sensors' has no learner to drive; give the scenario",
     ),
     ("evaluate --agents team@.", ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@."),
-    (
-        "evaluate --scenario cooperation-3-pair --agents ppo@shipped+episode",
-        "shipped policy ppo for scenario 'cooperation-3-pair': there is none; shipped are",
-    ),
+    ("evaluate --agents policy@shipped+step", "'policy@shipped' is now written universal (the policies"),
+    ("evaluate --agents ppo@shipped/ppo", "'ppo@shipped/ppo' is now written ppo"),
+    ("agent export shipped/ppo --onnx policy.onnx", "'shipped/ppo' is now written ppo"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
     ("evaluate --per-world csv", "--per-world: needs a folder for it: --output FOLDER"),
     ("evaluate --report", "--report: needs a folder for it: --output FOLDER"),
@@ -108,10 +110,10 @@ TRAININGS = [
         "recipe 'ppo': scheme = centralized: must be single, shared, independent or centralised",
     ),
     ("train --resume .", ".: contains no training; give the folder of a run"),
-    ("agent export shipped/ppo --onnx none/policy.onnx", "none/policy.onnx: there is no folder none; make it first"),
+    ("agent export ppo --onnx none/policy.onnx", "none/policy.onnx: there is no folder none; make it first"),
     (
-        "shield --agents ppo@shipped+episode",
-        "agent 'ppo@shipped+episode': has a shield already; this command puts its own around each agent",
+        "shield --agents ppo+episode",
+        "agent 'ppo+episode': has a shield already; this command puts its own around each agent",
     ),
 ]
 
@@ -164,7 +166,7 @@ def test_run__needs_a_learner(refuse: Refuse) -> None:
         ("mine.yaml", "scenario new mine"),
         ("worlds.csv", "scenario sample paper-random --output worlds.csv"),
         ("out/worlds.csv", "evaluate --episodes 10000000 --output out"),
-        ("policy.onnx", "agent export shipped/ppo --onnx policy.onnx"),
+        ("policy.onnx", "agent export ppo --onnx policy.onnx"),
     ],
 )
 def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refuse: Refuse) -> None:

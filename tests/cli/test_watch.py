@@ -103,7 +103,9 @@ def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) ->
         registry.AGENTS.loaded, "team", Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     )
     assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
-    with pytest.raises(InvalidInput, match=r"'team@run\+episode': is a team, and \+episode is for one driven vehicle"):
+    with pytest.raises(
+        InvalidInput, match=r"'team@run\+episode': is a team, and \+episode is for one controlled vehicle"
+    ):
         make_lineup(["team@run+episode"], scenario)
 
 
@@ -265,7 +267,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("package", "extra", "line"),
     [
         ("pyarrow", "data", "evaluate --agents coast --episodes 2 --output new --per-world parquet"),
-        ("onnx", "export", "agent export shipped/ppo --onnx policy.onnx"),
+        ("onnx", "export", "agent export ppo --onnx policy.onnx"),
     ],
 )
 def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
@@ -299,7 +301,7 @@ def test_shield__names_the_worlds_that_it_leaves_out(ethbrake: Command, monkeypa
 
 
 def test_shield__of_several_learners_tells_its_policies_and_can_be_compared(ethbrake: Command) -> None:
-    words = ("--scenario", "cooperation-3-pair", "--agents", "full_brake,policy@shipped", "--episodes", "12", "--json")
+    words = ("--scenario", "cooperation-3-pair", "--agents", "full_brake,vine-pair", "--episodes", "12", "--json")
     answer = ethbrake("shield", *words)
     rows = told_json(answer)
     assert [row["mode"] for row in rows] == ["none", "step", "step-alert", "step-cap"] * 2

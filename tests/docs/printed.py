@@ -156,10 +156,10 @@ _TESTS = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
     " --set measures=injury --json"
     for test, agents in (
-        ("", "ppo@shipped/ppo,universal@shipped"),
-        ("-brake-only", "ppo@shipped/ppo,universal@shipped"),
-        ("-obstacle --set harm_count=total", "ppo@shipped/ppo,options@shipped"),
-        ("-buildup", "ppo@shipped/ppo,universal@shipped"),
+        ("", "ppo,universal"),
+        ("-brake-only", "ppo,universal"),
+        ("-obstacle --set harm_count=total", "ppo,rollout-obstacle"),
+        ("-buildup", "ppo,universal"),
     )
 )
 
@@ -168,8 +168,7 @@ TABLES: dict[str, How] = {
     "| what | first-impact harm | of the best known": TRAINED,
     "| who drives Vehicle 2 | collisions | first-impact harm": _by(
         NIGHTLY,
-        "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal@shipped,best_harm"
-        " --json",
+        "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal,best_harm --json",
     ),
     "| no. | label | the paper": _by(BY_HAND),
     "| `--draw` | full_brake": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
@@ -184,7 +183,7 @@ TABLES: dict[str, How] = {
 }
 
 PICTURES: dict[str, How] = {
-    "emergency.svg": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal@shipped --output emergency.svg"),
+    "emergency.svg": _by(NIGHTLY, "ethbrake watch --agents full_brake,universal --output emergency.svg"),
     "game-loop.svg": _by(BY_HAND),
     "front": _by(SEARCH),
     "model-": _by(SUITE, "tests/docs/test_studies.py"),

@@ -358,7 +358,7 @@ def test_demonstration__plays_the_picture_of_the_first_page_and_says_it_in_words
 ) -> None:
     demo = load("demo")
     monkeypatch.setattr(demo, "WORLDS", (0,))
-    monkeypatch.setattr(demo, "AGENTS", {"Full braking": "full_brake", demo.OWN: "policy@shipped"})
+    monkeypatch.setattr(demo, "AGENTS", {"Full braking": "full_brake", demo.OWN: "universal"})
     monkeypatch.setattr(demo, "TESTS", {"Main test": demo.TESTS["Main test"]})
     page = demo.add_demonstration((ROOT / "README.md").read_text("utf-8"))
     assert (

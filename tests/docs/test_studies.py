@@ -69,9 +69,9 @@ def test_sampling__the_table_in_the_docs_is_the_one_that_it_prints(agent):
 def test_price__is_nothing_where_everything_is_known():
     found = price.drive(BASE, 12, {"paper": {"preset": "paper"}})["paper"]
     for count in price.COUNTS:
-        assert price.price(found, "e_v2x_bm:believed", count).value == pytest.approx(0.0, abs=1e-4)
-    assert price.above(found, "e_v2x_bm:believed") is None
-    assert price.above(found, f"{price.POLICY}+step:believed").value == 0.0
+        assert price.price(found, "e_v2x_bm:estimated", count).value == pytest.approx(0.0, abs=1e-4)
+    assert price.above(found, "e_v2x_bm:estimated") is None
+    assert price.above(found, f"{price.POLICY}+step:estimated").value == 0.0
 
 
 def test_price__is_paired_by_world_and_told_of_both_counts():
@@ -79,11 +79,11 @@ def test_price__is_paired_by_world_and_told_of_both_counts():
     over = BASE.replace(v2x="sensors-only")
     harm = {
         spec: drive(over.sample(30, 7).worlds, make_agent(spec, scenario=over), over, 1).ledger
-        for spec in ("e_v2x_bm", "e_v2x_bm:believed")
+        for spec in ("e_v2x_bm", "e_v2x_bm:estimated")
     }
     for count in price.COUNTS:
-        told = price.price(found["sensors-only"], "e_v2x_bm:believed", count)
-        difference = harm["e_v2x_bm:believed"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
+        told = price.price(found["sensors-only"], "e_v2x_bm:estimated", count)
+        difference = harm["e_v2x_bm:estimated"].world_harm(count) - harm["e_v2x_bm"].world_harm(count)
         assert told.value == pytest.approx(difference.mean(), abs=1e-9)
     heads = [line for line in price.tables(found).splitlines() if line.startswith("| channel")]
     tables = [table for table in BASELINES if table.columns[0] == "channel"]
@@ -289,7 +289,7 @@ def test_paper__its_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_dis
         assert [row[column].split(" [")[0] for column in (1, 2, 4)] == list(cells)
 
 
-@pytest.mark.parametrize(("spec", "name"), [("full_brake", "Non-ethical (full braking)"), ("ppo@shipped/ppo", "PPO")])
+@pytest.mark.parametrize(("spec", "name"), [("full_brake", "Non-ethical (full braking)"), ("ppo", "PPO")])
 def test_paper__harms_at_three_delays_are_as_committed(spec: str, name: str) -> None:
     (row,) = (row for row in RESULTS["harm-delays"].tables[0].rows if row[0].value == name)
     state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}

@@ -75,7 +75,7 @@ def test_weights__weigh_the_same_ledger_in_results() -> None:
 
 def test_weights__do_not_make_a_policy_unfamiliar(recwarn: pytest.WarningsRecorder) -> None:
     scenario = PAPER.replace(harm_weight=[1, 0, 9])
-    eb.evaluate(scenario.sample(3, 3), {"it": eb.make_agent("ppo@shipped/ppo")}, scenario=scenario)
+    eb.evaluate(scenario.sample(3, 3), {"it": eb.make_agent("ppo")}, scenario=scenario)
     assert not [each for each in recwarn if issubclass(each.category, Unfamiliar)]
 
 

@@ -97,7 +97,7 @@ def at(motion: EpisodeMotion, time_s: float) -> Floats:
 
 @pytest.mark.parametrize(
     ("name", "spec"),
-    [("paper-random", "constant:4.5"), ("paper-random", "ppo@shipped"), ("paper-random-obstacle", "full_brake"),
+    [("paper-random", "constant:4.5"), ("paper-random", "ppo"), ("paper-random-obstacle", "full_brake"),
      ("pair", "full_brake")],
 )  # fmt: skip
 def test_motion__is_exact_at_every_moment(name: str, spec: str, pair: eb.Scenario) -> None:

@@ -205,7 +205,7 @@ def test_summarise__where_nobody_collided_a_bound_of_the_share_is_said_and_none_
 
 # ---------------------------------------------------------------- who knows what
 
-SPECS = ("full_brake", "ppo@shipped/ppo", "ppo@shipped/ppo+episode", "e_v2x_bm:pairwise")
+SPECS = ("full_brake", "ppo", "ppo+episode", "e_v2x_bm:pairwise")
 KNOWN = ("own sensors", "messages", "messages + true model", "true state", "not stated")
 
 
@@ -213,7 +213,7 @@ def check_marked(text: str, share: float) -> None:
     assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
     assert "† messages |" not in text and "† own sensors" not in text
     assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
-    assert "† ppo@shipped/ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
+    assert "† ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
     assert "Not stated what it knows: mine." in text
 
 

@@ -67,8 +67,8 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "scenario 'paper-random' has 0 learners (none); say which vehicle the agents drive": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER.replace(roles={}, early_impacts="keep")
     ),
-    "scenario 'paper-random': its learners are vehicle_2, vehicle_3, but only vehicle_2 is driven": lambda: eb.evaluate(
-        WORLDS, BRAKE, scenario=PAPER.with_learners([1, 2]), vehicle=1
+    "scenario 'paper-random': its learners are vehicle_2, vehicle_3, but only vehicle_2 is controlled": lambda: (
+        eb.evaluate(WORLDS, BRAKE, scenario=PAPER.with_learners([1, 2]), vehicle=1)
     ),
     "reset: 3 worlds of 3 vehicles are given; 3 of 4 vehicles needed": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=FOUR
@@ -80,7 +80,7 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
         advance(WORLDS, -WORLDS.vehicles.braking_capacity_mps2, until_s=0.1)[0], BRAKE, scenario=PAPER
     ),
     "must be worlds or a sample, as scenario.sample(n, seed) gives": lambda: eb.evaluate(5, BRAKE, scenario=PAPER),
-    "must be specs such as 'full_brake,ppo@shipped', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
+    "must be specs such as 'full_brake,ppo', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
     "agent 5: must be name or name:argument": lambda: eb.evaluate(agents=[5], scenario=PAPER, episodes=2),
     "the worlds are given; leave one of the two out": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER, episodes=2),
     "number of worlds = 0: must be a whole number, at least 1": lambda: eb.evaluate(

@@ -290,8 +290,7 @@ def test_worlds_sha256__tells_every_bit_and_not_how_it_lies_in_memory(monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("spec", "policy"),
-    [("ppo@shipped", "ppo"), ("ppo@shipped+episode", "ppo"), ("ppo@shipped+step", "ppo"), ("full_brake+step", None)],
+    ("spec", "policy"), [("ppo", "ppo"), ("ppo+episode", "ppo"), ("ppo+step", "ppo"), ("full_brake+step", None)]
 )
 def test_policy_sha256__is_found_inside_what_is_around_it(spec: str, policy: str | None) -> None:
     expected = policy and eb.load_shipped(policy).manifest.manifest_sha256
@@ -299,7 +298,7 @@ def test_policy_sha256__is_found_inside_what_is_around_it(spec: str, policy: str
 
 
 def test_results__say_worlds_scenario_policy_and_versions() -> None:
-    agents = {**BRAKE, "ppo": eb.make_agent("ppo@shipped", scenario=PAPER)}
+    agents = {**BRAKE, "ppo": eb.make_agent("ppo", scenario=PAPER)}
     result = evaluate(SAMPLE, agents, scenario=PAPER, seed=7, chunk=25, aftermath=False)
     braking, learned = (row.to_json() for row in summarise(result))
     assert {key: learned[key] for key in ABOUT} == {key: braking[key] for key in ABOUT} == ABOUT
@@ -332,14 +331,14 @@ def test_every_results_file__says_its_kind_worlds_scenario_and_versions(
 @pytest.mark.parametrize(
     ("agent", "scenario", "beyond"),
     [
-        ("ppo@shipped/ppo+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
-        ("ppo@shipped/ppo", PAPER.replace(time_step_s=0.05), "time_step_s"),
-        ("ppo@shipped/ppo", PAPER.replace(roles={**ROLES, "vehicle_3": "coast"}), "vehicle_3 by coast"),
-        ("ppo@shipped/ppo", PAPER.replace(latency_s=[0.0, 0.5, 1.2]), "latency_s in 100 % of the worlds"),
-        ("ppo@shipped/ppo", PAPER.replace(speeds_mps={"uniform": [18.0, 30.0]}), "speeds_mps in 9. % of the worlds"),
-        ("ppo@shipped/ppo", load_scenario("cooperation-4-five"), "vehicle_1, .*, vehicle_5, 5 vehicles"),
+        ("ppo+step", load_scenario("paper-random-obstacle"), "obstacle_gap_m"),
+        ("ppo", PAPER.replace(time_step_s=0.05), "time_step_s"),
+        ("ppo", PAPER.replace(roles={**ROLES, "vehicle_3": "coast"}), "vehicle_3 by coast"),
+        ("ppo", PAPER.replace(latency_s=[0.0, 0.5, 1.2]), "latency_s in 100 % of the worlds"),
+        ("ppo", PAPER.replace(speeds_mps={"uniform": [18.0, 30.0]}), "speeds_mps in 9. % of the worlds"),
+        ("ppo", load_scenario("cooperation-4-five"), "vehicle_1, .*, vehicle_5, 5 vehicles"),
         (
-            "ppo@shipped/ppo",
+            "ppo",
             PAPER.replace(v2x={"tells": {"vehicle_3": ["place", "speed", "intent"]}}),
             "messages without acceleration, .*, messages without mass, messages with intent",
         ),
@@ -359,10 +358,10 @@ def check_beyond(agent: str, scenario: Scenario, beyond: str) -> None:
 
 def test_policy__that_drives_where_it_was_trained_is_not_warned_of() -> None:
     with warnings.catch_warnings(action="error"):
-        evaluate(None, "universal@shipped,ppo@shipped", scenario=PAPER, episodes=200)
+        evaluate(None, "universal,ppo", scenario=PAPER, episodes=200)
         for name in ("stress-wide", "paper-random-obstacle"):
-            evaluate(None, "universal@shipped", scenario=name, episodes=200)
-        evaluate(None, "team@shipped", scenario="cooperation-3-pair", episodes=100)
+            evaluate(None, "universal", scenario=name, episodes=200)
+        evaluate(None, "vine-pair", scenario="cooperation-3-pair", episodes=100)
 
 
 # ---------------------------------------------------------------- a list chunk by chunk
@@ -531,7 +530,7 @@ def test_objects__say_what_they_are_in_a_line() -> None:
     record = eb.record_episode(worlds.take([0]), agents["full_brake"], scenario=PAPER)
     lines = "20 worlds of 3 vehicles: gaps 5.11 to 9.85 m, speeds 18.1 to 22 m/s, at 0 s"
     for value, text in (
-        (evaluation, "Evaluation('paper-random', 20 worlds of seed 7, vehicle_2 driven by 'full_brake', 'coast')"),
+        (evaluation, "Evaluation('paper-random', 20 worlds of seed 7, vehicle_2 controlled by 'full_brake', 'coast')"),
         (sample, f"Sample(Worlds({lines}), numbers 0 to 19, 0 rejected)"),
         (worlds.vehicles, "Vehicles(20 worlds of 3, masses 4.5 to 5.9 t)"),
         (worlds.take(np.zeros(0, int)), "Worlds(0 worlds of 3 vehicles: gaps none m, speeds none m/s, at none s)"),
@@ -568,7 +567,7 @@ def test_evaluation__notes_the_place_of_each_world_in_its_list() -> None:
     [("episode", ("HybridAgent", "coupled", "total")), ("episode:pairwise", ("HybridAgent", "pairwise", "total"))],
 )
 def test_lineup__of_a_hybrid_has_the_bound_and_the_count_that_were_asked(shield, expected) -> None:
-    (agent,) = make_lineup([f"ppo@shipped+{shield}"], PAPER, harm_count="total").values()
+    (agent,) = make_lineup([f"ppo+{shield}"], PAPER, harm_count="total").values()
     assert (type(agent).__name__, agent.bound, agent.harm_count) == expected
 
 

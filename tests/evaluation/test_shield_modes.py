@@ -108,10 +108,10 @@ def test_team__an_intervention_is_simulated_again_without_it_for_the_whole_team(
     episodes = drive(worlds, ShieldedDriver(coasting, PAIR, logging=True).on((1, 2)), PAIR)
     harm = episodes.ledger.world_harm("first")
     found = review(episodes.guarded.shield, coasting, worlds)
-    assert found.realised.tolist() == harm[found.world].tolist() and set(found.vehicle) == {1, 2}
+    assert found.harm.tolist() == harm[found.world].tolist() and set(found.vehicle) == {1, 2}
     alone = drive(worlds, Team.of(make_agent("coast"), (1, 2)), PAIR).ledger.world_harm("first")
     first = {world: k for k, world in reversed(list(enumerate(found.world.tolist())))}
-    assert all(found.without[k] == alone[world] for world, k in first.items()) and len(first) > 20
+    assert all(found.unshielded_harm[k] == alone[world] for world, k in first.items()) and len(first) > 20
     assert found.share("needed") > 0.5
 
 

@@ -115,7 +115,7 @@ def test_parts__of_the_users_file_train_and_are_evaluated(tmp_path: Path) -> Non
     assert manifest.observation.features[-3:] == ("rear_1.known", "urgency", "rear_1.load")
     assert (recipe.reward.terms, manifest.reward["terms"]) == ({"calm": 0.5, "hurry": 0.01},) * 2
     assert manifest.scenario["v2x"]["preset"] == "rural"
-    told = {"mine": eb.LearnedAgent(policy, "mine"), "shipped": eb.make_agent("ppo@shipped", scenario=PAPER)}
+    told = {"mine": eb.LearnedAgent(policy, "mine"), "shipped": eb.make_agent("ppo", scenario=PAPER)}
     harm = eb.evaluate(scenario.sample(10, 7), told, scenario=scenario).outcome("mine").first_impact_harm
     assert harm.mean() == near(min(entry["first_impact_harm"] for entry in result.evaluations))
 
@@ -275,7 +275,7 @@ def squared(episodes: Any) -> Any:
 
 
 def evaluated(**options: Any) -> Any:
-    agents = {name: eb.make_agent(name, scenario=PAPER) for name in ("full_brake", "e_v2x_bm", "ppo@shipped+step")}
+    agents = {name: eb.make_agent(name, scenario=PAPER) for name in ("full_brake", "e_v2x_bm", "ppo+step")}
     return eb.evaluate(SAMPLE, agents, scenario=PAPER, **options)
 
 

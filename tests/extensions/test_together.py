@@ -5,6 +5,7 @@ import runpy
 from ethbrake_marl.agents.registry import agent_entries, agent_names
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.extensions.field.controllers import FIELD
+from ethbrake_marl.policies.shipped import shipped_policies
 from tests.agents import test_knowledge as core, test_roles as roles
 from tests.cli.test_scenarios import SCRIPTS
 from tests.extensions.certified import test_knowledge as certified, test_roles as certified_roles
@@ -22,18 +23,9 @@ def test_knowledge__every_agent_of_the_registry_stands_in_a_table():
 
 def test_agent_names__are_those_that_ship_and_are_listed(capsys):
     scripts = ("coast", "constant", "e_v2x_bm", "full_brake", "planner")
-    names = (
-        *scripts,
-        *FIELD,
-        "best_harm",
-        "ppo",
-        "sac",
-        "vine",
-        "rollout-classification",
-        "policy",
-        "universal",
-        "team",
-    )
+    learned = ("ppo", "sac", "vine", "rollout-classification", "policy", "universal", "team")
+    names = (*scripts, *FIELD, "best_harm", *learned)
+    names = (*names, *(name for name in shipped_policies() if name not in names))
     assert agent_names() == tuple(sorted(names)) and run_command(["agent", "list"]) == 0
     table = capsys.readouterr().out
     assert [name for name in (*names, "+search", "+episode", "+step", "+robust") if name not in table] == []

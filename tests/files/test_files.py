@@ -56,7 +56,7 @@ def test_write__replaces_a_plain_file_by_force_and_takes_the_longest_name(tmp_pa
 def test_target__that_cannot_be_replaced_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    check_target("agent export shipped/ppo --onnx", tmp_path / "mine.onnx", monkeypatch, capsys)
+    check_target("agent export ppo --onnx", tmp_path / "mine.onnx", monkeypatch, capsys)
 
 
 def check_target(words: str, path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

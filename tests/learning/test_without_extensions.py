@@ -59,6 +59,6 @@ def test_run__without_a_report_trains_shields_evaluates_and_writes_results(tmp_p
 
 def test_policy__of_several_networks_drives_without_the_algorithm_that_trained_it() -> None:
     scenario = eb.load_scenario("paper-random")
-    result = eb.evaluate(agents="full_brake,universal@shipped", scenario=scenario, episodes=20)
+    result = eb.evaluate(agents="full_brake,universal", scenario=scenario, episodes=20)
     braking, universal = (result.outcome(name).total_harm.mean() for name in result.outcomes)
     assert universal < braking

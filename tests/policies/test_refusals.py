@@ -15,12 +15,12 @@ from ethbrake_marl.evaluation.lineup import make_lineup
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.shipped import load_named_policy, shipped_name
+from ethbrake_marl.policies.shipped import load_named_policy, load_shipped, shipped_policies
 from ethbrake_marl.training.recipe import load_recipe
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
-SHIPPED = load_named_policy("shipped/ppo")
+SHIPPED = load_named_policy("ppo")
 
 
 @cache
@@ -41,17 +41,17 @@ POLICIES: dict[str, Callable[[], object]] = {
     "observation: float64 of shape (3, 4); this policy takes float32 [n, 4]": lambda: actor()(np.zeros((3, 4))),
     "observation[1, 2] = nan: must be finite": lambda: actor()(np.array([[0, 0, 0, 0], [0, 0, np.nan, 0]], np.float32)),
     "observation[0, 1] = inf: must be finite": lambda: actor()(np.array([[0, np.inf, 0, 0]], np.float32)),
-    "shipped policy sac for scenario 'paper-delay-low': there is none; shipped are: counterfactual": lambda: (
-        shipped_name("sac", eb.load_scenario("paper-delay-low"), "first")
-    ),
-    "agent 'universal@runs/x': must be universal@shipped; for another policy: ppo@PATH or sac@PATH": lambda: (
-        make_lineup(["universal@runs/x"], PAPER)
-    ),
-    "that policy was trained by rollout-classification; write rollout-classification@shipped/universal": lambda: (
-        make_lineup(["sac@shipped/universal"], PAPER)
-    ),
+    "agent 'universal@runs/x': universal takes no policy": lambda: make_lineup(["universal@runs/x"], PAPER),
+    "': that policy was trained by sac; write sac@": lambda: make_lineup([f"ppo@{shipped_policies()['sac']}"], PAPER),
     "agent 'ppo@': a path is needed after '@'": lambda: make_lineup(["ppo@"], PAPER),
-    "agent 'sac': a policy is needed: sac@PATH, where PATH is a run": lambda: make_lineup(["sac"], PAPER),
+    "agent 'policy': a policy is needed: policy@PATH, where PATH is a run": lambda: make_lineup(["policy"], PAPER),
+    "unknown shipped policy 'ppo-paper-random-obstacle'; it is now called 'ppo-obstacle'": lambda: load_shipped(
+        "ppo-paper-random-obstacle"
+    ),
+    "'team@shipped' is now written universal": lambda: make_lineup(["team@shipped+step"], PAPER),
+    "'policy@shipped/ppo-paper-random-obstacle' is now written ppo-obstacle": lambda: make_lineup(
+        ["policy@shipped/ppo-paper-random-obstacle"], PAPER
+    ),
 }
 
 
@@ -113,4 +113,4 @@ def test_policy__is_made_of_finite_numbers_and_possible_fields() -> None:
 
 def test_shipped_policy__is_told_what_is_near() -> None:
     with refused("unknown shipped policy 'universel'; did you mean 'universal'?", UnknownName):
-        load_named_policy("shipped/universel")
+        load_shipped("universel")

@@ -121,7 +121,7 @@ SPECS = (
     "planner:99999999999", "best_harm:99999999999", "planner:1e99", "planner:" + "9" * 4000, "planner:999999999ms",
     "planner:0", "planner:0.5", "planner:-1", "planner:\u0663", "best_harm:0", "best_harm:x", "best_harm:\u00b2",
     "best_harm:" + "9" * 5000, "constant:.inf", "constant:1e400", "constant:nan", "constant:" + "9" * 3000,
-    "constant:-7", "e_v2x_bm:eval", "coast:1", "__import__('os').system('touch pwned')", "ppo@/dev/zero", "ppo@shipped",
+    "constant:-7", "e_v2x_bm:eval", "coast:1", "__import__('os').system('touch pwned')", "ppo@/dev/zero", "ppo",
     "hybrid@shipped", "team@.", "learner:1", "Learner", "replay", "a" * 5000, "constant:3;touch pwned",
     "$(touch pwned)", "../../etc/passwd", "ladder", "coast:x", "",
 )  # fmt: skip

@@ -227,7 +227,7 @@ def commands(rng: random.Random) -> Iterator[Case]:
     """Command lines, the places where their results are to go, and the variables around them."""
     line = partial(Case, build=lambda folder: None, may_change=MAY_CHANGE)
     for spec in (*SPECS, *(f"ppo@{word}" for word in WORDS), *(f"{word}:1" for word in WORDS if word)):
-        good = spec in ("ppo@shipped", "ladder", "constant:-7")
+        good = spec in ("ppo", "ladder", "constant:-7")
         yield line("agent", ("evaluate", *FEW, "--agents", spec), certain=not good)
     for number in NUMBERS:
         certain = number not in ("0", "0x10", "\u0663", "10000001", "1e3", "1_000")

@@ -7,7 +7,7 @@ pieces        the same where messages contain some pieces alone, every selection
 interfaces    worlds through every shielded interface, alone and with a team
 interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
 search        restarts of a search against the shield, and against twelve leaks of it, each of which must be found
-believed      worlds that are corners of what was not received, and worlds from between them
+estimated      worlds that are corners of what was not received, and worlds from between them
 inside        worlds drawn from the inside of intervals, behind robust mode; corner mode beside it claims no such thing
 horizon       what a bound is worth beyond its horizon; nothing is claimed
 """
@@ -76,8 +76,8 @@ OPTIONS = {
     "--piece-decisions": {"type": int, "default": 100_000, "help": "of 'pieces', all teams together, at least"},
     "--interface-worlds": {"type": int, "default": 2_000, "help": "through each interface"},
     "--interfered": {"type": int, "default": 1_000, "help": "episodes with failing calls on each interface"},
-    "--corner-worlds": {"type": int, "default": 60_000, "help": "of 'believed'"},
-    "--range-worlds": {"type": int, "default": 1_200, "help": "of 'believed', from between the corners"},
+    "--corner-worlds": {"type": int, "default": 60_000, "help": "of 'estimated'"},
+    "--range-worlds": {"type": int, "default": 1_200, "help": "of 'estimated', from between the corners"},
     "--restarts": {"type": int, "default": 1_000, "help": "of the search"},
     "--intervals": {"default": "gaps_m=0.5", "help": "of 'inside'"},
     "--boxes": {"type": int, "default": 20, "help": "of 'inside'"},
@@ -103,7 +103,7 @@ def cases(given: Given) -> Cases:
     for lists, robust, worlds in ((LISTS, "corners", given.corner_worlds), (INSIDE, "interior", given.range_worlds)):
         for name, way in product(lists, WAYS):
             each = max(1, worlds // (len(lists) * len(WAYS)))
-            yield f"believed, {robust}: {name}, {way}", partial(believed, lists[name], way, each, seed, robust)
+            yield f"estimated, {robust}: {name}, {way}", partial(estimated, lists[name], way, each, seed, robust)
     for which in TEAMS:
         yield f"pieces: level {which[0]}, N = {which[1]}", partial(pieces, which, given.piece_decisions, seed)
     for name in PLAYS:
@@ -240,7 +240,7 @@ def searched(restarts: int, seed: int, leak: Any = None, harm_count: str = "firs
     return Told(found.first is not None, f"{first}, largest excess {found.excess:.2g} m2/s2")
 
 
-def believed(scenario: Any, way: str, worlds: int, seed: int, robust: str) -> Told:
+def estimated(scenario: Any, way: str, worlds: int, seed: int, robust: str) -> Told:
     """Where the world is a corner of what is not known, or anywhere in the ranges, whatever is proposed."""
     harm, bound, replaced = shielded(way, scenario, worlds, seed, robust=robust)
     above, kept = int((harm > bound + ABOVE).sum()), np.isfinite(bound)

@@ -20,7 +20,7 @@ from tests.programmes import ROOT, Cases, Given, Told, find_uv
 
 LIMIT_MB = 650
 NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # what an empty environment begins with
-SHIPPED = "ppo@shipped,ppo@shipped+episode"
+SHIPPED = "ppo,ppo+episode"
 NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
 
 
@@ -70,14 +70,14 @@ class Call(NamedTuple):
 COMMANDS = (
     Call(("ethbrake", "--version")),
     Call(("ethbrake", "evaluate", "--agents", SHIPPED, "--episodes", "200")),
-    Call(("ethbrake", "evaluate", "--agents", "full_brake,ppo@shipped+step", "--episodes", "20", "--json")),
-    Call(("ethbrake", "shield", "--agents", "ppo@shipped", "--episodes", "20")),
+    Call(("ethbrake", "evaluate", "--agents", "full_brake,ppo+step", "--episodes", "20", "--json")),
+    Call(("ethbrake", "shield", "--agents", "ppo", "--episodes", "20")),
     Call(("ethbrake", "watch", "--output", "film.svg")),
     Call(("ethbrake", "scenario", "validate", "paper-random")),
     Call(("ethbrake", "doctor")),
     Call(("ethbrake", "train", "--steps", "1000"), 2, NEEDS_TRAIN),
     Call(("ethbrake", "run"), 2, NEEDS_TRAIN),
-    Call(("ethbrake", "agent", "export", "shipped/ppo", "--onnx", "ppo.onnx"), 2, "'ethbrake-marl[export]'"),
+    Call(("ethbrake", "agent", "export", "ppo", "--onnx", "ppo.onnx"), 2, "'ethbrake-marl[export]'"),
     Call(("python", "-c", "import ethbrake_marl as eb; eb.train"), 1, NEEDS_TRAIN),  # an exception, whose end says it
 )
 SMOKE = (COMMANDS[0], COMMANDS[1], COMMANDS[6], COMMANDS[7])  # of the sdist, whose files are the wheel's

@@ -245,8 +245,8 @@ LIGHT = PAPER.replace(v2x={"tells": {"vehicle_3": [*USUAL_PIECES[:-1]]}})  # Veh
 @pytest.mark.parametrize(
     ("spec", "refuses"),
     [
-        ("full_brake", False), ("ppo@shipped/ppo", False), ("e_v2x_bm", True), ("e_v2x_bm:pairwise", False),
-        ("ppo@shipped/ppo+step", True), ("ppo@shipped/ppo+episode", True), ("full_brake+episode:pairwise", True),
+        ("full_brake", False), ("ppo", False), ("e_v2x_bm", True), ("e_v2x_bm:pairwise", False),
+        ("ppo+step", True), ("ppo+episode", True), ("full_brake+episode:pairwise", True),
     ],
 )  # fmt: skip
 def test_agents__who_looks_ahead_refuses_to_do_without_a_piece(spec: str, refuses: bool) -> None:

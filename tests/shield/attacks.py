@@ -322,13 +322,13 @@ def hits_assumed(shield: StepShield, pairs: np.ndarray) -> None:
     pairs[:, 1] = np.maximum(pairs[:, 1], pairs[:, 0] < 0.5)
 
 
-def belief(name: str, believed: Callable[[np.ndarray], np.ndarray]) -> Leak:
-    """The shield believes a parameter to be something else."""
+def misjudged(name: str, estimated: Callable[[np.ndarray], np.ndarray]) -> Leak:
+    """The shield estimates a parameter to be something else."""
 
     def leak(shield, last):
         if last is None:
             problem = shield.memory.running.problem
-            changed = problem._replace(**{name: believed(getattr(problem, name).copy())})
+            changed = problem._replace(**{name: estimated(getattr(problem, name).copy())})
             shield.memory = shield.memory._replace(running=shield.memory.running._replace(problem=changed))
 
     return leak
@@ -347,7 +347,7 @@ def far_pairs_forgotten(shield: StepShield, pairs: np.ndarray) -> None:
 
 
 def plan_rounded(shield: StepShield, last: Decision | None) -> None:
-    """The plan is kept with two decimals; its harm is believed unchanged."""
+    """The plan is kept with two decimals; its harm is taken as unchanged."""
     shield.memory = shield.memory._replace(
         backup=shield.memory.backup._replace(plan=np.round(shield.memory.backup.plan, 2))
     )
@@ -355,7 +355,7 @@ def plan_rounded(shield: StepShield, last: Decision | None) -> None:
 
 @_of_pairs
 def gaps_blurred(shield: StepShield, pairs: np.ndarray) -> None:
-    """Gaps are believed 1 cm longer than they are, from the third step on."""
+    """Gaps are estimated 1 cm longer than they are, from the third step on."""
     if int(shield.memory.running.steps.max()) == 3:
         pairs[:, 0] += 0.01
 
@@ -366,13 +366,13 @@ LEAKS: dict[str, Leak] = {
     "1 % of the harm so far is forgotten in each step": harm_forgotten,
     "impacts are counted one step late": impacts_late,
     "a pair closer than 0.5 m counts as hit before": hits_assumed,
-    "the latency of all is believed 10 % longer": belief("latency", lambda latency: latency * 1.1),
-    "the masses are believed equal": belief("mass", np.ones_like),
-    "the others are believed to brake 1 % harder": belief("command", lambda command: command * 1.01),
-    "restitution is believed half of what it is": belief("clock", half_restitution),
+    "the latency of all is estimated 10 % longer": misjudged("latency", lambda latency: latency * 1.1),
+    "the masses are estimated equal": misjudged("mass", np.ones_like),
+    "the others are estimated to brake 1 % harder": misjudged("command", lambda command: command * 1.01),
+    "restitution is estimated half of what it is": misjudged("clock", half_restitution),
     "harm of pairs further off is forgotten": far_pairs_forgotten,
     "the plan is kept with two decimals": plan_rounded,
-    "gaps are believed 1 cm longer": gaps_blurred,
+    "gaps are estimated 1 cm longer": gaps_blurred,
 }
 
 

@@ -34,7 +34,7 @@ def test_agent__drives_behind_each_shield(spec: str) -> None:
 def test_list__has_no_variants() -> None:
     forms = [entry.form for entry in agent_entries()]
     assert {"e_v2x_bm[:pairwise]", "+episode[:pairwise]", "+step"} <= {*forms}
-    assert not [form for form in forms if "believed" in form or "robust" in form]
+    assert not [form for form in forms if "estimated" in form or "robust" in form]
 
 
 @pytest.mark.parametrize("setting", [{"allowance": 5.0}, {"logging": True}, {"shares": True}], ids=str)
@@ -50,14 +50,14 @@ REFUSED: dict[str, Callable[[], object]] = {
     "unknown ShieldedVectorEnv option 'uncertainty'; known: allowance, bound, cap": lambda: eb.shield(
         eb.EthBrakeVectorEnv(2), uncertainty="gaps_m=0.2"
     ),
-    "unknown HybridShield option 'believed'; known: allowance, bound, cap": lambda: eb.HybridShield(
-        eb.parallel_env(), believed=True
+    "unknown HybridShield option 'estimated'; known: allowance, bound, cap": lambda: eb.HybridShield(
+        eb.parallel_env(), estimated=True
     ),
     "unknown shield option 'robust'; known: allowance, bound, cap": lambda: eb.ShieldOptions(robust="interior"),
     "unknown shield or search 'robust'; known: episode, episode:pairwise, step": lambda: make_agent(
         "coast+robust", scenario=PAPER
     ),
-    "unknown shield or search 'step:believed'": lambda: make_agent("coast+step:believed", scenario=PAPER),
+    "unknown shield or search 'step:estimated'": lambda: make_agent("coast+step:estimated", scenario=PAPER),
 }
 
 
@@ -68,5 +68,5 @@ def test_what_an_extension_has__is_refused_in_one_line(message: str) -> None:
 
 
 def test_variant__of_an_agent_is_an_argument_that_it_does_not_take() -> None:
-    with refused("agent 'e_v2x_bm:believed': the argument must be 'coupled' or 'pairwise'"):
-        make_agent("e_v2x_bm:believed", scenario=PAPER)
+    with refused("agent 'e_v2x_bm:estimated': the argument must be 'coupled' or 'pairwise'"):
+        make_agent("e_v2x_bm:estimated", scenario=PAPER)

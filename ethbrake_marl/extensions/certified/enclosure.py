@@ -485,7 +485,7 @@ class Boxes(NamedTuple):
             name = getattr(script, "name", type(script).__name__)
             if name.split(":")[0] not in SCRIPTS:
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, which it cannot enclose;"
+                    f"shield: robust interior: vehicle_{i + 1} is controlled by {name!r}, which it cannot enclose;"
                     " full_brake, coast and constant:A are possible; robust corners takes every script"
                 )
 
@@ -521,8 +521,8 @@ class Boxes(NamedTuple):
                 continue
             if not (command[:, :, i] == command[:, :1, i]).all():
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} is driven by {name!r}, whose command is another one in"
-                    " each world of the box; full_brake, coast and constant:A are possible, A being at most every"
+                    f"shield: robust interior: vehicle_{i + 1} is controlled by {name!r}, whose command is another one"
+                    " in each world of the box; full_brake, coast and constant:A are possible, A being at most every"
                     " capacity of the box"
                 )
             constant[:, i] = command[:, 0, i]

@@ -160,7 +160,7 @@ class Ranges:
             names = ", ".join(member.name for member in scenario.members)
             raise InvalidInput(
                 f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
-                " believed agents need one of these"
+                " estimated agents need one of these"
             )
         world = middle_world(scenario)
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
@@ -207,7 +207,7 @@ class Ranges:
         others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
 
-    def believe(
+    def estimate(
         self,
         worlds: Worlds,
         way_m: Floats,
@@ -225,7 +225,7 @@ class Ranges:
                 for which this prediction is better than their last message. None: no prediction.
 
         """
-        worlds.refuse_build_up(":believed")
+        worlds.refuse_build_up(":estimated")
         vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
         told, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
         given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
@@ -255,7 +255,7 @@ class Ranges:
             command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)), obstacle_hit=told.obstacle_hit,
             road=np.zeros((n, 0)),
         )  # fmt: skip
-        command = fixed_commands(self.others, line, "believed", vehicle=vehicle)
+        command = fixed_commands(self.others, line, "estimated", vehicle=vehicle)
         speed, way = move_on(
             line.speeds_mps, command, latency - at_s, of["speed_limit_mps"], worlds.time_s[:, None] - at_s
         )

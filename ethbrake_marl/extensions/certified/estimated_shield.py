@@ -61,7 +61,7 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
     shield.memory = shield.memory._replace(running=running, backup=backup)
 
 
-class BelievedShield:
+class EstimatedShield:
     """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
     It starts at the first decision, and again whenever another vehicle becomes known, is known to react, or moves
@@ -90,7 +90,7 @@ class BelievedShield:
         others: Mapping[int, Script] | None = None,
     ) -> None:
         self.scenario, self.vehicle = scenario, vehicle
-        self.robust = None if robust is None else checked_robust(robust, "believed")
+        self.robust = None if robust is None else checked_robust(robust, "estimated")
         self.predicted_harm: Floats = np.zeros(0)
         self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
         self.decision: Decision | None = None  # last decision
@@ -106,7 +106,7 @@ class BelievedShield:
         numbers = len(self._ranges.uncertain)
         if self.robust is not None and 2**numbers > MOST_CORNERS:
             raise InvalidInput(
-                f"robust:believed: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
+                f"robust:estimated: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
                 f" which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
             )
         self.shield = self._make()
@@ -122,16 +122,16 @@ class BelievedShield:
         """Number of worlds that are certified for each true world: 1 for the median, plus 1 for each corner."""
         return 1 + len(self._corners())
 
-    def __copy__(self) -> BelievedShield:
+    def __copy__(self) -> EstimatedShield:
         """Return an independent copy: its decisions do not change this shield."""
-        apart = object.__new__(BelievedShield)
+        apart = object.__new__(EstimatedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
         for name in PER_WORLD:
             setattr(apart, name, getattr(self, name).copy())
         return apart
 
-    def take(self, rows: Ints) -> BelievedShield:
+    def take(self, rows: Ints) -> EstimatedShield:
         """Return an independent shield for the episodes with the indices ``rows``."""
         apart = copy.copy(self)
         if self.shield.memory.running is not None:
@@ -176,28 +176,28 @@ class BelievedShield:
         shield, vehicle = self.shield, self.vehicle
         if worlds.n > len(self._heard):
             raise InvalidInput(
-                f"shield: believed: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+                f"shield: estimated: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
             )
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
         past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s
         due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
         due &= True if only is None else only
         if due.any():
-            believed = self._believe(worlds, odometer.way_m, None)
-            self._begin_anew(worlds, believed, odometer.way_m, due)
-            proposer = None if proposer is None else proposer._replace(worlds=believed)
+            estimated = self._estimate(worlds, odometer.way_m, None)
+            self._begin_anew(worlds, estimated, odometer.way_m, due)
+            proposer = None if proposer is None else proposer._replace(worlds=estimated)
             self.decision = decision = shield.decide(proposed, only=due, proposer=proposer)
             self._wanted[due] = decision.applied[due]
             self.interventions = self.interventions + (decision.intervened & due)
             self._asked_s[due] = worlds.time_s[due]
         return self._wanted.copy()
 
-    def _begin_anew(self, worlds: Worlds, believed: Worlds, way_m: Floats, due: Bools) -> None:
+    def _begin_anew(self, worlds: Worlds, estimated: Worlds, way_m: Floats, due: Bools) -> None:
         """Restart the inner shield in worlds where it has not started, or where a message contradicts the prediction.
 
         Args:
             worlds: the true worlds.
-            believed: the estimated worlds.
+            estimated: the estimated worlds.
             way_m: [n] the vehicle's distance since the alert, m.
             due: [n] True for worlds that decide now.
 
@@ -211,7 +211,7 @@ class BelievedShield:
             if begun:
                 self._note_impacts(worlds)
             keeps = self._keeps(told, worlds.time_s)
-            surprised = self._is_surprised(believed, told.known & ~keeps) if begun else fresh
+            surprised = self._is_surprised(estimated, told.known & ~keeps) if begun else fresh
             anew = fresh | surprised | (heard != self._heard).any(axis=1)
         rows = np.flatnonzero(due & anew)
         rows = rows if begun else np.arange(worlds.n)
@@ -219,7 +219,7 @@ class BelievedShield:
             return
         before = copy.copy(shield) if begun and self.robust != INTERIOR else None
         keeps = keeps & ~fresh[:, np.newaxis]
-        self._begin_shield(worlds.take(rows), believed.take(rows), way_m[rows], rows, keeps[rows], before)
+        self._begin_shield(worlds.take(rows), estimated.take(rows), way_m[rows], rows, keeps[rows], before)
         if before is not None and (held_before := rows[~fresh[rows]]).size:
             _hold_better(shield, held_before, before)
         rows = rows[due[rows]]  # the other worlds begin again at their own first decision
@@ -229,14 +229,14 @@ class BelievedShield:
         self.predicted_harm[first] = np.where(felt, np.inf, shield.memory.backup.harm[first])
 
     def _begin_shield(
-        self, worlds: Worlds, believed: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
+        self, worlds: Worlds, estimated: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
         """Start the inner shield in ``rows``, with the median of everything unknown and, if robust, the corners of its
         ranges.
 
         Args:
             worlds: the true worlds of these rows.
-            believed: their estimated worlds.
+            estimated: their estimated worlds.
             way_m: the vehicle's distance since the alert in each of them, m.
             rows: indices of the episodes in the batch.
             keeps: mask of vehicles, [rows, N], whose predicted state is better than their received state.
@@ -249,10 +249,10 @@ class BelievedShield:
             if before is not None:
                 running = before.memory.running
                 assert running is not None
-                expected = worlds_at(believed, running.states[rows * running.members + m])
+                expected = worlds_at(estimated, running.states[rows * running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
                 foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
-            parts.append(self._believe(worlds, way_m, share, foretold))
+            parts.append(self._estimate(worlds, way_m, share, foretold))
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
     def _keeps(self, told: Told, time_s: Floats) -> Bools:
@@ -290,24 +290,24 @@ class BelievedShield:
                     self._impact_s[met[:, p], j] = worlds.time_s[met[:, p]]
         self._totals = totals.copy()
 
-    def _is_surprised(self, believed: Worlds, heard: Bools) -> Bools:
+    def _is_surprised(self, estimated: Worlds, heard: Bools) -> Bools:
         """Return a mask [n] of the worlds in which a vehicle is outside the range of its predicted states.
 
         Args:
-            believed: the estimated worlds now, [n].
+            estimated: the estimated worlds now, [n].
             heard: [n, N] True for vehicles whose received state is compared.
 
         """
         running = self.shield.memory.running
         assert running is not None
-        seen, wrong = seen_columns(Packed.of(believed)), np.zeros(believed.n, np.bool_)
-        first = (seen.shape[1] + 4) // 5 - believed.N  # 1: an obstacle ahead is vehicle 0 of the columns
-        foretold = running.states[:, : seen.shape[1]].reshape(believed.n, running.members, -1)
+        seen, wrong = seen_columns(Packed.of(estimated)), np.zeros(estimated.n, np.bool_)
+        first = (seen.shape[1] + 4) // 5 - estimated.N  # 1: an obstacle ahead is vehicle 0 of the columns
+        foretold = running.states[:, : seen.shape[1]].reshape(estimated.n, running.members, -1)
         outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
-        for i in range(believed.N):
+        for i in range(estimated.N):
             wrong |= heard[:, i] & outside[:, first + i]
-        for p in range(believed.N - 1):
-            wrong |= heard[:, p] & heard[:, p + 1] & outside[:, 2 * first + believed.N + p]
+        for p in range(estimated.N - 1):
+            wrong |= heard[:, p] & heard[:, p + 1] & outside[:, 2 * first + estimated.N + p]
         return wrong
 
     def _corners(self) -> list[dict[tuple[str, int], float]]:
@@ -315,11 +315,11 @@ class BelievedShield:
         shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
         return [dict(zip(uncertain, each, strict=True)) for each in shares]
 
-    def _believe(
+    def _estimate(
         self,
         worlds: Worlds,
         way_m: Floats,
         share: dict[tuple[str, int], float] | None,
         foretold: tuple[Worlds, Bools] | None = None,
     ) -> Worlds:
-        return self._ranges.believe(worlds, way_m, share, foretold)
+        return self._ranges.estimate(worlds, way_m, share, foretold)

@@ -43,7 +43,7 @@ class Odometer(NamedTuple):
         return Odometer(self.way_m + way, worlds.time_s.copy(), speed.copy())
 
 
-class Believing(AgentAround):
+class Estimating(AgentAround):
     """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
 
     The policy starts when it is first asked, on the information received by then. It starts again in worlds where
@@ -58,7 +58,7 @@ class Believing(AgentAround):
     """
 
     def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
-        super().__init__(policy, f"{policy.name}:believed")
+        super().__init__(policy, f"{policy.name}:estimated")
         self.scenario, self._shows = scenario, shows
         self._ranges: dict[int, Ranges] = {}  # by the agent's vehicle
         Ranges.of(scenario, 0, {})  # refuses a mixture at once
@@ -66,7 +66,7 @@ class Believing(AgentAround):
     @property
     def knows(self) -> Knowledge:
         """Information that the agent uses: received messages, completed by the scenario's model of the line."""
-        return Knowledge((Source.BELIEFS,))
+        return Knowledge((Source.ESTIMATES,))
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         """Return the memory at the start of episodes, as a mapping. The policy has not started, because nothing was
@@ -98,18 +98,18 @@ class Believing(AgentAround):
         policy, predicted = memory["policy"], memory["predicted_harm"]
         rows = np.flatnonzero((heard != memory["heard"]).any(axis=1))
         if rows.size:
-            believed = self._believe(worlds.take(rows), vehicle, way.way_m[rows])
+            estimated = self._estimate(worlds.take(rows), vehicle, way.way_m[rows])
             others = self._ranges[vehicle].others
-            begun = begin_script(self.policy, self._shown_at_first(believed), vehicle, others)
+            begun = begin_script(self.policy, self._shown_at_first(estimated), vehicle, others)
             policy = begun if policy is None else renew_memory(policy, rows, begun)  # the first call covers all rows
             if isinstance(policy, Mapping) and "predicted_harm" in policy:
                 predicted = np.where(np.isnan(memory["heard"][:, 0]), policy["predicted_harm"], predicted)
-        shown = self._believe(worlds, vehicle, way.way_m) if self._shows else worlds
+        shown = self._estimate(worlds, vehicle, way.way_m) if self._shows else worlds
         command, policy = ask_script(self.policy, shown, policy, vehicle)
         return command, {"way": way, "heard": heard, "predicted_harm": predicted, "policy": policy}
 
-    def _shown_at_first(self, believed: Worlds) -> Worlds:
-        return believed
+    def _shown_at_first(self, estimated: Worlds) -> Worlds:
+        return estimated
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
         """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether a message says that this
@@ -122,13 +122,13 @@ class Believing(AgentAround):
         unforetold = told.reacts & (self.scenario.v2x.delays | ~told.pieces[..., LATENCY])
         return np.concatenate([told.heard, unforetold], axis=1)
 
-    def _believe(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
+    def _estimate(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
         if vehicle not in self._ranges:
             self._ranges[vehicle] = Ranges.of(self.scenario, vehicle)
-        return self._ranges[vehicle].believe(worlds, way_m)
+        return self._ranges[vehicle].estimate(worlds, way_m)
 
 
-class BelievingHybrid(Believing):
+class EstimatingHybrid(Estimating):
     """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM, the
     best constant deceleration.
 
@@ -140,19 +140,19 @@ class BelievingHybrid(Believing):
     @property
     def knows(self) -> Knowledge:
         """Information that the agent uses: the policy's information, and the estimated world for the comparison."""
-        return Knowledge.of(self.policy.policy, also=Source.BELIEFS)
+        return Knowledge.of(self.policy.policy, also=Source.ESTIMATES)
 
-    def _shown_at_first(self, believed: Worlds) -> Worlds:
+    def _shown_at_first(self, estimated: Worlds) -> Worlds:
         """Return the estimated worlds with their clock at 0 and without past impacts, because the rollouts that compare
         the policy with E-V2X-BM start there.
         """
-        v, n = believed.vehicles, believed.n
-        latency = np.maximum(v.latency_s - believed.time_s[:, np.newaxis], 0.0)
+        v, n = estimated.vehicles, estimated.n
+        latency = np.maximum(v.latency_s - estimated.time_s[:, np.newaxis], 0.0)
         vehicles = Vehicles.at_once(
             v.braking_capacity_mps2, v.driving_capacity_mps2, latency, v.mass_t, v.speed_limit_mps, v.restitution,
             v.brake_rate_mps3, v.release_rate_mps3, harm_weight=v.harm_weight,
         )  # fmt: skip
         return replace(
-            believed, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(believed.pair_hit),
+            estimated, vehicles=vehicles, time_s=np.zeros(n), pair_hit=np.zeros_like(estimated.pair_hit),
             obstacle_hit=np.zeros(n, np.bool_),
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Registry entries of this extension: the shield ``+robust``, and the variant ``:believed`` of agents and shields."""
+"""Registry entries of this extension: the shield ``+robust``, and the variant ``:estimated`` of agents and shields."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from ethbrake_marl.agents.protocol import Agent, Driver, Source, Team
 from ethbrake_marl.agents.settings import AgentSettings
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, checked_robust
-from ethbrake_marl.extensions.certified.estimating_agents import Believing, BelievingHybrid
+from ethbrake_marl.extensions.certified.estimating_agents import Estimating, EstimatingHybrid
 from ethbrake_marl.extensions.certified.options import RobustOptions, mode_uncertainty
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE
 from ethbrake_marl.registry import Part
@@ -34,8 +34,9 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 
 
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust:believed`` or ``+robust:interior:believed``: the same shield for the ranges of what the
-    vehicle did not receive.
+    """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
+
+    It is the same shield, for the ranges of what the vehicle did not receive.
 
     Args:
         policy: the agent to shield.
@@ -46,12 +47,12 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
     where = f"agent {settings.spec!r}"
     return ShieldedDriver(
         policy, settings.needed_scenario(), mode="robust", harm_count=settings.harm_count, where=where,
-        robust=checked_robust(argument or CORNERS, where), believed=True,
+        robust=checked_robust(argument or CORNERS, where), estimated=True,
     )  # fmt: skip
 
 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+step:believed``: every action of ``policy`` is certified in the estimated world.
+    """Make the shield ``+step:estimated``: every action of ``policy`` is certified in the estimated world.
 
     Raises ``InvalidInput`` for a team or several learners.
 
@@ -64,15 +65,16 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
         raise InvalidInput(
-            f"agent {settings.spec!r}: :believed shields one learner. +step shields several where messages contain"
+            f"agent {settings.spec!r}: :estimated shields one learner. +step shields several where messages contain"
             " every piece; without a piece several learners have no shield"
         )
-    return shielded(policy, scenario, "step", harm_count=settings.harm_count, believed=True)
+    return shielded(policy, scenario, "step", harm_count=settings.harm_count, estimated=True)
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the shield ``+episode:believed`` or ``+episode:pairwise:believed``: the paper's Algorithm 1 in the estimated
-    world.
+    """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``.
+
+    It is the paper's Algorithm 1 in the estimated world.
 
     At the first decision it predicts the harm of ``policy`` and of E-V2X-BM (the best constant deceleration) in that
     world; the better one controls the whole episode.
@@ -86,18 +88,19 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
 
     """
     hybrid = shield_episodes(policy, argument, settings)
-    if isinstance(policy, Believing):
+    if isinstance(policy, Estimating):
         raise InvalidInput(f"agent {settings.spec!r}: {policy.name} decides on what was received itself; take +step")
-    return BelievingHybrid(hybrid, settings.needed_scenario())
+    return EstimatingHybrid(hybrid, settings.needed_scenario())
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``e_v2x_bm:believed`` or ``e_v2x_bm:pairwise:believed``: E-V2X-BM (the best constant deceleration)
-    in the estimated world.
+    """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
+
+    It is E-V2X-BM (the best constant deceleration) in the estimated world.
 
     ``argument`` is ``pairwise`` or None; ``settings`` hold the scenario.
     """
-    return Believing(make_e_v2x_bm(argument, settings), settings.needed_scenario())
+    return Estimating(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 
 
 ROBUST = Part(
@@ -109,10 +112,12 @@ ROBUST = Part(
     options=RobustOptions,
 )
 
-BELIEVED_ROBUST = Part(shield_robustly_as_estimated, about="against all that was not received")
+ESTIMATED_ROBUST = Part(shield_robustly_as_estimated, about="against all that was not received")
 
-BELIEVED_STEP = Part(shield_steps_as_estimated, about="certified in the world that is believed")
+ESTIMATED_STEP = Part(shield_steps_as_estimated, about="certified in the estimated world")
 
-BELIEVED_EPISODE = Part(shield_episodes_as_estimated, about="as far as is received")
+ESTIMATED_EPISODE = Part(shield_episodes_as_estimated, about="as far as is received")
 
-BELIEVED_E_V2X_BM = Part(make_estimating_e_v2x_bm, about="on what was received, and the scenario's ranges for the rest")
+ESTIMATED_E_V2X_BM = Part(
+    make_estimating_e_v2x_bm, about="on what was received, and the scenario's ranges for the rest"
+)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.engine.engine import Engine, Ruling
-from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
+from ethbrake_marl.extensions.certified.estimated_shield import EstimatedShield
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.shields.contract import Guarded, ShieldGuard, why
 from ethbrake_marl.shields.guard import StepGuard
@@ -38,15 +38,14 @@ class RobustGuard(StepGuard):
         return super().tell(memory, ruling) | {"members": memory.shield.memory.running.members}
 
 
-class BelievedGuard(ShieldGuard):
-    """Guard of modes ``step`` and ``robust`` in the estimated world: lets a ``BelievedShield`` decide on the actions in
-    each step of a running engine.
+class EstimatedGuard(ShieldGuard):
+    """Guard of modes ``step`` and ``robust`` in the estimated world: an ``EstimatedShield`` decides on the actions.
 
     Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
     with the prediction, because an estimate may be wrong without a fault of the system.
     """
 
-    def _started(self, shield: BelievedShield, alert: Worlds, rows: Ints) -> BelievedShield:
+    def _started(self, shield: EstimatedShield, alert: Worlds, rows: Ints) -> EstimatedShield:
         shield.begin(alert, rows)
         return shield
 
@@ -73,10 +72,10 @@ class BelievedGuard(ShieldGuard):
         ``trusted`` is true if the mode is ``robust``, so that the bound also says something about the true world.
         ``memory`` holds the shield after the step, ``ruling`` its decision (None at the reset).
         """
-        estimated: BelievedShield = memory.shield
+        estimated: EstimatedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield
         infos = self._of_step(ruling) | why(ruling)
-        infos |= {"bound_harm": np.inf, "settles": False, "believed": True, "trusted": robust}
+        infos |= {"bound_harm": np.inf, "settles": False, "estimated": True, "trusted": robust}
         if ruling is not None:
             infos["bound_harm"] = np.where(np.isfinite(estimated.predicted_harm), shield.bound, np.inf)
             infos["settles"] = shield.memory.settles

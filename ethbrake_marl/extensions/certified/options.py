@@ -1,4 +1,4 @@
-"""Checked settings of mode ``robust`` and of ``believed``, and the shields and guards that they make."""
+"""Checked settings of mode ``robust`` and of ``estimated``, and the shields and guards that they make."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.enclosure import CORNERS, INTERIOR, checked_robust
-from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
-from ethbrake_marl.extensions.certified.guards import BelievedGuard, RobustGuard, RobustMode
+from ethbrake_marl.extensions.certified.estimated_shield import EstimatedShield
+from ethbrake_marl.extensions.certified.guards import EstimatedGuard, RobustGuard, RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import UNCERTAINTY_EXAMPLE, Uncertainty, parse_uncertainty
 from ethbrake_marl.scenario.schema import Scenario, as_scenario
@@ -29,7 +29,7 @@ class RobustOptions(ShieldOptions):
             uncertainty, else ``step``.
         uncertainty: uncertainty for mode ``robust``, such as ``"gaps_m=0.5"``.
         robust: worlds of the uncertainty that mode ``robust`` certifies: its ``corners`` (fast) or whole ``interior``.
-        believed: certify in the estimated world, on what the vehicle received; in mode ``robust`` against everything
+        estimated: certify in the estimated world, on what the vehicle received; in mode ``robust`` against everything
             that it did not receive. For modes ``step`` and ``robust`` with one learner, and not together with
             ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
 
@@ -43,24 +43,24 @@ class RobustOptions(ShieldOptions):
 
     uncertainty: Uncertainty | str | None = None
     robust: str = CORNERS
-    believed: bool = False
+    estimated: bool = False
 
     def __post_init__(self) -> None:
         if self.mode is None:
             object.__setattr__(self, "mode", "step" if self.uncertainty is None else "robust")
         mode, where = check_mode(self.mode), self.where
-        self.check_switches("believed")
-        if self.believed:
+        self.check_switches("estimated")
+        if self.estimated:
             if mode == "episode":
-                raise misplaced("believed", True, mode, ["step", "robust"], where)
+                raise misplaced("estimated", True, mode, ["step", "robust"], where)
             without = {"uncertainty": None, "allowance": 0.0, "cap": None, "logging": False, "shares": False}
             for name, value in without.items():
                 if getattr(self, name) != value:
                     raise InvalidInput(
-                        f"{where}: {name} = {getattr(self, name)!r}: not together with believed = True, which"
+                        f"{where}: {name} = {getattr(self, name)!r}: not together with estimated = True, which"
                         " certifies against what was not received"
                     )
-        uncertainty = None if self.believed else mode_uncertainty(mode, self.uncertainty, where)
+        uncertainty = None if self.estimated else mode_uncertainty(mode, self.uncertainty, where)
         object.__setattr__(self, "uncertainty", uncertainty)
         super().__post_init__()
         if checked_robust(self.robust, where) == INTERIOR and mode != "robust":
@@ -68,16 +68,16 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """Text of the mode in an agent spec, after the ``+``: ``robust:interior:believed`` in
-        ``ppo+robust:interior:believed``.
+        """Text of the mode in an agent spec, after the ``+``: ``robust:interior:estimated`` in
+        ``ppo+robust:interior:estimated``.
         """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
-        return f"{self.mode}{robust}{':believed' if self.believed else ''}"
+        return f"{self.mode}{robust}{':estimated' if self.estimated else ''}"
 
     @property
     def adds(self) -> Source:
         """Source of information that the shield uses in addition to the policy's information."""
-        return Source.BELIEFS if self.believed else super().adds
+        return Source.ESTIMATES if self.estimated else super().adds
 
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
@@ -86,10 +86,10 @@ class RobustOptions(ShieldOptions):
 
         ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts.
         """
-        if self.believed:
+        if self.estimated:
             assert isinstance(vehicle, int)
             robust = self.robust if self.mode == "robust" else None
-            return BelievedShield(scenario, vehicle, harm_count=self.harm_count, robust=robust, others=others)
+            return EstimatedShield(scenario, vehicle, harm_count=self.harm_count, robust=robust, others=others)
         if self.mode == "robust":
             return RobustShield(
                 scenario, vehicle, harm_count=self.harm_count, allowance=self.allowance, others=others, cap=self.cap,
@@ -103,7 +103,7 @@ class RobustOptions(ShieldOptions):
         ``several`` is True for one shield of all learners together.
         """
         one = one_learner(scenario)
-        if self.believed:  # the scenario's scripts apply only if it has exactly one learner
+        if self.estimated:  # the scenario's scripts apply only if it has exactly one learner
             self.shield(scenario, one or 0, {} if one is None else None)
         else:
             super().check_in(scenario, several=several)
@@ -119,15 +119,15 @@ class RobustOptions(ShieldOptions):
 
         """
         scenario, scripts, where = as_scenario(engine.scenario), engine.scripts, self.where
-        if self.believed:
+        if self.estimated:
             if len(engine.learners) > 1:
                 raise InvalidInput(
-                    f"{where}: believed = True: shields one learner, not several; pass learners=['vehicle_2'] to the"
+                    f"{where}: estimated = True: shields one learner, not several; pass learners=['vehicle_2'] to the"
                     " environment"
                 )
             mode = RobustMode.ROBUST if self.mode == "robust" else ShieldMode.STEP
             shield = self.shield(scenario, engine.learners[0], scripts)
-            return BelievedGuard(engine, policies, shield, mode=mode, where=where)
+            return EstimatedGuard(engine, policies, shield, mode=mode, where=where)
         if self.mode == "robust":
             shield = self.shield(scenario, shielded_vehicle(engine, several), scripts)
             mode = RobustMode.ROBUST

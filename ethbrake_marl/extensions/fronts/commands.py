@@ -13,7 +13,7 @@ from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.extensions.studies.commands import FolderOption
 from ethbrake_marl.registry import Part
 
-DEFAULT_AGENTS = "e_v2x_bm,universal@shipped"  # beside the front of one learner
+DEFAULT_AGENTS = "e_v2x_bm,universal"  # beside the front of one learner
 
 
 def front_command(
@@ -26,7 +26,7 @@ def front_command(
         typer.Option(
             metavar="A,B,...",
             help="Agents to show beside the front.",
-            show_default="of one learner e_v2x_bm, universal@shipped",
+            show_default="of one learner e_v2x_bm, universal",
         ),
     ] = None,
     weights: Annotated[
@@ -89,6 +89,6 @@ FRONT = Part(
     front_command,
     epilog=example(
         "study front --output runs/front",
-        "study front --weights 1,1,1 --weights 4,1,1 --agents policy@shipped --output runs/two",
+        "study front --weights 1,1,1 --weights 4,1,1 --agents vine-preference --output runs/two",
     ),
 )

@@ -33,7 +33,7 @@ from ethbrake_marl.extensions.search.shipped import shipped_profiles
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.game.objectives import weighted_harm
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
-from ethbrake_marl.policies.shipped import SHIPPED, shipped_policies
+from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
@@ -117,7 +117,7 @@ def search_front(
         budget: candidates per world and set of weights.
         seed: seed of the random search.
         threads: number of threads.
-        agents: specs of agents of the one learner, such as ``policy@shipped``. Each drives every world once for each
+        agents: specs of agents of the one learner, such as ``universal``. Each drives every world once for each
             set of weights, as the scenario's ``harm_weight`` and objective ``preference``.
         on_progress: called with the number of searches done and their total, two for each world and set of weights.
 
@@ -207,8 +207,8 @@ def _shipped_specs(scenario: Scenario) -> list[str]:
     specs = []
     for name in shipped_policies():
         with suppress(InvalidInput):
-            make_agents([f"policy@{SHIPPED}/{name}"], scenario)
-            specs.append(f"policy@{SHIPPED}/{name}")
+            make_agents([name], scenario)
+            specs.append(name)
     return specs
 
 

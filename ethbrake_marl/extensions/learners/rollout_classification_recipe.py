@@ -9,12 +9,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, refuse_shipped_path
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
 from ethbrake_marl.files.model import refuse
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.policies.shipped import SHIPPED, load_named_policy
+from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.registry import Part
 from ethbrake_marl.training.agents import make_policy_agent
 from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, NonNegative, Positive, Shape, TrainingRecipe
@@ -38,7 +39,7 @@ class ChoosingShape(Shape):
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
 
-PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+@.+$", max_length=4096)]
+PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 
 
 class RolloutClassificationRecipe(TrainingRecipe):
@@ -158,10 +159,11 @@ class RolloutClassificationRecipe(TrainingRecipe):
         loaded: list[Policy] = []
         for name in self.policies:
             kind, _, path = name.partition("@")
-            policy = load_named_policy(path)
-            where, by = f"recipe {self.name!r}: policies: {name}", policy.manifest.algorithm
-            if path == SHIPPED or kind not in ("policy", by):
-                raise InvalidInput(f"{where}: give policy@shipped/NAME, or {by}@ and its path")
+            refuse_shipped_path(path, kind)
+            policy = load_policy(path) if path else load_shipped(kind)
+            by = policy.manifest.algorithm
+            if path and kind not in ("policy", by):
+                raise InvalidInput(f"recipe {self.name!r}: policies: {name}: must be {by}@{path}")
             loaded += policy.among or [policy]
         if loaded and not self.drawn <= len(loaded):
             raise InvalidInput(
@@ -177,6 +179,6 @@ ROLLOUT_CLASSIFICATION = Part(
 ROLLOUT_CLASSIFICATION_AGENT = Part(
     make_policy_agent,
     form="rollout-classification@PATH",
-    about="a policy trained by rollout classification: a run, a bundle, or shipped",
+    about="a policy trained by rollout classification: a run or a bundle",
     knows=Source.MESSAGES,
 )

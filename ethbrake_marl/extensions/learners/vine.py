@@ -15,8 +15,9 @@ from ethbrake_marl.extensions.learners.mixture_model import ExpertsModel
 from ethbrake_marl.extensions.learners.start_weights import widened
 from ethbrake_marl.extensions.learners.vine_model import VineModel
 from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
-from ethbrake_marl.policies.shipped import load_named_policy
+from ethbrake_marl.policies.shipped import load_shipped
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.training import Training
 
@@ -38,8 +39,8 @@ class Vine(Algorithm):
         model = (VineModel if recipe.experts is None else ExpertsModel)(environment, recipe)
         start = recipe.policy_to_start_from(training.scenario)
         if start is not None:
-            kind, _, path = start.partition("@")
-            policy = load_named_policy(path, kind, training.scenario, recipe.reward.harm_count)
+            name, _, path = start.partition("@")
+            policy = load_policy(path) if path else load_shipped(name)
             first = model.policy.actors[0] if isinstance(model, ExpertsModel) else model.policy
             first.take_over(widened(policy, training))
         return model

@@ -10,19 +10,19 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.agents.protocol import Source
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, refuse_shipped_path
 from ethbrake_marl.extensions.learners.mixture_plan import ExpertsPlan
 from ethbrake_marl.extensions.learners.recipe_keys import AVERAGING, NO_SHAPING, Averaging, Focus, Holds, OffsetRange
 from ethbrake_marl.files.model import refuse
 from ethbrake_marl.policies.network_spec import Activation, NetworkSpec
-from ethbrake_marl.policies.shipped import SHIPPED, shipped_name
+from ethbrake_marl.policies.shipped import load_shipped, shipped_policies
 from ethbrake_marl.registry import Part
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.agents import make_policy_agent
 from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, Positive, Rate, Shape, TrainingRecipe
 from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
-_RIGHT_START = "must be ppo@, vine@ or universal@ and a policy, for instance ppo@shipped or ppo@runs/my-run"
+_RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@ or vine@ and the path of one"
 
 
 class ActorShape(Shape):
@@ -40,14 +40,17 @@ class VineRecipe(TrainingRecipe):
 
     A round has ``n_envs x n_steps`` decisions; ``tried`` of them are tried. The policy learns from the
     differences of the returns. ``start`` names a trained policy to continue from; without it the weights are random.
-    ``ppo@shipped`` is the policy that ships for the scenario; if none ships, the weights are random.
+    ``start: ppo`` means the shipped policy ``ppo`` or ``ppo-...`` that was trained on the scenario of this training; if
+    there is none, the weights are random.
     """
 
     most_decisions = 2**22
 
     algorithm: Literal["vine"]
-    start: Annotated[str, Field(pattern=r"^(ppo|vine|universal)@.+$", max_length=4096)] | None = Field(
-        None, description="policy to start from: ppo@shipped (random weights if none ships); left out: random weights"
+    start: Annotated[str, Field(pattern=r"^((ppo|vine)@.+|[a-z-]+)$", max_length=4096)] | None = Field(
+        None,
+        description="a policy to continue from, ppo or ppo@PATH; ppo: the shipped policy that was trained on this"
+        " scenario, or random weights if there is none; left out: random weights",
     )
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
     tried: int = Field(ge=1, description="decisions of a round that are tried with a higher and a lower action")
@@ -79,11 +82,14 @@ class VineRecipe(TrainingRecipe):
     @classmethod
     def _names_a_policy(cls, value: Any, check: Callable[[Any], Any]) -> Any:
         try:
-            return check(value)
+            start = check(value)
         except ValidationError as error:
             if error.errors()[0]["type"] != "string_pattern_mismatch":
                 raise
             raise ValueError(_RIGHT_START) from None
+        name, _, path = (start or "").partition("@")
+        refuse_shipped_path(path, name)
+        return start
 
     @field_validator("gradient_limit", mode="wrap")
     @classmethod
@@ -113,21 +119,19 @@ class VineRecipe(TrainingRecipe):
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
         """Return the spec of the policy whose weights a training on ``scenario`` begins with.
 
-        For instance ``ppo@shipped/ppo``; None: random weights.
+        For instance ``ppo-obstacle`` or ``ppo@runs/x``; None: random weights.
         """
-        kind, _, path = (self.start or "").partition("@")
-        if path != SHIPPED:
+        if self.start is None or "@" in self.start:
             return self.start
-        with suppress(InvalidInput):
-            return f"{self.start}/{shipped_name(kind, scenario, self.reward.harm_count)}"
-        return None
+        names = [self.start, *(name for name in shipped_policies() if name.startswith(f"{self.start}-"))]
+        return next((name for name in names if load_shipped(name).manifest.scenario.get("name") == scenario.name), None)
 
     def begins(self, scenario: Scenario) -> str:
         """Return a phrase about the initial weights, for messages.
 
-        It is the spec of a policy, such as ``ppo@shipped/ppo``, or ``random weights`` with the reason.
+        It is the spec of a policy, such as ``ppo``, or ``random weights`` with the reason.
         """
-        why = "" if self.start is None else f", as {self.start} has none for scenario {scenario.name!r}"
+        why = "" if self.start is None else f", as no {self.start} ships for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 
     def check_learners(self, learners: int) -> None:

@@ -28,7 +28,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 FULL_BRAKE, PAIRWISE, COUPLED = "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm"
 
-SAC, PPO, UNIVERSAL = "sac@shipped/sac", "ppo@shipped/ppo", "universal@shipped"
+SAC, PPO, UNIVERSAL = "sac", "ppo", "universal"
 
 NAMES = {  # names of the strategies in tables and figures
     FULL_BRAKE: "Non-ethical (full braking)",
@@ -96,7 +96,7 @@ def harms(evaluation: Evaluation) -> dict[str, Floats]:
     return each_harm
 
 
-_STAND_IN = "ppo-paper-random-obstacle"  # shipped policy that replaces an unconverged one without trainings
+_STAND_IN = "ppo-obstacle"  # shipped policy that replaces an unconverged one without trainings
 
 
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:

@@ -68,8 +68,8 @@ class LimitMeasures(MeasureSet):
             "mean_regret_first", lambda o, r: r.regret(o, "first"), "Regret, first-impact", "Regret\nfirst",
             "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best known"
             " is 0 where contact is proven avoidable, else the result of an earlier search over whole profiles of the"
-            " driven vehicles, or of an agent in this table that did better. With ≥: the best of some world is known"
-            " from these agents alone.",
+            " controlled vehicles, or of an agent in this table that did better. With ≥: the best of some world is"
+            " known from these agents alone.",
         ),
         Measure(
             "mean_regret_total", lambda o, r: r.regret(o, "total"),

@@ -145,11 +145,11 @@ def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
     """
     scenario, names = task.scenario, task.scenario.vehicle_names
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
-        return f"driven are: {task.names}; avoidability is proven for one vehicle"
+        return f"controlled are: {task.names}; avoidability is proven for one vehicle"
     if scenario.vehicles != _VEHICLES:
         return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
     if set(task.vehicles) not in _DECIDED:
-        return f"{task.names} is driven; avoidability is proven for {names[_DRIVEN]}"
+        return f"{task.names} is controlled; avoidability is proven for {names[_DRIVEN]}"
     because = _script_because(task, "avoidability is proven")
     if because is not None:
         return because

@@ -15,7 +15,7 @@ from ethbrake_marl.engine.memory import Memory, renew_memory, take_memory
 from ethbrake_marl.engine.profiles import TIME_STEP_S, ProfileProblem, Profiles, profile_problem
 from ethbrake_marl.engine.scripts import Script
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.estimating_agents import Believing
+from ethbrake_marl.extensions.certified.estimating_agents import Estimating
 from ethbrake_marl.extensions.search.problem import minimising, search_profiles
 from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.game.objectives import Declared
@@ -203,11 +203,11 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``planner:believed`` or ``planner:CANDIDATES:believed``, which searches in the estimated world.
+    """Make the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches in the estimated world.
 
     ``argument`` is the number of candidates, or None.
     """
-    return Believing(make_planner(argument, settings), settings.needed_scenario(), shows=True)
+    return Estimating(make_planner(argument, settings), settings.needed_scenario(), shows=True)
 
 
 PLANNER = Part(
@@ -217,4 +217,4 @@ PLANNER = Part(
     knows=Source.MODEL,
 )
 
-BELIEVED_PLANNER = Part(make_estimating_planner, about="as above")
+ESTIMATED_PLANNER = Part(make_estimating_planner, about="as above")

@@ -25,7 +25,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
 
-START = "universal@shipped"  # policy whose episode a search also starts from
+START = "universal"  # policy whose episode a search also starts from
 
 Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
 """Kept profiles [n] of a problem, and where there is one [n]; the others are ignored."""

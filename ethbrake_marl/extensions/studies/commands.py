@@ -175,12 +175,13 @@ def _end_study(out: Out, summary: str, *, interrupted: bool, failed: bool) -> No
         raise typer.Exit(1)
 
 
-@study_group.command(
-    "falsify", epilog=example("study falsify --agent ppo@shipped --against e_v2x_bm --output worst.yaml")
-)
+@study_group.command("falsify", epilog=example("study falsify --agent ppo --against e_v2x_bm --output worst.yaml"))
 def falsify_command(
     agent: Annotated[
-        str | None, typer.Option(help="Who drives; any agent of `ethbrake evaluate`.", show_default="policy@shipped")
+        str | None,
+        typer.Option(
+            help="Agent that controls the vehicle; any agent of `ethbrake evaluate`.", show_default="universal"
+        ),
     ] = None,
     measure: Annotated[
         str | None,
@@ -234,7 +235,7 @@ def falsify_command(
                 )
             _drive_again(out, again, agent)
             return
-        agent, measure, scenario = agent or "policy@shipped", measure or "regret", scenario or "paper-random"
+        agent, measure, scenario = agent or "universal", measure or "regret", scenario or "paper-random"
         budget, seed, keep = 4000 if budget is None else budget, seed or 0, keep or 20
         out.check(output, ".yaml", ".yml", what="a file of worlds")
         task = read_task(scenario, settings)

@@ -70,7 +70,7 @@ class Measure:
         if beside is None:
             raise InvalidInput(
                 f"agent {next(iter(self.agents))!r}: tells no bound; --measure bound is for an agent behind a shield,"
-                " for instance ppo@shipped+step"
+                " for instance ppo+step"
             )
         reference[rows] = beside
         more = harm[rows] - beside

@@ -43,7 +43,7 @@ def shielded(
 ) -> tuple[Floats, Floats, int]:
     """Harm realised and first bound of ``n`` worlds [n] m2/s2, and how many proposals were replaced."""
     mode = {"mode": "step"} if robust is None else {"mode": "robust", "robust": robust}
-    driver = ShieldedDriver(Hostile(way, seed), scenario, believed=True, **mode)
+    driver = ShieldedDriver(Hostile(way, seed), scenario, estimated=True, **mode)
     episodes = drive(scenario.sample(n, seed).worlds, driver, scenario, 1)
     shield = episodes.guarded.shield
     return episodes.ledger.world_harm("first"), shield.predicted_harm, int(shield.interventions.sum())

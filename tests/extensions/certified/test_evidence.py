@@ -32,10 +32,10 @@ def test_log__holds_every_intervention_and_forensics_says_what_it_was_good_for()
     assert all(entry.margin < 0.0 and entry.proposed == 0.0 != entry.applied for entry in log)
     found = review(shield, make_agent("coast"), WORLDS)
     shares = [found.share(kind) for kind in ("needed", "harmless", "costly")]
-    assert found.without.shape == (len(log),) and shares[0] > 0.8 and sum(shares) == pytest.approx(1.0)
+    assert found.unshielded_harm.shape == (len(log),) and shares[0] > 0.8 and sum(shares) == pytest.approx(1.0)
     first = {entry.world: k for k, entry in reversed(list(enumerate(log)))}  # each world's first intervention
     alone = drive(WORLDS, make_agent("coast"), SCENARIO, 1).ledger.world_harm("first")
-    assert all(found.without[k] == alone[world] for world, k in first.items())
+    assert all(found.unshielded_harm[k] == alone[world] for world, k in first.items())
 
 
 @pytest.mark.parametrize("mode", ["distrusted", "robust"])
@@ -47,7 +47,7 @@ def test_review__tells_the_harm_of_the_engine_also_where_the_bound_is_not_it(mod
     harm, shield = episodes.ledger.world_harm("first"), episodes.guarded.shield
     assert abs(shield.bound - harm).max() > 1.0
     found = review(shield, wavering, worlds)
-    assert found.realised.tolist() == harm[found.world].tolist()
+    assert found.harm.tolist() == harm[found.world].tolist()
     assert found.trusted.tolist() == (~shield.memory.distrusted[found.world]).tolist()
     assert found.trusted.all() == (mode == "robust")
 

@@ -24,7 +24,7 @@ from tests.shield.test_step_shield import begins_apart, coasts
 
 MODES: dict[str, tuple[int, dict[str, Any]]] = {
     "robust": (2, {"uncertainty": "gaps_m=0.2"}),
-    "believed": (1, {"believed": True}),
+    "estimated": (1, {"estimated": True}),
 }
 
 
@@ -55,7 +55,7 @@ def test_interfaces__have_mode_robust_and_the_penalty(interface: Any) -> None:
 
 @pytest.mark.parametrize("policy", [eb.policy_agent(remembering, initial_state=lambda n: np.zeros((n, 1))), Counting()])
 def test_policy_with_a_memory__is_asked_once_per_decision_whoever_proposes(policy: Any) -> None:
-    asks_once({"mode": "step", "believed": True}, policy)
+    asks_once({"mode": "step", "estimated": True}, policy)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Believed worlds by hand, who drives by them, and whether agents of this extension use what they say they know."""
+"""Estimated worlds by hand, who drives by them, and whether agents of this extension use what they say they know."""
 
 import numpy as np
 import pytest
@@ -17,9 +17,9 @@ from tests.agents.test_knowledge import PAPER, agent_of, changed_decisions, chec
 BLOCKED = eb.load_scenario("cooperation-2-blocked")
 
 
-@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
+@pytest.mark.parametrize("spec", ["e_v2x_bm:estimated", "coast+step:estimated", "ppo+episode:estimated"])
 @pytest.mark.parametrize("leak", ["known", "speed_mps"])
-def test_believed_model__a_planted_leak_is_found(spec, leak, monkeypatch):
+def test_estimated_model__a_planted_leak_is_found(spec, leak, monkeypatch):
     honest = Told.to
 
     def leaking(worlds, vehicle):
@@ -46,16 +46,16 @@ def engine_of(scenario: eb.Scenario, n: int = 40, vehicle: int = 1, seed: int = 
     return eb.Engine(scenario, n, learners=[vehicle], scripts=scripts, worlds=scenario.sample(n, seed).worlds)
 
 
-def believed(engine: eb.Engine, vehicle: int = 1, odometer: Odometer | None = None) -> eb.Worlds:
+def estimated(engine: eb.Engine, vehicle: int = 1, odometer: Odometer | None = None) -> eb.Worlds:
     worlds, scenario = engine.worlds, engine.scenario
     way = worlds.speeds_mps[:, vehicle] * worlds.time_s if odometer is None else odometer.way_m
-    return Ranges.of(scenario, vehicle).believe(worlds, way)
+    return Ranges.of(scenario, vehicle).estimate(worlds, way)
 
 
-def test_believed__is_the_world_where_everything_is_known_and_who_believes_drives_as_who_sees() -> None:
+def test_estimated__is_the_world_where_everything_is_known_and_who_estimates_drives_as_who_sees() -> None:
     engine, told = engine_of(BASE), ("gaps_m", "speeds_mps", "pair_hit", "time_s")
     for _ in range(10):
-        now, taken = engine.worlds, believed(engine)
+        now, taken = engine.worlds, estimated(engine)
         for name in told:
             np.testing.assert_array_equal(getattr(taken, name), getattr(now, name))
         np.testing.assert_array_equal(taken.vehicles.mass_t, now.vehicles.mass_t)
@@ -63,14 +63,14 @@ def test_believed__is_the_world_where_everything_is_known_and_who_believes_drive
         np.testing.assert_array_equal(taken.vehicles.latency_s[waiting], now.vehicles.latency_s[waiting])
         engine.step(np.full((40, 1), -0.5))
     agents, worlds = (
-        [make_agent(f"e_v2x_bm{way}", scenario=BASE) for way in ("", ":believed")],
+        [make_agent(f"e_v2x_bm{way}", scenario=BASE) for way in ("", ":estimated")],
         BASE.sample(40, 7).worlds,
     )
-    harm, believing = (drive(worlds, agent, BASE, 1).ledger.world_harm("first") for agent in agents)
-    np.testing.assert_allclose(believing, harm, atol=1e-4)
+    harm, estimating = (drive(worlds, agent, BASE, 1).ledger.world_harm("first") for agent in agents)
+    np.testing.assert_allclose(estimating, harm, atol=1e-4)
 
 
-def test_believed__who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
+def test_estimated__who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
     # Vehicle 3 is never heard: at the alert 7.5 m behind, at 20 m/s; it coasts to 0.8 s, then brakes with 6. At 1 s it
     # has made 20 m less 0.5 * 6 * 0.2^2 = 0.12 m, and Vehicle 2, with 20 m/s and no command, 20 m.
     scenario = BASE.replace(
@@ -79,7 +79,7 @@ def test_believed__who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_i
     engine = engine_of(scenario)
     for _ in range(5):
         engine.step(np.zeros((40, 1)))
-    taken = believed(engine)
+    taken = estimated(engine)
     np.testing.assert_allclose(engine.worlds.time_s, 1.0)
     free = ~engine.worlds.pair_hit[:, 0] & (engine.worlds.speeds_mps[:, 1] == 20.0)
     assert free.sum() > 20
@@ -89,7 +89,7 @@ def test_believed__who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_i
     assert (taken.command_mps2[:, 2] == -6.0).all() and not taken.pair_hit[:, 1].any()
 
 
-def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> None:
+def test_estimated__an_old_message_is_moved_on_by_the_script_to_the_truth() -> None:
     channel = {
         "preset": "paper",
         "link_latency_s": 0.2,
@@ -103,7 +103,7 @@ def test_believed__an_old_message_is_moved_on_by_the_script_to_the_truth() -> No
         now, told = engine.worlds, Told.to(engine.worlds, 1)
         assert told.known.all() and (told.at_s[:, [0, 2]] < now.time_s[:, np.newaxis] - 0.19).all()
         odometer = odometer.look(now, 1)
-        taken = believed(engine, odometer=odometer)
+        taken = estimated(engine, odometer=odometer)
         free = ~now.pair_hit.any(axis=1)
         np.testing.assert_allclose(taken.gaps_m[free], now.gaps_m[free], atol=1e-9)
         np.testing.assert_allclose(taken.speeds_mps[free], now.speeds_mps[free], atol=1e-9)
@@ -131,13 +131,13 @@ def line_of(vehicles: int, v2x: object) -> eb.Scenario:
 
 
 @pytest.mark.parametrize(("vehicles", "v2x"), LINES)
-def test_believing__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
+def test_estimating__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
     scenario = line_of(vehicles, v2x)
-    drives_each_world_alone(make_agent("e_v2x_bm:believed", scenario=scenario), scenario)
+    drives_each_world_alone(make_agent("e_v2x_bm:estimated", scenario=scenario), scenario)
 
 
 @pytest.mark.parametrize("v2x", ["paper", PERIODIC])
-def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
+def test_estimating__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
     scenario = eb.load_scenario("cooperation-4-all").replace(early_impacts="keep", v2x=v2x).with_learners(["vehicle_2"])
     engine = engine_of(scenario)
     for _ in range(15):
@@ -146,24 +146,24 @@ def test_believing__knows_of_the_obstacle_what_it_was_told(v2x: object) -> None:
     heard = told.known[:, 0]
     assert heard.sum() > 20
     np.testing.assert_allclose(told.obstacle_m[heard], (now.obstacle_gap_m + now.gaps_m[:, 0])[heard], atol=1e-9)
-    assert np.isinf(told.obstacle_m[~heard]).all() and np.isfinite(believed(engine).obstacle_gap_m).all()
-    drive(scenario.sample(5, 3).worlds, make_agent("e_v2x_bm:believed", scenario=scenario), scenario, 1)
+    assert np.isinf(told.obstacle_m[~heard]).all() and np.isfinite(estimated(engine).obstacle_gap_m).all()
+    drive(scenario.sample(5, 3).worlds, make_agent("e_v2x_bm:estimated", scenario=scenario), scenario, 1)
 
 
 # ---------------------------------------------------------------- what its agents state
 
-SENSORS, MESSAGES, BELIEFS, MODEL = Source.SENSORS, Source.MESSAGES, Source.BELIEFS, Source.MODEL
+SENSORS, MESSAGES, ESTIMATES, MODEL = Source.SENSORS, Source.MESSAGES, Source.ESTIMATES, Source.MODEL
 STATED = {
-    "e_v2x_bm:believed": (BELIEFS,),
-    "e_v2x_bm:pairwise:believed": (BELIEFS,),
-    "coast+step:believed": (SENSORS, BELIEFS),
-    "coast+robust:believed": (SENSORS, BELIEFS),
-    "coast+robust:interior:believed": (SENSORS, BELIEFS),
-    "ppo@shipped/ppo+step:believed": (MESSAGES, BELIEFS),
-    "ppo@shipped/ppo+episode:believed": (MESSAGES, BELIEFS),
-    "ppo@shipped/ppo+episode:pairwise:believed": (MESSAGES, BELIEFS),
-    "ppo@shipped/ppo+robust": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+robust:interior": (MESSAGES, MODEL),
+    "e_v2x_bm:estimated": (ESTIMATES,),
+    "e_v2x_bm:pairwise:estimated": (ESTIMATES,),
+    "coast+step:estimated": (SENSORS, ESTIMATES),
+    "coast+robust:estimated": (SENSORS, ESTIMATES),
+    "coast+robust:interior:estimated": (SENSORS, ESTIMATES),
+    "ppo+step:estimated": (MESSAGES, ESTIMATES),
+    "ppo+episode:estimated": (MESSAGES, ESTIMATES),
+    "ppo+episode:pairwise:estimated": (MESSAGES, ESTIMATES),
+    "ppo+robust": (MESSAGES, MODEL),
+    "ppo+robust:interior": (MESSAGES, MODEL),
 }
 HONEST, SEEING = in_two(STATED)
 
@@ -186,7 +186,7 @@ def test_own_sensors_and_messages__what_was_not_received_changes_no_action(spec,
 
 
 @pytest.mark.parametrize("channel", ["blocked", {"preset": "blocked", "persistence": "periodic"}], ids=str)
-@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+robust:believed"])
+@pytest.mark.parametrize("spec", ["e_v2x_bm:estimated", "coast+robust:estimated"])
 def test_own_sensors_and_messages__nor_where_an_obstacle_is_that_was_not_received(spec, channel):
     scenario = eb.load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(v2x=channel)
     assert changed_decisions(certified(spec, scenario), scenario, n=3 if "robust" in spec else 20) == 0

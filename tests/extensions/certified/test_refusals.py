@@ -89,17 +89,17 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: make_agent(
         "full_brake+robust", scenario=PAIR
     ),
-    "agent 'coast+step:believed+robust': +search comes first and once, then one shield of +episode": lambda: make_agent(
-        "coast+step:believed+robust", scenario=PERIODIC
+    "agent 'coast+step:estimated+robust': +search comes first and once, then one shield of +episode": lambda: (
+        make_agent("coast+step:estimated+robust", scenario=PERIODIC)
     ),
-    "agent 'e_v2x_bm:believed+episode:believed': e_v2x_bm:believed decides on what was received itself": lambda: (
-        make_agent("e_v2x_bm:believed+episode:believed", scenario=PERIODIC)
+    "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated decides on what was received itself": lambda: (
+        make_agent("e_v2x_bm:estimated+episode:estimated", scenario=PERIODIC)
     ),
     "shield: robust interior: total harm: it certifies first-impact harm of at most 3 vehicles without": lambda: (
-        make_agent("coast+robust:interior:believed", scenario=PERIODIC, harm_count="total")
+        make_agent("coast+robust:interior:estimated", scenario=PERIODIC, harm_count="total")
     ),
     "shield: robust interior: an obstacle ahead: it certifies first-impact harm": lambda: make_agent(
-        "coast+robust:interior:believed", scenario=PERIODIC.replace(obstacle_gap_m=60.0)
+        "coast+robust:interior:estimated", scenario=PERIODIC.replace(obstacle_gap_m=60.0)
     ),
     "shield: robust interior: 5 vehicles: it certifies first-impact harm of at most 3 vehicles": lambda: RobustShield(
         line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior"
@@ -117,20 +117,22 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "shield: shares = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
         mode="episode", shares=True
     ),
-    "shield: believed = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
-        mode="episode", believed=True
+    "shield: estimated = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+        mode="episode", estimated=True
     ),
-    "not together with believed = True, which certifies against": lambda: ShieldOptions(believed=True, allowance=1.0),
-    "shield: cap = 'baseline': not together with believed = True": lambda: ShieldOptions(believed=True, cap="baseline"),
-    "shield: uncertainty = 'gaps_m=0.5': not together with believed = True": lambda: ShieldOptions(
-        believed=True, mode="robust", uncertainty="gaps_m=0.5"
+    "not together with estimated = True, which certifies against": lambda: ShieldOptions(estimated=True, allowance=1.0),
+    "shield: cap = 'baseline': not together with estimated = True": lambda: ShieldOptions(
+        estimated=True, cap="baseline"
     ),
-    "shield: believed = 'yes': must be True or False": lambda: ShieldOptions(believed="yes"),
+    "shield: uncertainty = 'gaps_m=0.5': not together with estimated = True": lambda: ShieldOptions(
+        estimated=True, mode="robust", uncertainty="gaps_m=0.5"
+    ),
+    "shield: estimated = 'yes': must be True or False": lambda: ShieldOptions(estimated="yes"),
     "ShieldedEnv: mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: ShieldedEnv(
         EthBrakeEnv(), mode="robust"
     ),
-    "HybridShield: believed = True: shields one learner, not several; pass learners=['vehicle_2']": lambda: (
-        HybridShield(parallel_env(PAIR), mode="step", believed=True)
+    "HybridShield: estimated = True: shields one learner, not several; pass learners=['vehicle_2']": lambda: (
+        HybridShield(parallel_env(PAIR), mode="step", estimated=True)
     ),
 }
 
@@ -145,8 +147,17 @@ NAMES: dict[str, Callable[[], object]] = {
     "unknown uncertain quantity 'latencys'; did you mean 'latency_s'?": lambda: parse_uncertainty("latencys=0.1"),
     "unknown shield mode 'robus'; did you mean 'robust'?": lambda: ShieldOptions(mode="robus"),
     "unknown shield: robust 'edges'": lambda: ShieldOptions(uncertainty="gaps_m=1", robust="edges"),
-    "unknown shield or search 'step:pairwise:believed'; did you mean 'episode:pairwise:believed'?": lambda: make_agent(
-        "coast+step:pairwise:believed", scenario=PERIODIC
+    "unknown shield or search 'step:believed'; it is now called 'step:estimated'": lambda: make_agent(
+        "coast+step:believed", scenario=PERIODIC
+    ),
+    "unknown variant of e_v2x_bm 'believed'; it is now called 'estimated'": lambda: make_agent(
+        "e_v2x_bm:pairwise:believed", scenario=PERIODIC
+    ),
+    "unknown ShieldedEnv option 'believed'; it is now called 'estimated'": lambda: ShieldedEnv(
+        EthBrakeEnv(PERIODIC), believed=True
+    ),
+    "unknown shield or search 'step:pairwise:estimated'; did you mean 'episode:pairwise:estimated'?": lambda: (
+        make_agent("coast+step:pairwise:estimated", scenario=PERIODIC)
     ),
 }
 
@@ -157,12 +168,12 @@ def test_name__is_unknown(message: str) -> None:
         NAMES[message]()
 
 
-def test_mixture__believed_agents_need_one_of_its_scenarios() -> None:
+def test_mixture__estimated_agents_need_one_of_its_scenarios() -> None:
     members = [{"scenario": load_scenario(name).declared()} for name in ("paper-random", "paper-random-brake-only")]
     with refused(
         "is a mixture, and a vehicle that is not known could be of any of paper-random, paper-random-brake-only"
     ):
-        ShieldedEnv(EthBrakeEnv(Scenario(name="mixed", mixture=members)), believed=True)
+        ShieldedEnv(EthBrakeEnv(Scenario(name="mixed", mixture=members)), estimated=True)
 
 
 def test_estimated_worlds__that_leave_too_much_open_are_refused() -> None:
@@ -171,7 +182,7 @@ def test_estimated_worlds__that_leave_too_much_open_are_refused() -> None:
     with refused(
         "leaves 14 numbers of the other vehicles open, which make 16384 corners; at most 1024 can be certified"
     ):
-        make_agent("coast+robust:believed", scenario=wide)
+        make_agent("coast+robust:estimated", scenario=wide)
 
 
 def test_uncertain_latency__ends_before_the_horizon() -> None:
@@ -193,7 +204,7 @@ def test_interior__takes_no_script_that_it_cannot_enclose() -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
     gentle = PAPER.replace(early_impacts="keep", roles=roles)
     with refused(
-        "vehicle_3 is driven by 'e_v2x_bm:pairwise', which it cannot enclose; full_brake, coast and constant:A"
+        "vehicle_3 is controlled by 'e_v2x_bm:pairwise', which it cannot enclose; full_brake, coast and constant:A"
     ):
         RobustShield(gentle, 1, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior")
 
@@ -213,22 +224,20 @@ def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
 SLOW = PAPER.replace(brake_rate_mps3=9)
 PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 AGENTS: dict[str, Callable[[], object]] = {
-    "agent 'ppo@shipped+robust': mode robust needs an uncertainty": lambda: make_agent(
-        "ppo@shipped+robust", scenario=PAPER
-    ),
-    "agent 'e_v2x_bm:believed': needs a scenario: make_agent('e_v2x_bm:believed'": lambda: make_agent(
-        "e_v2x_bm:believed"
+    "agent 'ppo+robust': mode robust needs an uncertainty": lambda: make_agent("ppo+robust", scenario=PAPER),
+    "agent 'e_v2x_bm:estimated': needs a scenario: make_agent('e_v2x_bm:estimated'": lambda: make_agent(
+        "e_v2x_bm:estimated"
     ),
     "scenario 'mixture-delays': is a mixture, and a vehicle that is not known could be of any": lambda: make_agent(
-        "e_v2x_bm:believed", scenario=eb.load_scenario("mixture-delays")
+        "e_v2x_bm:estimated", scenario=eb.load_scenario("mixture-delays")
     ),
-    ":believed: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: evaluated(
-        make_agent("full_brake+step:believed", scenario=SLOW), SLOW
+    ":estimated: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: evaluated(
+        make_agent("full_brake+step:estimated", scenario=SLOW), SLOW
     ),
-    ":believed: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
-        evaluated(make_agent("full_brake+step:believed", scenario=PIECES), PIECES)
+    ":estimated: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
+        evaluated(make_agent("full_brake+step:estimated", scenario=PIECES), PIECES)
     ),
-    "shield: robust interior: vehicle_1 is driven by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
+    "shield: robust interior: vehicle_1 is controlled by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
         make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES
     ),
 }
@@ -248,10 +257,10 @@ def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
     team = Team.of(make_agent("coast"), [1, 2])
     entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     monkeypatch.setitem(registry.AGENTS.loaded, "team", entry)
-    with refused("'team@run+robust': is a team, and +robust is for one driven vehicle"):
+    with refused("'team@run+robust': is a team, and +robust is for one controlled vehicle"):
         make_lineup(["team@run+robust"], PAIR)
 
 
 def test_evaluation__of_a_robust_shield_needs_an_uncertainty(refuse: Refuse) -> None:
-    told = "agent 'ppo@shipped+robust': mode robust needs an uncertainty"
-    refuse("evaluate --agents ppo@shipped+robust", told)
+    told = "agent 'ppo+robust': mode robust needs an uncertainty"
+    refuse("evaluate --agents ppo+robust", told)

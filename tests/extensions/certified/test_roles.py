@@ -4,7 +4,7 @@ import pytest
 
 from tests.agents.test_roles import SCENARIOS, check_role
 
-SPECS = {"e_v2x_bm": ["e_v2x_bm:believed", "e_v2x_bm:pairwise:believed"]}
+SPECS = {"e_v2x_bm": ["e_v2x_bm:estimated", "e_v2x_bm:pairwise:estimated"]}
 
 
 @pytest.mark.parametrize("kind", SPECS)

@@ -11,7 +11,7 @@ from ethbrake_marl.extensions.certified.estimated import Told
 from ethbrake_marl.physics.messages import PIECES, USUAL_PIECES
 from tests.agents.test_knowledge import agent_of, changed_decisions
 from tests.extensions.certified.estimates import ABOVE, WAYS, shielded
-from tests.extensions.certified.test_knowledge import BASE, believed, engine_of
+from tests.extensions.certified.test_knowledge import BASE, engine_of, estimated
 
 LACKING = {
     "capacity and mass": ["place", "speed", "acceleration", "latency"],
@@ -32,26 +32,26 @@ def telling(pieces: object, base: eb.Scenario = BASE, **channel: object) -> eb.S
     return base.replace(v2x={**channel, "tells": pieces})
 
 
-def test_believed__of_a_missing_piece_is_the_middle_of_its_range() -> None:
+def test_estimated__of_a_missing_piece_is_the_middle_of_its_range() -> None:
     base = BASE.replace(mass_t=[4.5, 5.5, {"uniform": [2.0, 9.0]}], braking_capacity_mps2={"uniform": [6, 8]})
     pieces = {"vehicle_1": ["place", "speed", "mass"], "vehicle_3": ["place", "speed", "braking_capacity"]}
     engine = engine_of(telling(pieces, base))
-    now, taken = engine.worlds, believed(engine)
+    now, taken = engine.worlds, estimated(engine)
     assert taken.gaps_m == pytest.approx(now.gaps_m, abs=1e-9) and taken.speeds_mps == pytest.approx(now.speeds_mps)
     v, own = taken.vehicles, now.vehicles
     assert v.mass_t[:, :2].tolist() == own.mass_t[:, :2].tolist() and (v.mass_t[:, 2] == 5.5).all()
     assert (v.braking_capacity_mps2[:, 0] == 7.0).all()
     assert v.braking_capacity_mps2[:, 1:].tolist() == own.braking_capacity_mps2[:, 1:].tolist()
     engine = engine_of(telling({"vehicle_3": ["place", "mass"]}, base))  # without its speed its place is of no use
-    now, taken, told = engine.worlds, believed(engine), Told.to(engine.worlds, 1)
+    now, taken, told = engine.worlds, estimated(engine), Told.to(engine.worlds, 1)
     assert not told.known[:, 2].any() and told.known[:, :2].all() and told.pieces[:, 2].sum(axis=1).max() == 2
     assert (taken.gaps_m[:, 1] != now.gaps_m[:, 1]).all() and taken.vehicles.mass_t[:, 2].tolist() == (
         own.mass_t[:, 2].tolist()
     )
 
 
-@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed", "ppo@shipped/ppo+episode:believed"])
-def test_believed__messages_that_contain_everything_change_nothing(spec: str) -> None:
+@pytest.mark.parametrize("spec", ["e_v2x_bm:estimated", "coast+step:estimated", "ppo+episode:estimated"])
+def test_estimated__messages_that_contain_everything_change_nothing(spec: str) -> None:
     harms = []
     for scenario in (BASE, telling([*USUAL_PIECES]), telling([*PIECES])):
         episodes = drive(scenario.sample(12, 7).worlds, make_agent(spec, scenario=scenario), scenario, 1)
@@ -60,9 +60,9 @@ def test_believed__messages_that_contain_everything_change_nothing(spec: str) ->
 
 
 @pytest.mark.parametrize("without", USUAL_PIECES)
-@pytest.mark.parametrize("spec", ["e_v2x_bm:believed", "coast+step:believed"])
+@pytest.mark.parametrize("spec", ["e_v2x_bm:estimated", "coast+step:estimated"])
 @pytest.mark.parametrize("channel", [{}, {"preset": "blocked", "persistence": "periodic"}], ids=str)
-def test_believed__what_no_message_contains_changes_no_action(spec: str, without: str, channel: dict) -> None:
+def test_estimated__what_no_message_contains_changes_no_action(spec: str, without: str, channel: dict) -> None:
     scenario = telling([piece for piece in USUAL_PIECES if piece != without], **channel)
     assert changed_decisions(agent_of(spec, scenario), scenario, n=10) == 0
 

@@ -33,9 +33,9 @@ def test_clone__of_ppo_reaches_its_share_in_other_worlds(
     clone: ModuleType, tmp_path: Path, episodes: int, least: float
 ) -> None:
     """Of the harm that could be saved, from full braking to the best known."""
-    names = ("full_brake", "best_harm", "ppo@shipped")
+    names = ("full_brake", "best_harm", "ppo")
     agents = {name: eb.make_agent(name, scenario=PAPER) for name in names}
-    ppo = {"ppo": agents["ppo@shipped"]}
+    ppo = {"ppo": agents["ppo"]}
     write_dataset(tmp_path / "ppo.parquet", ppo, scenario=PAPER, episodes=episodes, seed=1)
     clone.train(tmp_path / "ppo.parquet", 0, tmp_path / "clone")
     agents["clone"] = eb.make_agent(f"{TRAIN / 'clone.py'}:make_agent:{tmp_path / 'clone'}", scenario=PAPER)

@@ -45,7 +45,7 @@ def record(spec: str = "full_brake", scenario: eb.Scenario = PAPER, n: int = 12,
     return record_episodes(scenario.sample(n, 7), driver, name, task)
 
 
-@pytest.mark.parametrize("spec", ["full_brake", "ppo@shipped"])
+@pytest.mark.parametrize("spec", ["full_brake", "ppo"])
 def test_record__an_agent_whose_commands_are_actions_is_as_in_an_evaluation(spec: str) -> None:
     found, expected = record(spec), eb.evaluate(PAPER.sample(12, 7), make_lineup([spec], PAPER), scenario=PAPER)
     ledgers = found.ledger, expected.outcome(spec).ledger
@@ -53,7 +53,7 @@ def test_record__an_agent_whose_commands_are_actions_is_as_in_an_evaluation(spec
     np.testing.assert_array_equal(*(np.stack([each.world_harm(c) for c in ("first", "total")]) for each in ledgers))
 
 
-@pytest.mark.parametrize("spec", ["best_harm", "e_v2x_bm", "full_brake+step", "ppo@shipped+search+episode"])
+@pytest.mark.parametrize("spec", ["best_harm", "e_v2x_bm", "full_brake+step", "ppo+search+episode"])
 def test_record__of_any_agent_the_harm_is_that_of_its_float32_actions(spec: str) -> None:
     found = record(spec)
     assert found.actions.dtype == np.float32 and np.abs(found.actions).max() <= 1.0
@@ -176,7 +176,7 @@ def test_file__appears_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("scenario", "agents", "reward"),
     [
-        (PAPER, "best_harm,ppo@shipped", "harm"),
+        (PAPER, "best_harm,ppo", "harm"),
         (FIVE, "full_brake", {"harm": 1.0, "shaping": 0.05, "jerk": 0.1}),
         (LINKED.with_learners(["vehicle_2"]), "full_brake", "total-harm"),
     ],

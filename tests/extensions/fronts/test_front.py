@@ -14,7 +14,7 @@ from ethbrake_marl.scenario.task import Task
 PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(40, 7).worlds
 WEIGHTS = np.concatenate([weight_grid(3, 2), np.ones((1, 3)), corners(3)])
-AGENTS = ["full_brake", "e_v2x_bm", "universal@shipped", "ppo@shipped"]
+AGENTS = ["full_brake", "e_v2x_bm", "universal", "ppo"]
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +36,8 @@ def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None
     worlds, row = obstacle.sample(30, 777).worlds, [0.2, 0.8, 0.0]
     found = search_front(obstacle, worlds, [row], budget=30, harm_count="total")
     fixed = obstacle.replace(harm_weight=row, objective="preference")
-    for name in ("universal", "options-paper-random-obstacle-total"):
-        agent = eb.make_agent(f"policy@shipped/{name}", scenario=fixed)
+    for name in ("universal", "rollout-obstacle"):
+        agent = eb.make_agent(name, scenario=fixed)
         outcome = eb.evaluate(worlds, {"it": agent}, scenario=obstacle, aftermath=False).outcome("it")
         assert (found.amounts[0] <= amounts_of(outcome.vehicle_harm("total"), np.array(row))).all()
 

@@ -6,7 +6,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.fronts.front import amounts_of, search_front
 
-SPEC = "policy@shipped/counterfactual-paper-random-preference"
+SPEC = "vine-preference"
 PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(300, 990401).worlds
 
@@ -17,11 +17,6 @@ def borne(weights: list[float]) -> np.ndarray:
     return (
         eb.evaluate(scenario.sample(300, 990401), {"it": agent}, scenario=scenario).outcome("it").vehicle_harm("first")
     )
-
-
-def test_policy__of_the_scenario_is_the_one_that_ships() -> None:
-    scenario = eb.load_scenario("paper-random-preference")
-    assert eb.make_agent("policy@shipped", scenario=scenario).name == SPEC
 
 
 @pytest.mark.parametrize("weights", [[1, 1, 1], [1, 0.25, 0], [0, 1, 0], [1, 0, 0]])

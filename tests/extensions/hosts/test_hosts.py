@@ -54,10 +54,10 @@ def same(one, other):
     [
         ("full_brake", "paper-random"),
         ("e_v2x_bm", "paper-random"),
-        ("ppo@shipped", "paper-random"),
+        ("ppo", "paper-random"),
         ("r157_human", "paper-random"),
-        ("ppo@shipped+step", "paper-random"),
-        ("planner:8+step:believed", "paper-random"),
+        ("ppo+step", "paper-random"),
+        ("planner:8+step:estimated", "paper-random"),
         ("constant:3+episode", "paper-random"),
         ("full_brake+step", "cooperation-3-pair"),
     ],
@@ -120,7 +120,7 @@ class Jittery(Bench):
 
 def test_host__with_a_jittery_clock_gives_the_same_bits():
     worlds = PAPER.sample(100, 7).worlds
-    for agent in ("ppo@shipped+step:believed", "r157_human"):
+    for agent in ("ppo+step:estimated", "r157_human"):
         driver = eb.make_agent(agent, scenario=PAPER)
         one, other = (drive_host(make(worlds), driver, PAPER, worlds).outcome for make in (Bench, Jittery))
         assert same(one.ledger, other.ledger) and one.ledger.collided.any()
@@ -148,7 +148,7 @@ def test_latencies__are_rounded_up_to_whole_steps_and_everybody_is_told():
     assert found.first_impact_harm.mean() == pytest.approx(ours.outcome("ours").first_impact_harm.mean(), rel=0.02)
 
 
-@pytest.mark.parametrize("agent", ["r157_human", "r157_human+robust", "e_v2x_bm:believed+step"])
+@pytest.mark.parametrize("agent", ["r157_human", "r157_human+robust", "e_v2x_bm:estimated+step"])
 def test_world__fares_the_same_alone_and_among_others_that_decide_at_other_times(agent):
     scenario = eb.load_scenario("stress-wide")
     options = {"uncertainty": "gaps_m=0.1"} if "robust" in agent else {}

@@ -41,7 +41,7 @@ def test_sumo__tells_the_table_of_the_page(capsys):
     told = capsys.readouterr().out.splitlines()
     shown = re.findall(r"^\| `(\S+)` \| (\S+) \| (\S+) \| (.*?) \|$", PAGE, re.MULTILINE)
     assert told == [" ".join(row) for row in shown] and len(shown) == 3
-    outcome, distrusted = names["there"].outcome("ppo@shipped+robust"), names["distrusted"]["ppo@shipped+robust"]
+    outcome, distrusted = names["there"].outcome("ppo+robust"), names["distrusted"]["ppo+robust"]
     assert not (outcome.first_impact_harm > outcome.predicted_harm).any() and not distrusted.any()
     text = eb.summarise(names["there"]).markdown()
     assert "Regret" not in text and "proven" not in text  # of the physics here

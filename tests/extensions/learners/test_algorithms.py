@@ -92,14 +92,14 @@ def test_training__starts_from_nothing_where_no_policy_ships_and_says_so(tmp_pat
     notes: list[str] = []
     tell = lambda progress: notes.append(progress.note)  # noqa: E731
     result = train(SHIPPED.replace(**SMALL, **STILL), name, tmp_path / "run", on_progress=tell)
-    told = f"random weights, as ppo@shipped has none for scenario {name!r}"
+    told = f"random weights, as no ppo ships for scenario {name!r}"
     assert json.loads((tmp_path / "run" / "run.json").read_text())["start"] == result.training.begins == told
     assert notes[0] == f"begins with {told}"
     assert result.policy.tensors["policy.output.bias"] == pytest.approx(-0.9, abs=1e-3)
     seen = np.random.default_rng(0).uniform(0, 1, (50, result.policy.observation.size)).astype(np.float32)
     np.testing.assert_allclose(result.policy(seen), -0.9, atol=0.1)
     fits = Training.of(SHIPPED, SCENARIO), Training.of(SHIPPED, "paper-random-obstacle")
-    assert [each.begins for each in fits] == ["ppo@shipped/ppo", "ppo@shipped/ppo-paper-random-obstacle"]
+    assert [each.begins for each in fits] == ["ppo", "ppo-obstacle"]
     assert (Training.of("quick", SCENARIO).begins, Training.of("ppo", SCENARIO).begins) == ("random weights", None)
 
 
@@ -422,7 +422,7 @@ def test_rollout_classification__policies_drive_as_alone_and_costs_are_beside_th
     line = eb.load_scenario(
         {"name": "two", "mixture": [{"scenario": "paper-random"}, {"scenario": "paper-delay-high"}]}
     )
-    policies, shape = ["policy@shipped/ppo", "policy@shipped/sac"], {"policy": [8], "choices": 2}
+    policies, shape = ["ppo", "sac"], {"policy": [8], "choices": 2}
     model = choosing(line, policies=policies, tried=8, near=[], fixed=[-1.0], drawn=2, holds=[1000], network=shape)
     start = model.engine.moment()
     model._numbers = model.engine.roster.numbers.copy()
@@ -479,4 +479,4 @@ def test_mixture__drives_shielded_and_searched(around: str, mixture: eb.Policy, 
 
 
 def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once() -> None:
-    check_beyond("rollout-classification@shipped/options-paper-random-obstacle-total", SCENARIO, "no obstacle_gap_m")
+    check_beyond("rollout-obstacle", SCENARIO, "no obstacle_gap_m")

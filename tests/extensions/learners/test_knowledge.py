@@ -5,8 +5,8 @@ import pytest
 from ethbrake_marl.agents.protocol import Source
 from tests.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two, with_channels
 
-STATED = {"rollout-classification@shipped/options-paper-random-obstacle-total": (Source.MESSAGES,)}
-APART = {"vine@PATH"}  # it needs a run, and has tests of its own
+STATED = {"rollout-obstacle": (Source.MESSAGES,)}
+APART = {"vine@PATH", "rollout-classification@PATH"}  # they need a run, and have tests of their own
 HONEST, _ = in_two(STATED)
 
 

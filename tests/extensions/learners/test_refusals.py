@@ -70,7 +70,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "recipe 'vine': gradient_limit = often: must be auto or a finite number above 0": lambda: TINY_VINE.replace(
         gradient_limit="often"
     ),
-    "must be ppo@, vine@ or universal@": lambda: TINY_VINE.replace(start="sac@shipped"),
+    "start = sac@x: must be the name of a shipped policy, for instance ppo, or": lambda: TINY_VINE.replace(
+        start="sac@x"
+    ),
+    "'ppo@shipped' is now written ppo": lambda: TINY_VINE.replace(start="ppo@shipped"),
     "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_VINE.replace(n_envs=2**22),
     "must be single, shared, independent or centralised": lambda: TINY_VINE.replace(scheme="centralized"),
     "memory = 15: must be at least tried = 16": lambda: TINY_ROLLOUTS.replace(memory=15),
@@ -84,10 +87,10 @@ REFUSED: dict[str, Callable[[], object]] = {
         load_recipe("vine").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
     ),
     "drawn = 2: must be at most the number of policies, 1": lambda: train(
-        load_recipe("rollout-classification").replace(policies=["policy@shipped/ppo"]), "paper-random", "new"
+        load_recipe("rollout-classification").replace(policies=["ppo"]), "paper-random", "new"
     ),
-    "policies: sac@shipped/ppo: give policy@shipped/NAME, or ppo@ and its path": lambda: train(
-        load_recipe("rollout-classification").replace(policies=["sac@shipped/ppo"], drawn=1), "paper-random", "new"
+    "'policy@shipped/ppo' is now written ppo": lambda: train(
+        load_recipe("rollout-classification").replace(policies=["policy@shipped/ppo"], drawn=1), "paper-random", "new"
     ),
     "recipe 'vine': experts: a mixture is for one learner, not for 2": lambda: train(TINY_EXPERTS, PAIR, Path("run")),
 }
@@ -120,8 +123,4 @@ def test_recipe_or_training__is_refused(message: str) -> None:
 
 def test_policy_to_choose_among__is_one_that_ships(empty_folder: Path) -> None:
     with refused("unknown shipped policy 'nobody'", UnknownName):
-        train(
-            load_recipe("rollout-classification").replace(policies=["policy@shipped/nobody"], drawn=1),
-            "paper-random",
-            "new",
-        )
+        train(load_recipe("rollout-classification").replace(policies=["nobody"], drawn=1), "paper-random", "new")

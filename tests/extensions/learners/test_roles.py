@@ -4,7 +4,7 @@ import pytest
 
 from tests.agents.test_roles import SCENARIOS, check_role
 
-SPECS = {"vine": ["vine@shipped"], "rollout-classification": ["rollout-classification@shipped"]}
+SPECS = {"vine": ["vine@mine"], "rollout-classification": ["rollout-classification@mine"]}
 
 
 @pytest.mark.parametrize("kind", SPECS)

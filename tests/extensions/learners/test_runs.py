@@ -74,7 +74,7 @@ def test_schema__says_what_every_key_of_an_algorithm_means(algorithm: str) -> No
     check_meanings(algorithm)
 
 
-CHOOSING_POLICIES = {"policies": ["policy@shipped/ppo", "policy@shipped/sac"], "drawn": 2, "near": [], "focus": 0.5,
+CHOOSING_POLICIES = {"policies": ["ppo", "sac"], "drawn": 2, "near": [], "focus": 0.5,
          "relative": True, "tie_break": 0.5, "observation": ["own", "front_1", "rear_1", "contact"]}  # fmt: skip
 TRAININGS = {
     "vine": (TINY_VINE.replace(gradient_limit="auto"), SCENARIO),

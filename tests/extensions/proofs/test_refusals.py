@@ -87,7 +87,9 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "horizon_s 0.4: must be after the first decision at 0.5 s": lambda: profile_problem(WORLDS, [1], horizon_s=0.4),
     "task: vehicles (3,): must be indices from 0 to 2, each once": lambda: Task(PAPER, (3,)),
     "task: vehicles (0, 0): must be indices from 0 to 2, each once": lambda: Task(PAPER, (0, 0)),
-    "scenario 'paper-random': needs one driven vehicle; driven are: vehicle_1": lambda: Task(PAPER, (0, 1)).vehicle,
+    "scenario 'paper-random': needs one controlled vehicle; controlled are: vehicle_1": lambda: (
+        Task(PAPER, (0, 1)).vehicle
+    ),
     "vehicles (): at least one is needed, each once, from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
     "budget = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=0),
     "threads = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=10, threads=0),

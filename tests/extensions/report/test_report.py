@@ -198,14 +198,14 @@ def test_report__begins_with_what_the_agent_does_against_full_braking_and_where_
     paper_random: eb.Scenario, harm_count: HarmCount
 ) -> None:
     """By the first impacts it is worse in no world, by all of them in some."""
-    mine = replace(summed_up(paper_random, "full_brake", "ppo@shipped"), harm_count=harm_count)
-    after, before = (mine.evaluation.outcome(name).world_harm(harm_count) for name in ("ppo@shipped", "full_brake"))
+    mine = replace(summed_up(paper_random, "full_brake", "ppo"), harm_count=harm_count)
+    after, before = (mine.evaluation.outcome(name).world_harm(harm_count) for name in ("ppo", "full_brake"))
     best, worse = regrets_of(mine.evaluation).best(harm_count).mean(), after > before + 1e-6
     words = "first impacts" if harm_count == "first" else "all impacts"
     more = f"but more in {100 * worse.mean():.1f} % of these worlds, by {(after - before).max():.2f} at most"
     assert worse.any() == (harm_count == "total")
     assert mine.first_sentence == (
-        f"ppo@shipped does {100 * (1 - after.mean() / before.mean()):.0f} % less harm than full braking ({words}:"
+        f"ppo does {100 * (1 - after.mean() / before.mean()):.0f} % less harm than full braking ({words}:"
         f" {after.mean():.2f} m²/s² per emergency instead of {before.mean():.2f}; best known {best:.2f}),"
         f" {more if worse.any() else 'and in none of these worlds more'}."
     )

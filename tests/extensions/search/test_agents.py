@@ -24,7 +24,7 @@ PAPER = eb.load_scenario("paper-random")
 @pytest.mark.parametrize(
     ("spec", "parts"),
     [
-        ("ppo@shipped+search+step", AgentSpec("ppo", None, "shipped", ("search", "step"))),
+        ("ppo+search+step", AgentSpec("ppo", None, None, ("search", "step"))),
         ("mine:x@path+robust", AgentSpec("mine", "x", "path", ("robust",))),
     ],
 )
@@ -39,7 +39,7 @@ def test_spec__is_taken_apart_and_written_again(spec, parts):
         ("best_harm:20+search", Searched),
         ("e_v2x_bm+search+episode", HybridAgent),
         ("coast+robust", ShieldedDriver),
-        ("ppo@shipped+search+step", ShieldedDriver),
+        ("ppo+search+step", ShieldedDriver),
         ("full_brake+search+step", ShieldedDriver),
     ],
 )
@@ -84,7 +84,7 @@ def test_predictions__are_what_is_done(agent: str) -> None:
 
 
 def test_policy_sha256__is_found_inside_what_is_around_it() -> None:
-    agent = eb.make_agent("ppo@shipped+search+episode", scenario=PAPER)
+    agent = eb.make_agent("ppo+search+episode", scenario=PAPER)
     assert policy_sha256(agent) == eb.load_shipped("ppo").manifest.manifest_sha256
 
 
@@ -93,7 +93,7 @@ def test_left_out__worlds_are_named_and_left_out_for_all_agents() -> None:
 
 
 def test_lineup__of_the_ladder_is_every_rung() -> None:
-    assert list(make_lineup(["ladder", "constant:5", "e_v2x_bm:pairwise:believed"], PAPER)) == [
+    assert list(make_lineup(["ladder", "constant:5", "e_v2x_bm:pairwise:estimated"], PAPER)) == [
         "coast",
         "full_brake",
         "e_v2x_bm:pairwise",
@@ -101,5 +101,5 @@ def test_lineup__of_the_ladder_is_every_rung() -> None:
         "planner",
         "best_harm",
         "constant:5",
-        "e_v2x_bm:pairwise:believed",
+        "e_v2x_bm:pairwise:estimated",
     ]

@@ -169,7 +169,7 @@ DIFFERS = {
 def test_best_harm_agent__is_in_no_world_above_universal(name: str, harm_count: HarmCount) -> None:
     scenario = load_scenario(name)
     scenario = scenario.with_learners([1])
-    lineup = make_lineup(["universal@shipped", "best_harm:50"], scenario, harm_count=harm_count)
+    lineup = make_lineup(["universal", "best_harm:50"], scenario, harm_count=harm_count)
     found = evaluate(scenario.sample(30, 5007), lineup, scenario=scenario, aftermath=False)
     policy, best = (found.outcome(spec).world_harm(harm_count) for spec in lineup)
     assert (best <= policy).all() and best.mean() < policy.mean()
@@ -259,7 +259,7 @@ def test_shipped_tables__no_policy_that_ships_does_less_harm() -> None:
         scenario = load_scenario(table.header["scenario"])
         worlds = scenario.sample(20, seed=7).worlds
         for name in names:
-            driven = drive(worlds, make_agent(f"policy@shipped/{name}", scenario=scenario), scenario, 1).ledger
+            driven = drive(worlds, make_agent(name, scenario=scenario), scenario, 1).ledger
             for count, known in best_known(worlds, Task(scenario, scenario.learners)).items():
                 assert (driven.world_harm(count) > known - 1e-6).all(), (scenario.name, name, count)
 
@@ -439,7 +439,7 @@ def test_known_limits__are_the_proof_and_the_best_known() -> None:
 def test_known_limits__say_why_nothing_is_proven() -> None:
     coasts = load_scenario("cooperation-3-pair").replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})
     for task, why in (
-        (Task(SCENARIO, ()), "driven are: none; avoidability is proven for one vehicle"),
+        (Task(SCENARIO, ()), "controlled are: none; avoidability is proven for one vehicle"),
         (Task(coasts, (1, 2)), "vehicle_1 follows coast; harm is bounded where it follows full_brake"),
     ):
         assert known_limits(LISTED, task) == Unproven(why)

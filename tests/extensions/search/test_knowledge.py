@@ -7,16 +7,16 @@ from ethbrake_marl.agents.protocol import Source
 from tests.agents.test_knowledge import BLOCKED, agent_of, changed_decisions, check_stated, in_two, with_channels
 from tests.extensions.certified.test_knowledge import LINES, drives_each_world_alone, line_of
 
-MESSAGES, BELIEFS, MODEL = Source.MESSAGES, Source.BELIEFS, Source.MODEL
+MESSAGES, ESTIMATES, MODEL = Source.MESSAGES, Source.ESTIMATES, Source.MODEL
 STATED = {
     "planner:20": (MODEL,),
     "best_harm:20": (MODEL,),
-    "planner:20:believed": (BELIEFS,),
-    "ppo@shipped/ppo+search+episode": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+search+step": (MESSAGES, MODEL),
-    "ppo@shipped/ppo+search": (MESSAGES, MODEL),
+    "planner:20:estimated": (ESTIMATES,),
+    "ppo+search+episode": (MESSAGES, MODEL),
+    "ppo+search+step": (MESSAGES, MODEL),
+    "ppo+search": (MESSAGES, MODEL),
 }
-USUAL = {"planner": "planner:20", "planner:believed": "planner:20:believed", "best_harm": "best_harm:20"}  # budgets
+USUAL = {"planner": "planner:20", "planner:estimated": "planner:20:estimated", "best_harm": "best_harm:20"}  # budgets
 HONEST, SEEING = in_two(STATED)
 
 
@@ -38,6 +38,6 @@ def test_true_state_and_model__is_not_said_without_need(spec):
 
 
 @pytest.mark.parametrize(("vehicles", "v2x"), LINES)
-def test_believing__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
+def test_estimating__drives_every_line_and_no_world_depends_on_the_batch(vehicles: int, v2x: object) -> None:
     scenario = line_of(vehicles, v2x)
-    drives_each_world_alone(make_agent("planner:8:believed", scenario=scenario), scenario)
+    drives_each_world_alone(make_agent("planner:8:estimated", scenario=scenario), scenario)

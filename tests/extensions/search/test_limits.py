@@ -277,7 +277,7 @@ LINE = load_scenario("paper-random")
     [
         (LINE.replace(roles={"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "full_brake"}), 1,
          "vehicle_1 follows coast"),
-        (LINE.with_learners([2]), 2, "vehicle_3 is driven"),
+        (LINE.with_learners([2]), 2, "vehicle_3 is controlled"),
         (LINE.replace(latency_s=[0.6, 0.5, 0.8]), 1, "vehicle_1 may brake later than vehicle_2"),
         (load_scenario("paper-random-obstacle").replace(obstacle_gap_m=30.0), 1,
          "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"),

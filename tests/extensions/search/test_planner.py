@@ -36,7 +36,7 @@ def harm(agent, harm_count="first", worlds=WORLDS, scenario=SCENARIO):
 
 
 @pytest.mark.parametrize("harm_count", HARM_COUNTS)
-@pytest.mark.parametrize("inside", ["constant:5", "ppo@shipped"])
+@pytest.mark.parametrize("inside", ["constant:5", "ppo"])
 def test_searched__is_never_worse_and_as_predicted(inside, harm_count):
     plain, agent = harm(agent_of(inside), harm_count), searched(inside, harm_count=harm_count)
     episodes = drive(WORLDS, agent, SCENARIO, 1)

@@ -67,5 +67,5 @@ PLANS = PAPER.replace(
 
 
 def test_looking_ahead__needs_commands_that_are_fixed_at_the_alert() -> None:
-    with refused("vehicle_3 is driven by 'planner:8', whose command is not fixed at the alert"):
+    with refused("vehicle_3 is controlled by 'planner:8', whose command is not fixed at the alert"):
         drive(WORLDS, Searched(BRAKE, PLANS), PLANS, 1)

@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.report.report import Report
 from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo@shipped")
+AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo")
 PAPER = eb.load_scenario("paper-random")
 
 

@@ -74,7 +74,7 @@ def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str
 @pytest.fixture(scope="module")
 def run_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report of as many agents, tests and remarks as one of ``ethbrake run``."""
-    specs = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo@shipped", "ppo@shipped+episode")
+    specs = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "ppo", "ppo+episode")
     names = (*specs[:3], TRAINED_POLICY, "hybrid")
     found = {}
     for name in ("paper-random", "paper-random-obstacle"):

@@ -1,4 +1,4 @@
-"""Shields over believed worlds: the bound where the world is a corner of what is open, and what they are without it."""
+"""Shields over estimated worlds: the bound in worlds that are corners of what is open, and in others."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.driving import drive
 from ethbrake_marl.agents.making import make_agent
 from ethbrake_marl.extensions.certified.enclosure import Boxes
-from ethbrake_marl.extensions.certified.estimated_shield import BelievedShield
+from ethbrake_marl.extensions.certified.estimated_shield import EstimatedShield
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
 from tests.extensions.certified.estimates import ABOVE, HEARD_LATE, INSIDE, LISTS, NEVER_HEARD, WAYS, shielded
@@ -35,11 +35,11 @@ def test_robust__at_the_corners_no_world_is_above_the_first_bound(name: str, way
 
 
 def test_robust__between_the_corners_some_worlds_are_above_though_trusted_and_none_inside_the_box() -> None:
-    """The counterexample of docs/shield-believed.md: whoever proposes to coast, in the first world of seed 5006."""
+    """The counterexample of docs/extensions/certified.md: coasting, in the first world of seed 5006."""
     harm, bound = {}, {}
     for robust in ("members", "interior"):
         settings = {"robust": "interior"} if robust == "interior" else {}
-        env = eb.HybridShield(eb.parallel_env("cooperation-1-front"), mode="robust", believed=True, **settings)
+        env = eb.HybridShield(eb.parallel_env("cooperation-1-front"), mode="robust", estimated=True, **settings)
         env.reset(seed=5006)
         infos, bounds = {}, []
         while env.agents:
@@ -69,7 +69,7 @@ def test_interior__a_box_that_is_the_middle_alone_is_found(monkeypatch: pytest.M
         return boxes._replace(low=half, high=half)
 
     monkeypatch.setattr(Boxes, "of", middle)
-    monkeypatch.setattr(BelievedShield, "_corners", lambda self: [{}])
+    monkeypatch.setattr(EstimatedShield, "_corners", lambda self: [{}])
     harm, bound, _ = shielded("coast", INSIDE["never heard"], 12, 7, robust="interior")
     assert (harm > bound + 1.0).any()
 
@@ -80,7 +80,7 @@ def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
 
 
 @pytest.mark.parametrize("robust", [None, "corners", pytest.param("interior", marks=pytest.mark.slow)])
-def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: str | None) -> None:
+def test_estimated__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: str | None) -> None:
     n = 40 if robust == "interior" else 20
     harm, bound, _ = shielded("drive", BASE, n, 7, robust=robust)
     _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, n)
@@ -91,8 +91,8 @@ def test_believed__where_everything_is_known_the_bound_is_that_of_the_best_const
     assert (harm <= bound + 1e-6).all()
 
 
-@pytest.mark.parametrize("spec", ["coast+step:believed", "coast+robust:believed", "ppo@shipped/ppo+episode:believed"])
-def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
+@pytest.mark.parametrize("spec", ["coast+step:estimated", "coast+robust:estimated", "ppo+episode:estimated"])
+def test_estimated__no_world_depends_on_the_batch(spec: str) -> None:
     worlds = PERIODIC.sample(5, 3).worlds
     whole = drive(worlds, make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
     alone = drive(worlds.take([4]), make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
@@ -113,7 +113,7 @@ def test_believed__no_world_depends_on_the_batch(spec: str) -> None:
     ids=["two vehicles", "an obstacle"],
 )  # fmt: skip
 @pytest.mark.parametrize("robust", [None, "corners"])
-def test_believed__shields_other_lines(scenario: eb.Scenario, robust: str | None) -> None:
+def test_estimated__shields_other_lines(scenario: eb.Scenario, robust: str | None) -> None:
     if robust is None or scenario.vehicles == 2:
         assert np.isfinite(shielded("coast", scenario, 4, 7, robust=robust)[:2]).all()
 
@@ -121,12 +121,12 @@ def test_believed__shields_other_lines(scenario: eb.Scenario, robust: str | None
 @pytest.mark.parametrize(
     "spec",
     [
-        pytest.param("coast+robust:interior:believed", marks=pytest.mark.slow), "coast+step:believed",
-        "e_v2x_bm:believed",
+        pytest.param("coast+robust:interior:estimated", marks=pytest.mark.slow), "coast+step:estimated",
+        "e_v2x_bm:estimated",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("script", ["coast", "e_v2x_bm"])
-def test_believed__the_script_of_the_driven_vehicle_itself_does_not_count(spec: str, script: str) -> None:
+def test_estimated__the_script_of_the_controlled_vehicle_itself_does_not_count(spec: str, script: str) -> None:
     scripted = BASE.replace(roles={"vehicle_1": "full_brake", "vehicle_2": script, "vehicle_3": "full_brake"})
     worlds = scripted.sample(3, 1).worlds
     harms = [
@@ -136,10 +136,10 @@ def test_believed__the_script_of_the_driven_vehicle_itself_does_not_count(spec: 
     np.testing.assert_array_equal(*harms)
 
 
-def test_believed__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:
+def test_estimated__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:
     late = BASE.replace(latency_s=[0.0, 1.2, 0.5])
-    agents = {spec: make_agent(spec, scenario=late) for spec in ("coast+step", "coast+step:believed")}
-    harm, bound = driven(agents["coast+step:believed"], late, 60)
+    agents = {spec: make_agent(spec, scenario=late) for spec in ("coast+step", "coast+step:estimated")}
+    harm, bound = driven(agents["coast+step:estimated"], late, 60)
     assert 0 < np.isinf(bound).sum() < 10 and (harm <= bound + ABOVE).all()
     known, received = eb.summarise(eb.evaluate(late.sample(60, 7), agents, scenario=late))
     assert known["predicted_harm"] is not None and received["predicted_harm"] is None  # no mean of what is not finite
@@ -155,10 +155,10 @@ def told_in(env: Any, world: int = 3, action: float = 0.0) -> list[dict[str, Any
 @pytest.mark.parametrize("mode", ["step", "robust"])
 @pytest.mark.parametrize("scenario", [PERIODIC, HEARD_LATE, eb.load_scenario("cooperation-2-blocked")], ids=str)
 def test_parallel__does_what_the_agent_of_evaluations_does(scenario: eb.Scenario, mode: str) -> None:
-    env = HybridShield(eb.parallel_env(scenario), mode=mode, believed=True)
+    env = HybridShield(eb.parallel_env(scenario), mode=mode, estimated=True)
     for world in range(1 if mode == "robust" else 2):
         told = told_in(env, world)
-        agent = make_agent(f"coast+{mode}:believed", scenario=scenario)
+        agent = make_agent(f"coast+{mode}:estimated", scenario=scenario)
         alone = drive(scenario.sample(1, 7, first=world).worlds, agent, scenario, 1)
         harm, shield = env.unwrapped.engine.ledger.world_harm("first"), alone.guarded.shield
         assert harm[0] == alone.ledger.world_harm("first")[0]
@@ -171,13 +171,13 @@ def test_parallel__does_what_the_agent_of_evaluations_does(scenario: eb.Scenario
         )
 
 
-def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief() -> None:
-    single = ShieldedEnv(eb.EthBrakeEnv(PERIODIC), believed=True)
-    aec = shielded_aec(eb.parallel_env(PERIODIC), mode="step", believed=True)
-    vector = ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=1, scenario=PERIODIC), believed=True)
-    start, *told = told_in(HybridShield(eb.parallel_env(PERIODIC), mode="step", believed=True), action=0.5)
+def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_estimate() -> None:
+    single = ShieldedEnv(eb.EthBrakeEnv(PERIODIC), estimated=True)
+    aec = shielded_aec(eb.parallel_env(PERIODIC), mode="step", estimated=True)
+    vector = ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=1, scenario=PERIODIC), estimated=True)
+    start, *told = told_in(HybridShield(eb.parallel_env(PERIODIC), mode="step", estimated=True), action=0.5)
     assert start["bound_harm"] == np.inf and np.isfinite(told[0]["bound_harm"]) and set(start) == set(told[0])
-    assert all(each["believed"] and not each["trusted"] for each in told)
+    assert all(each["estimated"] and not each["trusted"] for each in told)
     for env in (single, aec, vector):
         env.reset(options={"listed_world": {"seed": 7, "number": 3}})
     for wanted in told:
@@ -195,8 +195,8 @@ def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_belief
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=2, scenario=PERIODIC), mode="robust", believed=True),
-        lambda: eb.ShieldedVecEnv(eb.make_sb3_vec_env(PERIODIC, 2, seed=5), mode="robust", believed=True),
+        lambda: ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=2, scenario=PERIODIC), mode="robust", estimated=True),
+        lambda: eb.ShieldedVecEnv(eb.make_sb3_vec_env(PERIODIC, 2, seed=5), mode="robust", estimated=True),
     ],
     ids=["vector", "sb3"],
 )
@@ -220,5 +220,5 @@ def test_latencies_that_are_over__are_not_waited_for_again() -> None:
         name="late", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
         mass_t=1, latency_s=[0, 0.6], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
     )  # fmt: skip
-    for found in driven(make_agent("full_brake+episode:believed", scenario=late), late, 1):
+    for found in driven(make_agent("full_brake+episode:estimated", scenario=late), late, 1):
         assert found == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake
