@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ethbrake_marl.agents.protocol import Knowledge
-from ethbrake_marl.errors import count_of
+from ethbrake_marl.errors import count_of, naming_extras
 from ethbrake_marl.evaluation.agent_tally import AgentTally, estimate_all, lower_bounds, tally_agents
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
@@ -161,6 +161,24 @@ class SummaryTable(list[SummaryRow]):
             " below a value: its 95 % interval; decreases are relative to full braking."
         )
         return "\n\n".join([ours, *(text for _, text in self.notes())])
+
+    def to_pandas(self) -> Any:
+        """Return a pandas ``DataFrame`` with one row per agent, whose index is the agent's name.
+
+        Column ``x`` is the value of measure ``x`` of the JSON results, in the unit that it has there; ``x_low`` and
+        ``x_high`` are the ends of its 95 % interval. NaN stands for a missing number. Raises ``MissingExtra`` if pandas
+        is not installed.
+        """
+        with naming_extras():
+            from pandas import DataFrame, Index
+
+        columns: dict[str, list[float | None]] = {}
+        for row in self:
+            for name, each in row.estimates.items():
+                low, high = (each and each.interval) or (None, None)
+                for key, value in ((name, each and each.value), (f"{name}_low", low), (f"{name}_high", high)):
+                    columns.setdefault(key, []).append(value)
+        return DataFrame(columns, index=Index([row.agent for row in self], name="agent"), dtype=float)
 
     def notes(self) -> list[Note]:
         """Return the notes to print below the table: those about the agents, then those about rows of other sources.

@@ -125,9 +125,6 @@ NAMES: dict[str, Callable[[], object]] = {
         WORLDS, BRAKE, scenario="paper-randm"
     ),
     "unknown agent 'full_brak'; did you mean 'full_brake'?": lambda: eb.evaluate(WORLDS, ["full_brak"], scenario=PAPER),
-    "unknown library 'panda'; did you mean 'pandas'?": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER).to_frame(
-        "panda"
-    ),
 }
 
 
