@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,7 @@ from ethbrake_marl.cli.command import (
     schema_option,
 )
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.progress import Progress
 
 KEPT = (
@@ -152,8 +154,8 @@ def train_command(
 ) -> None:
     """Train a policy, or the policies of several learners.
 
-    Writes a run's folder. Afterwards: `ethbrake evaluate --agents full_brake,ppo@FOLDER,ppo@FOLDER+episode`;
-    for several learners: `team@FOLDER`. Ctrl-C ends the training after the current update and keeps the policy;
+    Writes a run's folder, and ends with the harm of the trained agent beside full braking, the agent's name and the
+    command that evaluates it. Ctrl-C ends the training after the current update and keeps the policy;
     `ethbrake train --resume FOLDER` continues: the final policy is the same, bit for bit, as without the stop.
     """
     with Out(as_json=as_json, force=force, kept=KEPT) as out:
@@ -169,7 +171,7 @@ def train_command(
                 name for name, value in {**asked, "--seed": seed, "--force": force or None}.items() if value is not None
             ):
                 raise InvalidInput(f"{option}: --resume goes on with what the folder says; leave one of the two out")
-            _tell(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
+            _show(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
             raise InvalidInput("--other-versions: a new training has the versions of now; give it with --resume FOLDER")
@@ -188,21 +190,56 @@ def train_command(
         result = training.train(
             plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=given.texts
         )
-        _tell(out, result)
+        _show(out, result, scenario)
 
 
-def _tell(out: Out, result: training.TrainResult) -> None:
-    """Print the result of a training as JSON on stdout, and how it ended on stderr."""
-    out.result({
-        "directory": str(result.directory),
-        "status": result.status,
-        "start": result.training.begins,
-        "steps": result.steps,
-        "scheme": result.training.scheme,
-        "drivers": dict(result.training.drivers),
-        "evaluation": result.evaluations[-1] if result.evaluations else None,
-        "policy_steps": next(iter(result.policies.values())).manifest.steps,
-    })  # fmt: skip
+def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -> None:
+    """Print the result of a training on stdout, beside full braking, and how it ended on stderr.
+
+    ``scenario``: name or path from the command line; None: the name of the training's scenario.
+    """
+    from ethbrake_marl.training.fixed_list import measure_full_braking
+    from ethbrake_marl.training.progress import objective_in_words
+
+    plan, run = result.training.recipe, training.RunDirectory(result.directory)
+    columns = [
+        Column("Agent", "agent", text=True),
+        Column("First-impact harm", "first_impact_harm"),
+        Column("Total harm", "total_harm"),
+        Column("Collisions", "collision_rate", digits=1, scale=100.0, unit=" %"),
+    ]
+    if objective := objective_in_words(result.training):
+        columns.append(Column(objective[0].upper() + objective[1:], "objective"))
+    measured = {"full_brake": measure_full_braking(result.training), result.agent: result.metrics or {}}
+    rows = [(agent, *(metrics.get(each.name) for each in columns[1:])) for agent, metrics in measured.items()]
+    note = (
+        f"Means per world; harm in m²/s². These are the {plan.evaluation.worlds:,} worlds of seed"
+        f" {plan.evaluation.seed}, on which the training chose its policy."
+    )
+    table = Sheet("", columns, rows, note)
+    settings = [
+        each for each in run.read_config().get("settings", ()) if training.read_settings([each], [plan]).scenario
+    ]
+    settings += ["harm_count=total"] if plan.reward.harm_count == "total" else []
+    words = ["--scenario", scenario or result.training.scenario.name, "--agents", f"full_brake,{result.agent}"]
+    command = shlex.join(["ethbrake", "evaluate", *words, *(word for each in settings for word in ("--set", each))])
+    out.result(
+        {
+            "directory": str(result.directory),
+            "status": result.status,
+            "start": result.training.begins,
+            "steps": result.steps,
+            "scheme": result.training.scheme,
+            "drivers": dict(result.training.drivers),
+            "evaluation": result.evaluations[-1] if result.evaluations else None,
+            "policy_steps": result.trained.steps,
+            "agent": result.agent,
+            "fixed_list": {"worlds": plan.evaluation.worlds, "seed": plan.evaluation.seed, "results": table.json()},
+            "next_command": command,
+        },
+        table,
+        f"\nThe agent is {result.agent}. Evaluate it on other worlds:\n  {command}",
+    )
     _end(out, result)
 
 

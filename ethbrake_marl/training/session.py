@@ -60,6 +60,16 @@ class TrainResult:
     evaluations: tuple[Mapping[str, float], ...]  # steps, updates and metrics of each evaluation, in order
 
     @property
+    def agent(self) -> str:
+        """Name of what was trained as an agent, for ``make_agent`` and ``--agents``: ``ppo@runs/mine``."""
+        return self.training.agent_in(self.directory)
+
+    @property
+    def metrics(self) -> Mapping[str, float] | None:
+        """Results of ``trained`` on the fixed list (an entry of ``evaluations``); None if nothing was measured."""
+        return next((each for each in self.evaluations if each["steps"] == self.trained.steps), None)
+
+    @property
     def policies(self) -> dict[str, Policy]:
         """The policy of each learner, by the vehicle's name."""
         return dict(self.trained.drivers)
@@ -280,11 +290,9 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
-        alone = len(training.drivers) == 1
-        agents = f"{training.recipe.algorithm}@{run.path}+episode" if alone else f"team@{run.path}"
         raise InvalidInput(
             f"{run.path}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
-            f" {training.scenario.name} --agents {agents}"
+            f" {training.scenario.name} --agents full_brake,{training.agent_in(run.path)}"
         )
 
 

@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -150,6 +151,34 @@ def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbra
     assert ": 0 of 256\n" in answer.err and "after 256 training steps" in answer.err and "of 200" not in answer.err
 
 
+def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_the_same(
+    ethbrake, tiny_recipe, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    chosen = ("--recipe", tiny_recipe, "--set", "mass_t=40", "--set", "gamma=0.98", "--set", "reward.harm_count=total")
+    answer = ethbrake("train", *chosen, "--output", "runs/mine")
+    command = (
+        "ethbrake evaluate --scenario paper-random --agents full_brake,ppo@runs/mine --set mass_t=40"
+        " --set harm_count=total"
+    )
+    assert answer.status == 0 and answer.out.splitlines()[-1].strip() == command
+    assert "The agent is ppo@runs/mine." in answer.out and "the 10 worlds of seed 7" in answer.out
+    figures = told_json(ethbrake("train", *chosen, "--output", "runs/mine", "--force", "--json"))
+    assert (figures["agent"], figures["next_command"]) == ("ppo@runs/mine", command)
+    rows = told_json(ethbrake(*shlex.split(command)[1:], "--episodes", "10", "--json"))  # the recipe's fixed list
+    assert (figures["fixed_list"]["worlds"], figures["fixed_list"]["seed"]) == (10, 7)
+    for told, row in zip(figures["fixed_list"]["results"], rows, strict=True):
+        assert told == {name: pytest.approx(row[name]) if name != "agent" else row[name] for name in told}
+        assert f"{row['first_impact_harm']:.2f}" in answer.out and f"{row['total_harm']:.2f}" in answer.out
+
+
+def test_train__of_a_team_with_own_objectives_shows_them(ethbrake, tiny_recipe, tmp_path) -> None:
+    own = ("--scenario", "cooperation-3-pair", "--set", "reward.objective=own", "--output", tmp_path / "run")
+    answer = ethbrake("train", *own, "--recipe", tiny_recipe)
+    assert answer.status == 0 and f"The agent is team@{tmp_path / 'run'}." in answer.out
+    assert "First-impact harm (own)" in answer.out
+
+
 def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path) -> None:
     scenario, folder = ("--scenario", "cooperation-3-pair"), tmp_path / "run"
     told = "policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
@@ -159,7 +188,7 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     alone, team = told_json(ethbrake("evaluate", *scenario, *words))
     assert alone["first_impact_harm"] == team["first_impact_harm"]
     check_refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by PPO", f"ppo@{folder}")
-    check_refused(ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
+    check_refused(ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents full_brake,team@")
 
 
 def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
@@ -173,7 +202,7 @@ def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, 
     told = told_json(ethbrake("train", "--resume", folder, "--json"))
     assert (told["status"], told["steps"]) == ("finished", 256)
     again = ethbrake("train", "--resume", folder)
-    check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@")
+    check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents full_brake,ppo@")
 
 
 # Learning curves
