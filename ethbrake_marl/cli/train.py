@@ -113,7 +113,9 @@ def run_command(
         out.result(result.results, Text(told), *result.tables)
         for note in result.notes:
             out.note(note)
-        _end(out, result.trained)
+        if result.interrupted:
+            out.interrupted(f"interrupted: {result.interrupted}; the report is without it: {trained.directory}")
+        _end(out, trained)
 
 
 def quickest(*, several: bool = False) -> str:

@@ -175,9 +175,10 @@ class SummaryTable(list[SummaryRow]):
         columns: dict[str, list[float | None]] = {}
         for row in self:
             for name, each in row.estimates.items():
-                low, high = (each and each.interval) or (None, None)
-                for key, value in ((name, each and each.value), (f"{name}_low", low), (f"{name}_high", high)):
-                    columns.setdefault(key, []).append(value)
+                low, high = (None if each is None else each.interval) or (None, None)
+                columns.setdefault(name, []).append(None if each is None else each.value)
+                columns.setdefault(f"{name}_low", []).append(low)
+                columns.setdefault(f"{name}_high", []).append(high)
         return DataFrame(columns, index=Index([row.agent for row in self], name="agent"), dtype=float)
 
     def notes(self) -> list[Note]:

@@ -154,7 +154,8 @@ def resume(
     """Continue a training that was stopped or killed. Its policies are the same, bit for bit, as without the stop.
 
     Training continues from the newest undamaged checkpoint, or from the beginning if there is none. Rows and events
-    after that checkpoint are dropped.
+    after that checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about the policy so far are
+    deleted.
 
     Args:
         directory: the run's folder.
@@ -174,6 +175,7 @@ def resume(
         run.write_json(run.team, training.team())  # the one that is there may be damaged
         with hold_lock(run.lock, _BUSY):
             state, damaged = _newest_checkpoint(run, training, other_versions)
+            run.remove_results()
             return learn(callback, state, [f"a damaged checkpoint was left aside: {reason}" for reason in damaged])
 
 

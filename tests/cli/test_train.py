@@ -14,6 +14,8 @@ import onnx
 import pytest
 
 from ethbrake_marl.cli.command import Out
+from ethbrake_marl.progress import OnProgress
+from ethbrake_marl.training.experiment import Experiment, RunReport
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -188,7 +190,9 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     alone, team = told_json(ethbrake("evaluate", *scenario, *words))
     assert alone["first_impact_harm"] == team["first_impact_harm"]
     check_refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by PPO", f"ppo@{folder}")
-    check_refused(ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents full_brake,team@")
+    check_refused(
+        ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents full_brake,team@"
+    )
 
 
 def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
@@ -203,6 +207,40 @@ def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, 
     assert (told["status"], told["steps"]) == ("finished", 256)
     again = ethbrake("train", "--resume", folder)
     check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents full_brake,ppo@")
+
+
+@pytest.mark.usefixtures("core_alone")
+def test_resume__deletes_the_results_of_the_policy_before_and_nothing_else(
+    ethbrake, tiny_recipe, tmp_path, monkeypatch
+) -> None:
+    folder = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        assert ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder).status == 130
+    written = {"results.json", "results.csv", "per_world.csv"}
+    assert {*status_of(folder, "written")[0]} == written and all((folder / name).exists() for name in written)
+    (folder / "notes.txt").write_text("mine")
+    (tmp_path / "precious.txt").write_text("mine")
+    status = json.loads((folder / "run.json").read_text())
+    hostile = {"written": [*written, "policy", "config.json", "../precious.txt", "..", ".", 7]}
+    (folder / "run.json").write_text(json.dumps(status | hostile))
+    assert ethbrake("train", "--resume", folder).status == 0
+    there = {path.name for path in folder.iterdir()}
+    assert not there & written and {"notes.txt", "policy", "config.json"} <= there
+    assert (tmp_path / "precious.txt").exists()
+
+
+def test_run__whose_further_training_was_interrupted_ends_with_130(
+    ethbrake, tiny_recipe, tmp_path, monkeypatch
+) -> None:
+    def make(experiment: Experiment, tell: OnProgress) -> RunReport:
+        return RunReport(("a table",), "report: here", "the training alone/vehicle_3")
+
+    monkeypatch.setattr("ethbrake_marl.training.experiment.RUN_REPORTS", {"mine": make})
+    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "run")
+    assert answer.status == 130 and "a table" in answer.out
+    told = "interrupted: the training alone/vehicle_3; the report is without it: "
+    assert answer.err.splitlines()[-1].startswith(told)
 
 
 # Learning curves

@@ -7,7 +7,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -268,6 +267,15 @@ def check_unmarked(text: str) -> None:
 # ---------------------------------------------------------------- other objectives
 
 
+def test_rescored__breaks_no_name_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    line, name = load_scenario("cooperation-4-five"), "policy@runs/a-long-name-of-a-run-of-mine"
+    shown = str(evaluate(line.sample(20, 7), {name: eb.make_agent("full_brake")}, scenario=line).rescore(["own"]))
+    assert shown.count(f"{name}   own ") == 2
+    words = shown.replace("\n", " ").split()
+    assert "(injury:CURVE:" in words and {"Agent", "Objective", name} <= {*words}
+
+
 def test_rescored__one_impact_by_hand_in_json_and_as_columns(pair: Scenario, tmp_path: Path) -> None:
     # Harm 9, of which the vehicles bear 4.95 and 4.05 (see conftest).
     result = evaluate(pair.sample(2, 0), BRAKE, scenario=pair)
@@ -366,7 +374,7 @@ def test_frame__of_a_table_has_a_row_per_agent_with_the_ends_of_each_interval(ev
     rows = summarise(evaluation)
     frame = rows.to_pandas()
     assert frame.index.name == "agent" and list(frame.index) == [row.agent for row in rows]
-    assert (frame.dtypes == float).all() and len(frame.columns) == 3 * len(rows[0].estimates)
+    assert {str(kind) for kind in frame.dtypes} == {"float64"} and len(frame.columns) == 3 * len(rows[0].estimates)
     for row in rows:
         got = frame.loc[row.agent, ["total_harm", "total_harm_low", "total_harm_high"]]
         assert got.tolist() == [row.total_harm.value, *row.total_harm.ends]
