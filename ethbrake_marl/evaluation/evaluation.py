@@ -75,8 +75,8 @@ class Evaluation:
         drivers += [f"{more} more"] if more else []
         seed = "" if self.seed is None else f" of seed {self.seed}"
         return (
-            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80} driven"
-            f" by {', '.join(drivers)})"
+            f"Evaluation({self.scenario.name!r}, {count_of(self.worlds.n, 'world')}{seed}, {self.task.names:.80}"
+            f" controlled by {', '.join(drivers)})"
         )
 
     @property
@@ -93,8 +93,8 @@ class Evaluation:
         """Return ``compute(self)``. A later call with the same function returns the stored result."""
         if compute not in self._computed:
             self._computed[compute] = compute(self)
-        found: T = self._computed[compute]
-        return found
+        result: T = self._computed[compute]
+        return result
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
@@ -178,37 +178,37 @@ class Evaluation:
             values = rule.of(self.worlds)
             if key in _ALWAYS_SHOWN or np.ptp(values, axis=0).any():
                 initial |= {rule.column_of(i): none_for_nan(values[:, i]) for i in range(values.shape[1])}
-        found: Columns = {}
+        table: Columns = {}
         for agent, outcome in self.outcomes.items():
-            told = outcome.columns()
+            measured = outcome.columns()
             for name, each in MEASURE_SETS.items():
                 context = contexts[name]
                 for column, of in each.per_world.items():
-                    told[column] = None if isinstance(context, Silent) else of(outcome, context)
-            told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
+                    measured[column] = None if isinstance(context, Silent) else of(outcome, context)
+            measured |= {name: column for name, column in outcome.borne(objectives).items() if name not in measured}
             columns: Columns = {
                 "agent": [agent] * n,
                 **initial,
-                **{name: [None] * n if column is None else none_for_nan(column) for name, column in told.items()},
+                **{name: [None] * n if column is None else none_for_nan(column) for name, column in measured.items()},
                 "knows": [outcome.knows.text] * n,
                 "hidden": self.hidden.astype(int).tolist(),
             }
             for left in self.left_out:
-                told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
-                columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
-            found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
-        return found
+                values_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
+                columns = {name: [*values, values_of.get(name)] for name, values in columns.items()}
+            table = {name: [*table.get(name, ()), *values] for name, values in columns.items()}
+        return table
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
         """Return the columns of ``per_world`` as arrays, by name.
 
         NaN stands for a missing number, the empty text for a missing text. Each of ``objectives`` adds columns.
         """
-        found, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
+        arrays, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
             texts = name in _TEXTS.union(*of_sets) or (name.startswith("vehicle_") and name.endswith("_type"))
-            found[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
-        return found
+            arrays[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
+        return arrays
 
     def to_pandas(self) -> Any:
         """Return a pandas ``DataFrame`` with one row per agent and world: the columns of ``--per-world``.
@@ -247,7 +247,7 @@ class Evaluation:
             for agent, each in self.outcomes.items()
         ]
         note = f"Means per world in m²/s², with their 95 % intervals{self.conditions.by_recording}."
-        note += " eb.summarise tells more."
+        note += " eb.summarise shows all measures."
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:

@@ -87,13 +87,13 @@ def evaluate(
         seed = LIST_SEED if seed is None else seed
         worlds = scenario.sample(EPISODES if episodes is None else episodes, seed=seed)
     elif episodes is not None:
-        raise InvalidInput(f"evaluate: episodes = {episodes!r}: the worlds are given; leave one of the two out")
+        raise InvalidInput(f"evaluate: episodes = {episodes!r}: worlds were passed too; leave one of the two out")
     _check_request(worlds, agents, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     if not sample.worlds.n:
         raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
-    vehicles = driven_vehicles(scenario, vehicle, agents)
+    vehicles = controlled_vehicles(scenario, vehicle, agents)
     warn_unfamiliar(agents, sample.worlds, scenario, vehicles)
     parts = []
     for first, part in chunks_of(sample, chunk or CHUNK):
@@ -166,7 +166,7 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
             f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo@shipped', or a mapping of agents"
         )
     if not agents:
-        raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
+        raise InvalidInput("evaluate: no agents; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
         check_agent(agent, f"evaluate: agent {name!r}", alone=False)
         Knowledge.of(agent)  # raises for an invalid ``knows``
@@ -174,7 +174,7 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
         check_whole_number("evaluate: chunk", chunk, 1)
 
 
-def driven_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
+def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
     This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. Without learners the
@@ -205,7 +205,7 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     if set(learners) - {vehicle}:
         raise InvalidInput(
             f"scenario {scenario.name!r}: its learners are {', '.join(names)}, but only"
-            f" {scenario.vehicle_names[vehicle]} is driven; give the others a script (scenario.replace(roles=...))"
+            f" {scenario.vehicle_names[vehicle]} is controlled; give the others a script (scenario.replace(roles=...))"
         )
     return int(vehicle)
 
@@ -237,7 +237,7 @@ def _roll_out(
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """Return the ``Outcome`` of the episodes that a team has driven.
+    """Return the ``Outcome`` of a team's episodes.
 
     It lacks what watchers measure during the episodes: ``shoved_m``, ``sampled_harm`` and ``metrics``. The fields
     ``predicted_harm`` and ``chosen_policy`` come from the memory of an agent that drives alone, or from a shield.

@@ -61,11 +61,11 @@ def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES
         shape = drawn[0].shape[:-1]
         return statistic(*drawn, *(np.broadcast_to(one, (*shape, 1)) for one in fixed), axis=axis)
 
-    found = bootstrap(
+    resampled = bootstrap(
         again, resample, n_resamples=resamples, confidence_level=CONFIDENCE, method="percentile", rng=seed,
         vectorized=True,
     )  # fmt: skip
-    return Estimate(value, (float(found.confidence_interval.low), float(found.confidence_interval.high)))
+    return Estimate(value, (float(resampled.confidence_interval.low), float(resampled.confidence_interval.high)))
 
 
 def mean_over_seeds(
@@ -87,20 +87,20 @@ def mean_over_seeds(
     Raises ``InvalidInput`` for arrays that cannot be paired or are not finite.
 
     """
-    given = np.atleast_2d(np.asarray(values))
-    sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
+    array = np.atleast_2d(np.asarray(values))
+    sides = _pair_sides("mean_over_seeds", array, np.zeros((1, array.shape[-1])) if baseline is None else baseline)
     value = float((sides[0].mean(axis=0) - sides[1].mean(axis=0)).mean())
-    found = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], clusters, seed)
-    if baseline is not None or (given < 0).any():
-        return found
-    if given.dtype != np.bool_:
-        return of_amounts(found, nothing=not given.any())
+    estimate = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], clusters, seed)
+    if baseline is not None or (array < 0).any():
+        return estimate
+    if array.dtype != np.bool_:
+        return of_amounts(estimate, nothing=not array.any())
     share = min(value, 1.0)  # a mean of ones may be rounded up
     if clusters is None:
-        low, high = wilson(share, given.shape[1])
+        low, high = wilson(share, array.shape[1])
     else:
-        low, high = share_of(given.ravel(), np.tile(clusters, len(given))).interval or (0.0, 1.0)
-    ends = found.interval or (low, high)
+        low, high = share_of(array.ravel(), np.tile(clusters, len(array))).interval or (0.0, 1.0)
+    ends = estimate.interval or (low, high)
     return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
 
 
@@ -141,7 +141,7 @@ def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
 
     Raises ``InvalidInput``, naming the function ``who``, if their numbers of worlds differ or a value is not finite.
     """
-    arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
+    arrays = tuple(np.atleast_2d(np.asarray(side, np.float64)) for side in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
         shapes = " and ".join(str(side.shape) for side in arrays)
         raise InvalidInput(f"{who}: shapes {shapes}: must be [seeds, worlds] with the same worlds")

@@ -115,13 +115,13 @@ class ShieldModes(list[ModeRow]):
             shares = row.verdicts or (None,) * len(VERDICTS)
             lines.append((f"  {row.mode}", row.harm, *compared, row.replaced, *shares, row.above_bound))
         title = "Mean harm per world (m²/s²), difference with 95 % interval"
-        found = [Sheet(title, [*head, share("replaced"), *map(share, VERDICTS), Column("above")], lines, gap=2)]
+        sheets = [Sheet(title, [*head, share("replaced"), *map(share, VERDICTS), Column("above")], lines, gap=2)]
         if teams:
             head = [Column("agent, mode, vehicle", text=True), share("replaced"), Column("bears")]
             head += [Column("under the baseline plan"), share("worlds with more")]
             bears = [(f"{row.agent}, {row.mode}, {each.vehicle}", *each[1:]) for row in self for each in row.vehicles]
-            found.append(Sheet("What each vehicle bears, mean per world (m²/s²)", head, bears, gap=2))
-        return found
+            sheets.append(Sheet("What each vehicle bears, mean per world (m²/s²)", head, bears, gap=2))
+        return sheets
 
 
 def compare_modes(
@@ -209,7 +209,7 @@ def _compare(
 
 def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
     """Let an agent or team drive one chunk of worlds in every mode of the shield, and return the results by mode."""
-    several, found = len(task.vehicles) > 1, {}
+    several, results = len(task.vehicles) > 1, {}
     alone: dict[Mode, Team] = {"none": Team.of(agent, task.vehicles)}
     if not several:
         assert isinstance(agent, Agent)
@@ -217,7 +217,7 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
         alone["episode"] = Team({task.vehicle: hybrid}, hybrid.name)
     for mode, team in alone.items():
         episodes = drive(worlds, team, task.scenario)
-        found[mode] = _Part(episodes.ledger.world_harm(task.harm_count), int((~episodes.at_rest).sum()))
+        results[mode] = _Part(episodes.ledger.world_harm(task.harm_count), int((~episodes.at_rest).sum()))
     behind: dict[Mode, dict[str, Any]] = {"step": {}, "step-alert": {"later_rollouts": False}}
     behind |= {"step-cap": {"cap": "baseline"}} if several else {}
     for mode, settings in behind.items():
@@ -225,8 +225,8 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
         shielded = Shielded.of(episodes, task)
         verdict = review(episodes.guarded.shield, agent, worlds).verdict
         counted = np.array([int((verdict == each).sum()) for each in VERDICTS])
-        found[mode] = _Part(shielded.harm, int(shielded.moving.sum()), shielded, counted)
-    return found
+        results[mode] = _Part(shielded.harm, int(shielded.moving.sum()), shielded, counted)
+    return results
 
 
 def _row(

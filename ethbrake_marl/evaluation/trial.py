@@ -62,7 +62,7 @@ def load_runnable(
     elif drives == "some" and not learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner to drive; give the scenario that the agents were trained for"
-            " (--scenario), or say which vehicle is driven, for instance --set roles.vehicle_2=learner"
+            " (--scenario), or say which vehicle learns, for instance --set roles.vehicle_2=learner"
         )
     return scenario
 

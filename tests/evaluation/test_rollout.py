@@ -531,7 +531,7 @@ def test_objects__say_what_they_are_in_a_line() -> None:
     record = eb.record_episode(worlds.take([0]), agents["full_brake"], scenario=PAPER)
     lines = "20 worlds of 3 vehicles: gaps 5.11 to 9.85 m, speeds 18.1 to 22 m/s, at 0 s"
     for value, text in (
-        (evaluation, "Evaluation('paper-random', 20 worlds of seed 7, vehicle_2 driven by 'full_brake', 'coast')"),
+        (evaluation, "Evaluation('paper-random', 20 worlds of seed 7, vehicle_2 controlled by 'full_brake', 'coast')"),
         (sample, f"Sample(Worlds({lines}), numbers 0 to 19, 0 rejected)"),
         (worlds.vehicles, "Vehicles(20 worlds of 3, masses 4.5 to 5.9 t)"),
         (worlds.take(np.zeros(0, int)), "Worlds(0 worlds of 3 vehicles: gaps none m, speeds none m/s, at none s)"),
