@@ -23,7 +23,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.progress import Progress
 
-KEPT = (
+REMAINS = (
     "if the training had begun, the run's folder keeps the last good policy; ethbrake train --resume FOLDER goes on"
     " with a training that has not finished"
 )
@@ -77,18 +77,18 @@ def run_command(
     also who bears what, and what each learner and the messages add, for which more is trained. Ctrl-C ends the
     training early, and what was trained so far is evaluated; a second Ctrl-C stops at once.
     """
-    with Out(as_json=as_json, force=force, kept=KEPT) as out:
+    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.training.experiment import run_experiment
         from ethbrake_marl.training.progress import objective_in_words
 
         plan = training.load_recipe(recipe or quickest())
-        given = training.read_settings(settings, [plan])
-        chosen = evaluation.load_runnable(scenario, given.scenario, drives="some")
+        changes = training.read_settings(settings, [plan])
+        chosen = evaluation.load_runnable(scenario, changes.scenario, drives="some")
         if recipe is None and len(chosen.learners) > 1:
             plan = training.load_recipe(quickest(several=True))
-            given = training.read_settings(settings, [plan])
-        plan = given.change(plan, out.note)
+            changes = training.read_settings(settings, [plan])
+        plan = changes.change(plan, out.note)
         result = run_experiment(
             chosen,
             output or run_folder(chosen, plan, seed),
@@ -98,19 +98,19 @@ def run_command(
             episodes=episodes,
             list_seed=list_seed,
             force=out.force,
-            settings=given.texts,
+            settings=changes.texts,
             on_progress=out.show_progress,
         )
         trained = result.trained
         own = objective_in_words(trained.training)
         count = "total" if plan.reward.harm_count == "total" else "first-impact"
         what = "policy" if len(chosen.learners) == 1 else f"team (scheme {trained.training.scheme})"
-        told = (
+        headline = (
             f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
             f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained {what} behind its shield. All minimise"
             f" {count} harm{f', but what is trained minimises {own}' if own else ''}.\n"
         )
-        out.result(result.results, Text(told), *result.tables)
+        out.result(result.results, Text(headline), *result.tables)
         for note in result.notes:
             out.note(note)
         if result.interrupted:
@@ -150,7 +150,7 @@ def train_command(
             "--other-versions", help="With --resume: go on although other versions trained it; numbers may differ."
         ),
     ] = False,
-    schema: schema_option("ethbrake_marl.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # made here
+    schema: schema_option("ethbrake_marl.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # built by a function
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -160,7 +160,7 @@ def train_command(
     command that evaluates it. Ctrl-C ends the training after the current update and keeps the policy;
     `ethbrake train --resume FOLDER` continues: the final policy is the same, bit for bit, as without the stop.
     """
-    with Out(as_json=as_json, force=force, kept=KEPT) as out:
+    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         if resume is not None:
             asked = {
                 "--scenario": scenario,
@@ -178,9 +178,9 @@ def train_command(
         if other_versions:
             raise InvalidInput("--other-versions: a new training has the versions of now; give it with --resume FOLDER")
         plan = training.load_recipe(recipe or "ppo")
-        given = training.read_settings(settings, [plan])
-        chosen = evaluation.load_runnable(scenario or "paper-random", given.scenario)
-        plan = given.change(plan, out.note)
+        changes = training.read_settings(settings, [plan])
+        chosen = evaluation.load_runnable(scenario or "paper-random", changes.scenario)
+        plan = changes.change(plan, out.note)
         begun = [training.Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
@@ -190,7 +190,7 @@ def train_command(
 
         folder = output or run_folder(chosen, plan, seed)
         result = training.train(
-            plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=given.texts
+            plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=changes.texts
         )
         _show(out, result, scenario)
 

@@ -64,5 +64,5 @@ class Algorithm(ABC):
 
         None if there is nothing to check.
         """
-        found: Tensor | None = getattr(model.policy, "log_std", None)
-        return None if found is None else found.detach()
+        log_std: Tensor | None = getattr(model.policy, "log_std", None)
+        return None if log_std is None else log_std.detach()

@@ -31,7 +31,7 @@ _KINDS = {
     "progress": str,
 }
 
-KEPT = 2  # checkpoints kept during a training, so that an older one remains if the last is damaged
+MOST_CHECKPOINTS = 2  # number of checkpoints during a training, so that an older one remains if the last is damaged
 
 
 class TrainingState(NamedTuple):
@@ -58,7 +58,7 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
         with (partial / ARRAYS).open("rb") as stream:
             numbers = state.numbers | {"sha256": _digest(stream, state.numbers)}
         write_file(partial / NUMBERS, json.dumps(numbers, allow_nan=False).encode())
-    for old in checkpoint_folders(folder.parent)[KEPT:]:
+    for old in checkpoint_folders(folder.parent)[MOST_CHECKPOINTS:]:
         remove_folder(old)
 
 
@@ -103,8 +103,8 @@ def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
 
 def checkpoint_folders(folder: Path) -> list[Path]:
     """Return the folders of all checkpoints inside ``folder``, newest first, without checking their content."""
-    found = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
-    return sorted(found, reverse=True)
+    paths = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
+    return sorted(paths, reverse=True)
 
 
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:

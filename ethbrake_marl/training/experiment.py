@@ -204,20 +204,20 @@ def compared_agents(
     """
     several = len(scenario.learners) > 1
     specs = (TEAM_BASELINES if several else BASELINES) if baselines is None else baselines
-    found = make_lineup(specs, scenario, harm_count=harm_count)
+    agents = make_lineup(specs, scenario, harm_count=harm_count)
     if not several:
         alone = LearnedAgent(next(iter(trained.drivers.values())), TRAINED_POLICY)
-        return {**found, TRAINED_POLICY: alone, SHIELDED: HybridAgent(alone, scenario, harm_count=harm_count)}
+        return {**agents, TRAINED_POLICY: alone, SHIELDED: HybridAgent(alone, scenario, harm_count=harm_count)}
     drivers: dict[int, Agent] = {
         i: LearnedAgent(trained.drivers[scenario.vehicle_names[i]], TRAINED_TEAM) for i in scenario.learners
     }
     team = Team(drivers, TRAINED_TEAM)
-    found[TRAINED_TEAM] = team
+    agents[TRAINED_TEAM] = team
     braking = make_agents(["full_brake"], scenario)["full_brake"]
     for i in scenario.learners:
         name = without(scenario.vehicle_names[i])
-        found[name] = Team({**drivers, i: braking}, name)
-    return {**found, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
+        agents[name] = Team({**drivers, i: braking}, name)
+    return {**agents, SHIELDED: shielded(team, scenario, "step", harm_count=harm_count)}
 
 
 def without(vehicle: str) -> str:
@@ -251,12 +251,12 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
     ``rows`` is the table. The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
     """
     lines = []
-    for told in (row.to_json() for row in rows):
-        parameters = told.pop("parameters")
-        for name, value in told.items():
+    for cells in (row.to_json() for row in rows):
+        parameters = cells.pop("parameters")
+        for name, value in cells.items():
             if isinstance(value, list | dict) and not name.endswith("_interval"):
-                told[name] = json.dumps(value, allow_nan=False)
-        lines.append({"scenario": parameters["scenario"], "seed": parameters["seed"], **told})
+                cells[name] = json.dumps(value, allow_nan=False)
+        lines.append({"scenario": parameters["scenario"], "seed": parameters["seed"], **cells})
     return csv_text(lines)
 
 

@@ -16,7 +16,7 @@ LOSSES = ("loss", "policy_loss", "value_loss", "policy_gradient_loss", "actor_lo
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """A reward, a loss, a gradient or a weight is no longer finite; the last good policy was kept."""
+    """A reward, a loss, a gradient or a weight is no longer finite; the last good policy was saved."""
 
 
 def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:

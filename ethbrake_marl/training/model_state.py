@@ -195,10 +195,10 @@ def check_counter(name: str, value: object, kind: type) -> None:
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
     """Return ``arrays[name]``; raise ``ValueError`` unless it is finite, and shaped and typed as ``model``."""
-    found = arrays[name]
-    if (found.shape, found.dtype) != (model.shape, model.dtype) or not np.isfinite(found).all():
+    array = arrays[name]
+    if (array.shape, array.dtype) != (model.shape, model.dtype) or not np.isfinite(array).all():
         raise ValueError(f"{name}: {model.shape} finite {model.dtype} are needed")
-    return found
+    return array
 
 
 def group_of(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:

@@ -47,15 +47,15 @@ def save_team(
     scheme: Scheme = "shared" if shared else "independent" if len(names) > 1 else "single"
     drivers = {name: bundle_of(scheme, name) for name in names}
     for bundle in dict.fromkeys(drivers.values()):
-        driven = tuple(name for name in names if drivers[name] == bundle)
-        layers, log_std = actors[driven[0]].mean, actors[driven[0]].log_std
-        place = scenario.vehicle_names.index(driven[0])
+        learners = tuple(name for name in names if drivers[name] == bundle)
+        layers, log_std = actors[learners[0]].mean, actors[learners[0]].log_std
+        place = scenario.vehicle_names.index(learners[0])
         Policy.make(
             {**tensors_of_layers("policy", layers), "policy.log_std": copy_of(log_std)},
             algorithm="ppo",
             network=network_of(layers),
             observation=engine.observation if shared else engine.observations[place],
-            learners=driven,
+            learners=learners,
             scenario=scenario.model_dump(mode="json"),
             reward=engine.reward.model_dump(mode="json"),
             seeds={"training": seed},

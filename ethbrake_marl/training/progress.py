@@ -42,12 +42,12 @@ class Course:
         return self.wall_before_s + time.monotonic() - self.started
 
     @property
-    def kept(self) -> Trained | None:
+    def chosen(self) -> Trained | None:
         """The policy to save as the result: the best one, or the last one if there was no evaluation yet."""
         return self.best or self.policy
 
     def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> None:
-        """Record an evaluation of ``policy``, and keep the policy if it is the best so far.
+        """Record an evaluation of ``policy``, and remember the policy if it is the best so far.
 
         Args:
             policy: the evaluated policy, at the current ``steps`` and ``updates``.

@@ -354,11 +354,11 @@ def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
 
     A key that the class declares without a description has the description of its base class.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
         for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():
-            found |= {key: field.description} if field.description else {}
-    return found
+            texts |= {key: field.description} if field.description else {}
+    return texts
 
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")

@@ -87,7 +87,8 @@ class RunDirectory:
     def write_status(self, status: RunStatus, **more: Any) -> None:
         """Replace ``run.json`` by this status.
 
-        The start time is kept; a status other than ``running`` also records the end time. ``more`` are other entries.
+        The start time does not change; a status other than ``running`` also records the end time. ``more`` are other
+        entries.
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {}
@@ -142,8 +143,10 @@ class RunDirectory:
             prefix: text before the names of metrics in ``evaluations`` and in the result: ``eval/`` for rows.
 
         """
-        found = evaluations and all(entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations)
-        return prefix + (cls.OBJECTIVE if found else cls.HARM[harm_count])
+        has_objective = evaluations and all(
+            entry.get(prefix + cls.OBJECTIVE) not in (None, "") for entry in evaluations
+        )
+        return prefix + (cls.OBJECTIVE if has_objective else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
         """Return the rows of ``progress.csv``, each as column -> text."""
@@ -154,10 +157,10 @@ class RunDirectory:
 
         Raises ``InvalidInput`` if none is recorded.
         """
-        kept = read_object(self.status).get("cpu_s") or {}
-        if not kept:
-            raise InvalidInput(f"{self.path}: tells no processor time; train again with this version")
-        return {int(steps): float(spent) for steps, spent in kept.items()}
+        recorded = read_object(self.status).get("cpu_s") or {}
+        if not recorded:
+            raise InvalidInput(f"{self.path}: records no processor time; train again with this version")
+        return {int(steps): float(spent) for steps, spent in recorded.items()}
 
     def column(self, name: str) -> dict[int, float]:
         """Return the column ``name`` of ``progress.csv`` as number of decisions -> value, without empty cells."""

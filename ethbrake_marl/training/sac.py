@@ -48,8 +48,8 @@ class Sac(Algorithm):
 
         These are ``actor``, ``critic`` and, if the entropy coefficient is learned, ``ent_coef``.
         """
-        found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
-        return found if model.ent_coef_optimizer is None else {**found, "ent_coef": model.ent_coef_optimizer}
+        optimizers = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
+        return optimizers if model.ent_coef_optimizer is None else {**optimizers, "ent_coef": model.ent_coef_optimizer}
 
     def learned_beside(self, model: Any) -> dict[str, Tensor]:
         """Return the logarithm of the model's entropy coefficient as ``log_ent_coef``; empty if it is fixed."""

@@ -248,9 +248,9 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     finally:
         model.logger.close()
     save(callback, status, reason)
-    assert course.policy is not None and course.kept is not None  # set before the first rollout
+    assert course.policy is not None and course.chosen is not None  # set before the first rollout
     return TrainResult(
-        run.path, training, course.kept, course.policy, status, course.steps, course.updates, course.wall_s,
+        run.path, training, course.chosen, course.policy, status, course.steps, course.updates, course.wall_s,
         tuple(course.evaluations),
     )  # fmt: skip
 
@@ -267,7 +267,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
 
     """
     run, training, course = callback.run, callback.learner.training, callback.course
-    for policy, folder in ((course.kept, run.policy), (course.policy, run.last_policy)):
+    for policy, folder in ((course.chosen, run.policy), (course.policy, run.last_policy)):
         if policy is not None:
             policy.save(folder, replace=True)
     left_over = () if status == "finished" else run.checkpoints.glob("step_*")
@@ -278,7 +278,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
         "cpu_s": {str(steps): round(spent, 3) for steps, spent in course.cpu_s.items()},
         "steps": course.steps,
         "updates": course.updates,
-        "policy_steps": None if course.kept is None else course.kept.steps,
+        "policy_steps": None if course.chosen is None else course.chosen.steps,
         "policy": run.policy.name if run.policy.is_dir() else None,
         "checkpoints": sorted(path.name for path in left_over),
     }

@@ -35,9 +35,9 @@ class Settings(NamedTuple):
             return recipe
         changed = recipe.replace(**Override.put(recipe.model_dump(mode="json"), own))
         together = {"gamma": changed.gamma, "reward.shaping_discount": changed.reward.shaping_discount}
-        given = [key for key in together if key in {override.key for override in own}]
-        if tell is not None and len(given) == 1 and len({*together.values()}) > 1:
-            (key,), (other,) = given, together.keys() - set(given)
+        changed_keys = [key for key in together if key in {override.key for override in own}]
+        if tell is not None and len(changed_keys) == 1 and len({*together.values()}) > 1:
+            (key,), (other,) = changed_keys, together.keys() - set(changed_keys)
             tell(
                 f"note: {key} = {together[key]:g}, but {other} stays {together[other]:g}: shaping leaves the best"
                 f" policy as it is only where both are equal (--set {other}={together[key]:g})"
@@ -65,7 +65,7 @@ def read_settings(
         "recipe": {key for recipe in recipes for key in type(recipe).model_fields} - _NO_SETTING,
         "agents": {*of_agents},
     }
-    found: dict[str, list[Override]] = {owner: [] for owner in known}
+    of_owner: dict[str, list[Override]] = {owner: [] for owner in known}
     for override in Override.parse(texts or ()):
         if override.top == "recipe" and len(override.path) > 1 and not recipes:
             raise InvalidInput(f"--set {override.key}: this command takes no recipe, so nothing of one can be set")
@@ -76,16 +76,16 @@ def read_settings(
             raise unknown_name("setting", inside.top, {key for each in whose for key in known[each]})
         if len(owners) > 1:
             raise InvalidInput(f"--set {override.key}: write scenario.{override.key} or recipe.{override.key}")
-        found[owners[0]].append(inside)
-    asked = {each.top: each.value for each in found["agents"]}
+        of_owner[owners[0]].append(inside)
+    asked = {each.top: each.value for each in of_owner["agents"]}
     check_harm_count(count := asked.get("harm_count", "first"))
     measures = asked.get("measures", "")
     if not isinstance(measures, str) or ("measures" in asked and not measures):
         raise InvalidInput("--set measures: must be names with commas between them, for instance measures=injury")
     return Settings(
         tuple(texts or ()),
-        tuple(found["scenario"]),
-        tuple(found["recipe"]),
+        tuple(of_owner["scenario"]),
+        tuple(of_owner["recipe"]),
         count,
         tuple(split_names(measures)) if measures else (),
     )

@@ -84,7 +84,7 @@ def load_team(
     name: str = "team",
     vehicles: Collection[int] | None = None,
 ) -> Team:
-    """Load the policies of a run as a team in which each vehicle is driven by the policy that it was trained with.
+    """Load the policies of a run as a team in which each policy controls the vehicle that it was trained for.
 
     Args:
         folder: folder of the run.

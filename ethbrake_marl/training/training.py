@@ -119,8 +119,8 @@ class Training:
         bundles: dict[str, list[str]] = {}
         for vehicle, bundle in self.drivers.items():
             bundles.setdefault(bundle, []).append(vehicle)
-        told = "; ".join(f"{bundle} drives {', '.join(vehicles)}" for bundle, vehicles in bundles.items())
-        return f"scheme {self.scheme}: {told}"
+        text = "; ".join(f"{bundle} drives {', '.join(vehicles)}" for bundle, vehicles in bundles.items())
+        return f"scheme {self.scheme}: {text}"
 
 
 def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
@@ -148,12 +148,12 @@ def check_same_training(run: RunDirectory, training: Training) -> None:
     recorded = recorded_training(run, read_object(run.config))
     if recorded.identity == training.identity:
         return
-    kept, wanted = recorded.content(), training.content()
+    there, wanted = recorded.content(), training.content()
     other = [
         f"{part} {key}"
         for part in wanted
-        for key in dict.fromkeys([*wanted[part], *kept[part]])
-        if key not in kept[part] or key not in wanted[part] or kept[part][key] != wanted[part][key]
+        for key in dict.fromkeys([*wanted[part], *there[part]])
+        if key not in there[part] or key not in wanted[part] or there[part][key] != wanted[part][key]
     ]
     raise InvalidInput(
         f"{run.path}: holds another training (here other: {', '.join(other)}); give another folder (--output)"

@@ -67,8 +67,8 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "scenario 'paper-random' has 0 learners (none); say which vehicle the agents drive": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER.replace(roles={}, early_impacts="keep")
     ),
-    "scenario 'paper-random': its learners are vehicle_2, vehicle_3, but only vehicle_2 is controlled": lambda: eb.evaluate(
-        WORLDS, BRAKE, scenario=PAPER.with_learners([1, 2]), vehicle=1
+    "scenario 'paper-random': its learners are vehicle_2, vehicle_3, but only vehicle_2 is controlled": lambda: (
+        eb.evaluate(WORLDS, BRAKE, scenario=PAPER.with_learners([1, 2]), vehicle=1)
     ),
     "reset: 3 worlds of 3 vehicles are given; 3 of 4 vehicles needed": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=FOUR
