@@ -295,7 +295,7 @@ def test_course__the_best_is_judged_by_the_count_of_the_reward_and_comes_back_fr
     course.add_evaluation(policy, {"first_impact_harm": 9.0, "total_harm": 10.0}, None)
     course.add_evaluation(other, second, -3.0)
     again.restore(course.to_json())
-    assert course.kept is policy  # by the harm, as it was begun without an objective
+    assert course.chosen is policy  # by the harm, as it was begun without an objective
     assert (again.evaluations, again.best_harm) == (course.evaluations, 10.0)
     assert again.wall_s >= course.wall_before_s
     assert course.evaluations[1] == {"steps": 0, "updates": 0, **second, "episode_return": -3.0}
@@ -307,7 +307,7 @@ def test_course__the_best_goes_by_the_objective_where_one_is_told(policy) -> Non
     for each, line, objective in zip(by_steps, (24.0, 30.0, 20.0, 18.0), (8.0, 0.1, 6.0, 7.0), strict=True):
         metrics = {"first_impact_harm": line, "objective": objective, "objective_vehicle_2": objective}
         course.add_evaluation(each, metrics, None)
-    assert course.kept is by_steps[1] and course.best_harm == 0.1
+    assert course.chosen is by_steps[1] and course.best_harm == 0.1
     for k, each in enumerate([*by_steps, *by_steps]):
         adversary.add_evaluation(each, {"first_impact_harm": 20.0 + k, "objective": -20.0 - k}, float(k))
     assert adversary.best_harm == -27.0
