@@ -255,7 +255,7 @@ def doctor_command(
 ) -> None:
     """Check this installation: versions, folders, physics.
 
-    One line per check, OK or FAIL; exit status 1 when any failed.
+    Prints one line per check, OK or FAIL. The exit status is 1 if a check failed.
     """
     with Out(as_json=as_json) as out:
         checks = diagnose(compile_all=compile_all)

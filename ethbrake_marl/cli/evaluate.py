@@ -323,7 +323,7 @@ _FILE = typer.Argument(
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    The second minus the first, for agents of the same name. Both must come from one command, and from the same worlds
+    Shows the second minus the first, for agents of the same name. Both must come from one command, and from the same worlds
     of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
     """
     with Out(as_json=as_json) as out:
@@ -357,10 +357,10 @@ def shield_command(
 ) -> None:
     """Compare agents without and behind the shield.
 
-    They drive the same worlds without a shield, in episode mode and in step mode; name them without a shield. The
-    shield bounds first-impact harm; with --set harm_count=total, total harm. If several vehicles learn: no shield,
-    step mode, and step mode with caps, for the whole team. Each decision that step mode replaced is simulated
-    again without the shield: needed (harm would have been higher), harmless (the same), costly (lower).
+    Each agent drives the same worlds without a shield, in episode mode and in step mode. Name agents without a shield.
+    The shield bounds first-impact harm; with --set harm_count=total, total harm. If several vehicles learn, the whole
+    team drives without a shield, in step mode, and in step mode with caps. Each decision that step mode replaced is
+    simulated again without the shield: needed (harm would have been higher), harmless (the same), costly (lower).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)

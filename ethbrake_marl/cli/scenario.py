@@ -66,8 +66,8 @@ def scenario_show(scenario: NameArgument) -> None:
 def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
-    Shows what is drawn and what may be a mistake, or what is wrong. The first worlds of its list are drawn, the
-    scripts drive, and learners brake fully.
+    Draws the first worlds of its list and runs them: scripts drive, learners brake fully. Shows the range of each
+    quantity and what may be a mistake, or what is wrong.
     """
     with Out(as_json=as_json) as out:
         scenario = evaluation.load_runnable(path)
@@ -153,7 +153,7 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
     """Describe a scenario in plain sentences.
 
-    Describes the line, how each quantity is drawn, who knows what when, and whose harm counts.
+    The sentences describe the line, how each quantity is drawn, who knows what when, and whose harm counts.
     """
     with Out(as_json=as_json) as out:
         chosen = evaluation.load_runnable(scenario)
@@ -274,7 +274,7 @@ def scenario_new(
 ) -> None:
     """Write a commented NAME.yaml with every key.
 
-    The rows of a table stand in NAME.csv beside it.
+    If the scenario has a table, its rows go to NAME.csv beside it.
     """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
@@ -291,7 +291,8 @@ def scenario_new(
 def scenario_parts(as_json: JsonOption = False) -> None:
     """List the names that scenarios and recipes may use.
 
-    Features of observations, V2X presets, objectives, training algorithms, recipes and measures, which rewards weigh.
+    These are features of observations, V2X presets, objectives, training algorithms, recipes and measures. A reward
+    is a weighted sum of measures.
     """
     from ethbrake_marl.game.features import FEATURES
     from ethbrake_marl.game.measures import MEASURES
@@ -317,7 +318,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
 def scenario_schema() -> None:
     """Print the JSON Schema of scenario files.
 
-    For editors that complete and check YAML.
+    Editors use it to complete and check YAML.
     """
     with Out() as out:
         out.print_json(scenarios.scenario_json_schema())

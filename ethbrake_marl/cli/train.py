@@ -72,10 +72,10 @@ def run_command(
 ) -> None:
     """Train one learner or a team, shield it, compare, and report.
 
-    Writes the run's folder: policies, results as CSV and JSON, every world, and the installed reports: three figures
-    and report.html; for one of the three tests (paper-random, -brake-only, -obstacle) also the other two; of a team
-    also who bears what, and what each learner and the messages add, for which more is trained. Ctrl-C ends the
-    training early, and what was trained so far is evaluated; a second Ctrl-C stops at once.
+    Writes the run's folder: policies, results as CSV and JSON, a row for every world, three figures and report.html.
+    If the scenario is one of the three tests (paper-random, -brake-only, -obstacle), the other two are evaluated too.
+    For a team, the report also shows who bears what, and what each learner and the messages add; this takes further
+    trainings. Ctrl-C ends the training early and evaluates the policy so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
