@@ -323,8 +323,8 @@ _FILE = typer.Argument(
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    Shows the second minus the first, for agents of the same name. Both must come from one command, and from the same worlds
-    of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
+    Shows the second minus the first, for agents of the same name. Both must come from one command, and from the same
+    worlds of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
     """
     with Out(as_json=as_json) as out:
         comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
