@@ -116,7 +116,7 @@ def show(found: eb.Evaluation, folder: Path) -> list[Any]:
     assert_type(eb.summarise(found), eb.SummaryTable)
     assert_type(eb.summarise_by(found, "scenario"), dict[str, eb.SummaryTable])
     figures = [deceleration_figure(curve), harm_against_total_gap(found)]
-    return [found.to_frame(), *figures]
+    return [found.to_pandas(), eb.summarise(found).to_pandas(), *figures]
 
 
 def play(level: eb.Scenario, worlds: eb.Worlds) -> float:

@@ -90,9 +90,9 @@ def run_command(arguments: Sequence[str]) -> int:
     except TyperException as error:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "ethbrake"
-        told = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
-        told = told.replace("Input should be", "must be").replace("a valid integer", "a whole number")
-        return _refuse(f"{told} (see: {where} --help)")
+        message = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
+        message = message.replace("Input should be", "must be").replace("a valid integer", "a whole number")
+        return _refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
     except OSError as error:
@@ -156,13 +156,13 @@ def tell_compilation(folder: Path, empty: bool) -> None:
     The report comes from a thread, because a single kernel may take a minute.
 
     Args:
-        folder: the cache folder of compiled kernels; a temporary one is not kept.
+        folder: the cache folder of compiled kernels; a temporary one is deleted at the end.
         empty: whether nothing was in that folder yet.
 
     """
-    kept = "the physics, once: minutes of one core" if empty else "what was not used before, once"
-    lost = "the physics; no folder can be written to keep it, so every command does (ethbrake doctor)"
-    Out().note(f"compiling {lost if is_temporary(folder) else f'{kept}, then it is kept'}")
+    once = "the physics, once: minutes of one core" if empty else "new parts of the physics, once"
+    always = "the physics; no folder can be written to store it, so every command compiles it again (ethbrake doctor)"
+    Out().note(f"compiling {always if is_temporary(folder) else f'{once}; the result is stored'}")
     from numba.core import event  # imported here, because commands that compile nothing do not load numba
 
     events: Any = event  # numba has no types for it
@@ -207,12 +207,12 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
     """
     if isinstance(command, typer.Typer):
-        given = command
+        group = command
     else:
-        given = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-        given.command(epilog=epilog)(command)
-    made = get_command(given)
-    COMMANDS.add(name, made, lambda other: other is made)
+        group = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+        group.command(epilog=epilog)(command)
+    built = get_command(group)
+    COMMANDS.add(name, built, lambda other: other is built)
 
 
 def _names() -> list[str]:
@@ -241,13 +241,13 @@ class Installed(TyperCommand):
 
     def command(self) -> Any:
         """Import the actual command of the entry point, and return it as a Typer (click) command."""
-        found = COMMANDS[self.entry]
-        found.name = self.name
-        return with_installed(found, self.entry)
+        command = COMMANDS[self.entry]
+        command.name = self.name
+        return with_installed(command, self.entry)
 
-    def make_context(self, *given: Any, **settings: Any) -> Any:
+    def make_context(self, *arguments: Any, **settings: Any) -> Any:
         """Return the context in which the actual command runs; the arguments are those of Typer's own method."""
-        return self.command().make_context(*given, **settings)
+        return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
         """Return the command's line, of at most ``limit`` characters, in the list of commands.

@@ -71,8 +71,8 @@ def schema_option(module: str, model: str, kind: str) -> Any:
             Out().print_json(getattr(import_module(module), model).json_schema())
             raise typer.Exit
 
-    told = f"Print the JSON Schema of {kind} files, and exit."
-    return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=told)]
+    text = f"Print the JSON Schema of {kind} files, and exit."
+    return Annotated[bool, typer.Option("--schema", is_eager=True, callback=show_schema, help=text)]
 
 
 def example(*lines: str) -> str:
@@ -94,12 +94,12 @@ class Out:
     Args:
         as_json: print results as JSON.
         force: replace existing files.
-        kept: sentence, without its capital, that tells the user after Ctrl-C what remains.
+        remains: sentence, without its capital, that says after Ctrl-C what remains.
 
     """
 
-    def __init__(self, *, as_json: bool = False, force: bool = False, kept: str = "nothing was written") -> None:
-        self.as_json, self.force, self.kept = as_json, force, kept
+    def __init__(self, *, as_json: bool = False, force: bool = False, remains: str = "nothing was written") -> None:
+        self.as_json, self.force, self.remains = as_json, force, remains
         self._stdout = sys.stdout
         self._stderr: Console = _PlainConsole(sys.stderr)
         self._bars: Progress | None = None
@@ -124,7 +124,7 @@ class Out:
         self._turned.__exit__(kind, error, trace)
         self.end_progress()
         if isinstance(error, KeyboardInterrupt):
-            self.interrupted(f"interrupted; {self.kept}")
+            self.interrupted(f"interrupted; {self.remains}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
         """Print the result of the command on stdout.
@@ -190,9 +190,9 @@ class Out:
         if what is not None:
             self.note(f"{what}: {path}")
 
-    def interrupted(self, told: str) -> NoReturn:
-        """Print ``told`` as one line on stderr, and end the command with status 130, as after Ctrl-C."""
-        self.note(told)
+    def interrupted(self, text: str) -> NoReturn:
+        """Print ``text`` as one line on stderr, and end the command with status 130, as after Ctrl-C."""
+        self.note(text)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:

@@ -114,15 +114,15 @@ def _dependencies() -> Iterator[Check]:
         name = requirement.name
         wanted = f"needs {requirement.specifier}"
         try:
-            found = version(name)
+            installed = version(name)
         except PackageNotFoundError:
             what = f"is not installed; the extra {extra} brings it" if extra else f"is not installed; {wanted}"
             yield Check(name, bool(extra), what)
             continue
         tested = pinned.get(name.lower())
-        note = f" (tested with {tested})" if tested and Version(found).public != Version(tested).public else ""
-        fits = requirement.specifier.contains(found, prereleases=True)
-        yield Check(name, fits, f"{found}{note}" if fits else f"{found}; {wanted}{note}")
+        note = f" (tested with {tested})" if tested and Version(installed).public != Version(tested).public else ""
+        fits = requirement.specifier.contains(installed, prereleases=True)
+        yield Check(name, fits, f"{installed}{note}" if fits else f"{installed}; {wanted}{note}")
 
 
 def _requirements() -> list[tuple[str, Requirement]]:
@@ -164,8 +164,8 @@ def _kernel_cache() -> tuple[bool, str]:
 def _scenarios() -> tuple[bool, str]:
     from ethbrake_marl.scenario.catalogue import list_scenarios, shipped_folder
 
-    found = [entry for entry in list_scenarios() if entry.shipped]
-    return len(found) > 0, f"{len(found)} in {shipped_folder()}"
+    shipped = [entry for entry in list_scenarios() if entry.shipped]
+    return len(shipped) > 0, f"{len(shipped)} in {shipped_folder()}"
 
 
 def _golden_impact() -> tuple[bool, str]:
@@ -203,9 +203,9 @@ def _golden_baseline() -> tuple[bool, str]:
         latency_s=np.array([0.0, 0.5, 0.8]), mass_t=5.0, restitution=0.1,
     )  # fmt: skip
     best = optimise_pairwise(world, 1)
-    found = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
+    computed = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
     wanted = "5.17021 m/s2, harm 4.03447"
-    return found == wanted, f"E-V2X-BM at gaps 7 and 7 m: {found} (known: {wanted})"
+    return computed == wanted, f"E-V2X-BM at gaps 7 and 7 m: {computed} (known: {wanted})"
 
 
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
@@ -219,7 +219,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
     """
     if is_temporary(cache_folder()):
-        return False, "no folder can be written to keep what is compiled; set NUMBA_CACHE_DIR to a writable folder"
+        return False, "no folder can be written to store what is compiled; set NUMBA_CACHE_DIR to a writable folder"
     begun, failed = perf_counter(), []
     doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
     doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _IN_PYTHON, "in Python")]
@@ -229,9 +229,9 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
         while waiting:
             done, waiting = wait(waiting, EVERY_S, FIRST_COMPLETED)
             failed += [f"{called[future]} failed: {future.result()}" for future in done if future.result()]
-            kept = sum(1 for _ in cache_folder().iterdir())
+            files = sum(1 for _ in cache_folder().iterdir())
             Out().note(
-                f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {kept} files in the cache"
+                f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {files} files in the cache"
             )
     for failure in failed:
         Out().note(f"compile: {failure}")
@@ -255,7 +255,7 @@ def doctor_command(
 ) -> None:
     """Check this installation: versions, folders, physics.
 
-    One line per check, OK or FAIL; exit status 1 when any failed.
+    Prints one line per check, OK or FAIL. The exit status is 1 if a check failed.
     """
     with Out(as_json=as_json) as out:
         checks = diagnose(compile_all=compile_all)

@@ -56,11 +56,11 @@ def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
 
 
-def _task_of(scenario: str, given: Settings) -> Task:
+def _task_of(scenario: str, chosen_settings: Settings) -> Task:
     from ethbrake_marl.scenario.task import Task
 
-    chosen = evaluation.load_runnable(scenario, given.scenario, drives="some")
-    return Task(chosen, chosen.learners, given.harm_count)
+    chosen = evaluation.load_runnable(scenario, chosen_settings.scenario, drives="some")
+    return Task(chosen, chosen.learners, chosen_settings.harm_count)
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def evaluate_command(
 
     `ethbrake agent list` shows all agents; ladder stands for all of them from coast to best_harm. Behind any agent:
     +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
-    PATH is a run or a policy bundle. +robust needs an uncertainty, which is given in Python;
+    PATH is a run or a policy bundle. +robust needs an uncertainty, which only Python can set;
     +robust:estimated needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
     impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
     """
@@ -112,18 +112,18 @@ def evaluate_command(
     with Out(as_json=as_json, force=force) as out:
         _check_outputs(out, output, per_world, report=report)
         write_page = page_of("evaluation", "--report") if report else None
-        given = training.read_settings(settings, of_agents=("harm_count", "measures"))
+        chosen = training.read_settings(settings, of_agents=("harm_count", "measures"))
         if group := scenarios.group_of_scenarios(scenario):
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
             for option in (name for name, value in other.items() if value):
                 raise InvalidInput(f"{option}: {scenario} is a group of {len(group)} scenarios; give one of them")
-            if given.measures:
+            if chosen.measures:
                 raise InvalidInput(f"--set measures: {scenario} is a group of {len(group)} scenarios; give one of them")
-            _evaluate_group(out, output, [_task_of(name, given) for name in group], agents, episodes, seed)
+            _evaluate_group(out, output, [_task_of(name, chosen) for name in group], agents, episodes, seed)
             return
-        task = _task_of(scenario, given)
+        task = _task_of(scenario, chosen)
         lineup = evaluation.Lineup.of(
-            split_specs(agents), task.scenario, harm_count=task.harm_count, measures=given.measures
+            split_specs(agents), task.scenario, harm_count=task.harm_count, measures=chosen.measures
         )
         used = {"harm_count": task.harm_count}
         seed = evaluation.LIST_SEED if seed is None else seed
@@ -135,14 +135,14 @@ def evaluate_command(
             sample = task.scenario.sample(episodes, seed)
             evaluation.check_agents(lineup.make(), sample.worlds, task.scenario, warn=True)
             tell = _tell_worlds(out, sample.worlds.n)
-            found = evaluation.evaluate_held(lineup, sample, seed, jobs=jobs, ray=ray, on_done=tell)
-            summary = evaluation.summarise(found)
-            beside_it = _write_worlds(out, output, found, per_world)
+            result = evaluation.evaluate_held(lineup, sample, seed, jobs=jobs, ray=ray, on_done=tell)
+            summary = evaluation.summarise(result)
+            beside_it = _write_worlds(out, output, result, per_world)
             results = evaluation.results_to_json(summary, per_world=beside_it, settings=used)
             if write_page is not None and output is not None:
                 output.mkdir(parents=True, exist_ok=True)
                 write_page(
-                    output / REPORT, found, summary, lineup.make(), harm_count=task.harm_count, force=out.force,
+                    output / REPORT, result, summary, lineup.make(), harm_count=task.harm_count, force=out.force,
                     tell=lambda done, total: out.progress("report: episodes", done, total),
                 )  # fmt: skip
                 out.note(f"report: {output / REPORT}")
@@ -187,7 +187,7 @@ def _evaluate_group(
         seed: seed of the worlds; None: the standard seed.
 
     """
-    told: list[dict[str, Any]] = []
+    objects: list[dict[str, Any]] = []
     rows: list[Any] = []
     seed = evaluation.LIST_SEED if seed is None else seed
     more = [each.group_column for each in evaluation.MEASURE_SETS.values() if each.group_column]
@@ -196,10 +196,10 @@ def _evaluate_group(
         sample = chosen.sample(GROUP_EPISODES if episodes is None else episodes, seed)
         lineup = make_drivers(agents, task)
         evaluation.check_agents(lineup, sample.worlds, chosen)
-        found = evaluation.evaluate(sample, lineup, scenario=chosen, seed=seed)
+        result = evaluation.evaluate(sample, lineup, scenario=chosen, seed=seed)
         rows.append(chosen.name)
-        for row in evaluation.summarise(found):
-            outcome, shares = found.outcome(row.agent), [row[each.measures[task.harm_count]] for each in more]
+        for row in evaluation.summarise(result):
+            outcome, shares = result.outcome(row.agent), [row[each.measures[task.harm_count]] for each in more]
             hardest = 3.6 * math.sqrt(outcome.ledger.pair_harm("first").max(initial=0.0))
             each: dict[str, Any] = {
                 "passed": not outcome.collided.any(),
@@ -212,7 +212,7 @@ def _evaluate_group(
             rows.append((row.agent, "passed" if each["passed"] else "failed", *shown, *shares))
             for head, share in zip(more, shares, strict=True):
                 each[head.column.name] = None if share is None else share.to_json()
-            told.append({"scenario": chosen.name, "agent": row.agent, "worlds": found.worlds.n, **each})
+            objects.append({"scenario": chosen.name, "agent": row.agent, "worlds": result.worlds.n, **each})
     columns: list[Column | str] = [
         "Agent",
         "Result",
@@ -224,12 +224,12 @@ def _evaluate_group(
     ]
     counted = "first-impact" if group[0].harm_count == "first" else "total"
     note = (
-        f"{found.worlds.n:,} worlds of each, seed {seed}; `ethbrake scenario explain` tells their parameters."
-        " Passed: nobody collides, in no world. Harms: means per world in m²/s². Hardest: the closing speed of a pair."
-        + "".join(f" {each.note.format(harm=counted)}" for each in more)
+        f"{result.worlds.n:,} worlds of each, seed {seed}; `ethbrake scenario explain` shows their parameters."
+        " Passed: no vehicle collides in any world. Harms: means per world in m²/s². Hardest: the largest"
+        " closing speed of a pair." + "".join(f" {each.note.format(harm=counted)}" for each in more)
     )
-    _write_results(out, output, told)
-    out.result(told, Sheet("", columns, rows, note))
+    _write_results(out, output, objects)
+    out.result(objects, Sheet("", columns, rows, note))
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
@@ -238,7 +238,7 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
     ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files are requested; they need a folder.
     """
     if output is None:
-        for option in (name for name, given in (("--per-world", per_world), ("--report", report)) if given):
+        for option in (name for name, value in (("--per-world", per_world), ("--report", report)) if value):
             raise InvalidInput(f"{option}: needs a folder for it: --output FOLDER")
         return
     if per_world == "parquet":
@@ -246,7 +246,7 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
     check_folder(output, _FILES, force=out.force)
 
 
-def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, per_world: str | None) -> Path | None:
+def _write_worlds(out: Out, output: Path | None, result: evaluation.Evaluation, per_world: str | None) -> Path | None:
     """Write the file with one row per world and agent into the folder ``output``, and return its path.
 
     ``per_world`` is the format, ``csv`` or ``parquet``. If it or ``output`` is None, return None.
@@ -255,7 +255,7 @@ def _write_worlds(out: Out, output: Path | None, found: evaluation.Evaluation, p
         return None
     file = output / f"{WORLDS}.{per_world}"
     output.mkdir(parents=True, exist_ok=True)
-    evaluation.write_per_world(file, found, force=out.force)
+    evaluation.write_per_world(file, result, force=out.force)
     out.note(f"every world: {file}")
     return file
 
@@ -288,11 +288,11 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
         horizon_s: time of the horizon (s).
 
     """
-    found = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
-    if found:
+    text = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
+    if text:
         out.note(
             f"note: bounds of the shield end at the horizon ({horizon_s:g} s) and say nothing of what comes after;"
-            f" worlds, of {worlds}, that were not at rest then: {found}"
+            f" worlds, of {worlds}, that were not at rest then: {text}"
         )
 
 
@@ -312,25 +312,25 @@ _FILE = typer.Argument(
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    The second minus the first, for agents of the same name. Both must come from one command, and from the same worlds
-    of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
+    Shows the second minus the first, for agents of the same name. Both must come from one command, and from the same
+    worlds of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
     """
     with Out(as_json=as_json) as out:
-        found = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
-        names = [_HARMS[name] for name in found.differences[0].harms]
-        rows = [[each.marked, _POLICIES[each.policy], *each.harms.values()] for each in found.differences]
-        out.result(found.to_json(), Sheet("", ["Agent", Column("Policy", text=True), *map(Column, names)], rows))
+        comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
+        names = [_HARMS[name] for name in comparison.differences[0].harms]
+        rows = [[each.marked, _POLICIES[each.policy], *each.harms.values()] for each in comparison.differences]
+        out.result(comparison.to_json(), Sheet("", ["Agent", Column("Policy", text=True), *map(Column, names)], rows))
         out.note("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
-        why = found.unpaired_because
-        by = evaluation.Conditions(recordings=found.recordings).by_recording
+        why = comparison.unpaired_because
+        by = evaluation.Conditions(recordings=comparison.recordings).by_recording
         how = "paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}"
         out.note(f"{how}{by}")
-        if found.exploits_line:
-            out.note(found.exploits_line)
-        for which, agents in zip(("first", "second"), found.left_over, strict=True):
+        if comparison.exploits_line:
+            out.note(comparison.exploits_line)
+        for which, agents in zip(("first", "second"), comparison.left_over, strict=True):
             if agents:
                 out.note(f"in the {which} only: {', '.join(agents)}")
-        for name, both in {**found.other_settings, **found.other_versions}.items():
+        for name, both in {**comparison.other_settings, **comparison.other_versions}.items():
             if "SHA-256 " in f"{both[0]}{both[1]}":  # the hash of a file, which only --json shows
                 out.note(f"note: {name} {'was read for one of the two' if None in both else 'changed between the two'}")
             else:
@@ -346,10 +346,10 @@ def shield_command(
 ) -> None:
     """Compare agents without and behind the shield.
 
-    They drive the same worlds without a shield, in episode mode and in step mode; name them without a shield. The
-    shield bounds first-impact harm; with --set harm_count=total, total harm. If several vehicles learn: no shield,
-    step mode, and step mode with caps, for the whole team. Each decision that step mode replaced is simulated
-    again without the shield: needed (harm would have been higher), harmless (the same), costly (lower).
+    Each agent drives the same worlds without a shield, in episode mode and in step mode. Name agents without a shield.
+    The shield bounds first-impact harm; with --set harm_count=total, total harm. If several vehicles learn, the whole
+    team drives without a shield, in step mode, and in step mode with caps. Each decision that step mode replaced is
+    simulated again without the shield: needed (harm would have been higher), harmless (the same), costly (lower).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)
@@ -380,5 +380,5 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
     """Print in one line on stderr which of ``whole`` worlds were left out, if there are any."""
     if left_out:
-        told = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
-        out.note(evaluation.LeftOut.line(told, whole))
+        texts = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
+        out.note(evaluation.LeftOut.line(texts, whole))

@@ -66,41 +66,41 @@ def scenario_show(scenario: NameArgument) -> None:
 def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
-    Shows what is drawn and what may be a mistake, or what is wrong. The first worlds of its list are drawn, the
-    scripts drive, and learners brake fully.
+    Draws the first worlds of its list and runs them: scripts drive, learners brake fully. Shows the range of each
+    quantity and what may be a mistake, or what is wrong.
     """
     with Out(as_json=as_json) as out:
         scenario = evaluation.load_runnable(path)
         sample = scenario.sample(TRIED_WORLDS, evaluation.LIST_SEED)
         n, names = sample.worlds.n, [scenario.vehicle_names[i] for i in scenario.learners]
         ranges, fixed, quantities = _drawn_lines(scenario, sample)
-        found = evaluation.try_scenario(scenario, sample.worlds)
-        told = {
-            "name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **found,
+        trial = evaluation.try_scenario(scenario, sample.worlds)
+        content = {
+            "name": scenario.name, "vehicles": scenario.vehicles, "learners": names, "worlds": n, **trial,
             "rejected": sample.rejected, "quantities": quantities,
             "kinds": {kind: dict(Counter(drawn.tolist())) for kind, drawn in sample.kinds.items()},
         }  # fmt: skip
-        odd, beyond, late = (found[each] for each in ("not_state_free", "commands_out_of_range", "vehicle_1_late"))
+        odd, beyond, late = (trial[each] for each in ("not_state_free", "commands_out_of_range", "vehicle_1_late"))
         head, *notes = (
             f"{'NOT OK' if beyond else 'OK'}  {scenario.name}: {scenario.vehicles} vehicles, learners:"
             f" {', '.join(names) or 'none'}; tried in {n} worlds",
             sample.count_kinds().removeprefix("; "),
             f"early impacts: {_share(sample.rejected, sample.rejected + n, 'draws')} refused,"
-            f" {_share(found['early_impacts'], n)} kept",
+            f" {_share(trial['early_impacts'], n)} kept",
             f"at the horizon ({scenario.horizon_s:g} s) something still moves in"
-            f" {_share(found['moving_at_horizon'], n)}"
-            + ("; what comes after counts nowhere, a longer horizon_s sees more" if found["moving_at_horizon"] else ""),
+            f" {_share(trial['moving_at_horizon'], n)}"
+            + ("; what comes after counts nowhere, a longer horizon_s sees more" if trial["moving_at_horizon"] else ""),
             f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}"
             if late and scenario.alert_s is None
             else "",
             "; ".join(f"{each} asks for more than it can in {_share(len(rows), n)}" for each, rows in beyond.items()),
             f"not state-free: {', '.join(f'{each} ({script})' for each, script in odd.items())}; therefore refused by"
-            f" {', '.join(found['refused_by']) or 'nothing'}"
+            f" {', '.join(trial['refused_by']) or 'nothing'}"
             if odd
             else "",
         )
         above, below = _folded(head, 2) + ranges, [line for note in notes for line in _folded(note, 3)]
-        out.result(told, *above, *_folded(fixed, max(SCREEN - len(above) - len(below), 1)), *below)
+        out.result(content, *above, *_folded(fixed, max(SCREEN - len(above) - len(below), 1)), *below)
         if beyond:
             (vehicle, rows), *_ = beyond.items()
             raise InvalidInput(
@@ -132,12 +132,12 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
         for key, rule in scenarios.QUANTITY.of(worlds).items()
         if key not in ranges and not np.ptp(rule.of(worlds), axis=0).all()
     }
-    told = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
+    texts = (f"{key} {each[0] if len(set(each)) == 1 else ', '.join(each)}" for key, each in others.items())
     columns = {
         name: dict(zip(("least", "median", "largest"), np.nanquantile(drawn, (0.0, 0.5, 1.0)).tolist(), strict=True))
         for name, drawn in scenarios.QUANTITY.columns(worlds).items()
     }
-    return lines, f"fixed: {'; '.join(told)}" if others else "", columns
+    return lines, f"fixed: {'; '.join(texts)}" if others else "", columns
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
@@ -153,12 +153,15 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
     """Describe a scenario in plain sentences.
 
-    Describes the line, how each quantity is drawn, who knows what when, and whose harm counts.
+    The sentences describe the line, how each quantity is drawn, who knows what when, and whose harm counts.
     """
     with Out(as_json=as_json) as out:
         chosen = evaluation.load_runnable(scenario)
-        told = [each for each in _sentences(chosen) if each]
-        out.result({"name": chosen.name, "sentences": told}, *(line for each in told for line in _folded(each, 4, 100)))
+        sentences = [each for each in _sentences(chosen) if each]
+        out.result(
+            {"name": chosen.name, "sentences": sentences},
+            *(line for each in sentences for line in _folded(each, 4, 100)),
+        )
 
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
@@ -186,14 +189,14 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
         yield f"Each world takes one of {rows:,} rows of a table{of}: {columns}."
     for name, kind in (scenario.vehicle_types or {}).items():
         own = {scenarios.QUANTITY.declared[key].label: getattr(kind, key) for key in scenarios.QUANTITY.of_a_type}
-        told = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
-        told += f"; V2X {flow_text(kind.v2x)}" if kind.v2x is not None else ""
-        told = told.removeprefix("; ") or "as beside the types"
-        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {told}."
+        text = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
+        text += f"; V2X {flow_text(kind.v2x)}" if kind.v2x is not None else ""
+        text = text.removeprefix("; ") or "as beside the types"
+        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {text}."
     yield f"Types along the line: {flow_text(scenario.types or 'any')}." if scenario.vehicle_types else ""
     for key, rule in scenarios.QUANTITY.declared.items():
-        told = _declared_in_words(scenario, key)
-        yield f"{rule.label[0].upper()}{rule.label[1:]}: {told}; {rule.meaning}." if told else ""
+        text = _declared_in_words(scenario, key)
+        yield f"{rule.label[0].upper()}{rule.label[1:]}: {text}; {rule.meaning}." if text else ""
     common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # same for all members
     yield _news_in_words(scenario) if "v2x" in common else "Who knows what when (V2X) differs between these scenarios."
     early = "stays in the list" if scenario.early_impacts == "keep" else f"is drawn again{_refused(scenario)}"
@@ -225,18 +228,18 @@ def _obstacle_in_words(scenario: scenarios.Scenario) -> str:
 def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
     """Describe how the quantity ``key`` is drawn; empty if the scenario does not declare it."""
     if scenario.members:
-        told = key in scenarios.QUANTITY.usual or (
+        is_common = key in scenarios.QUANTITY.usual or (
             key == "friction" and all(each.declares(key) for each in scenario.members)
         )
-        ends = [end for each in (scenario.bounds(key) if told else ()) for end in each]
+        ends = [end for each in (scenario.bounds(key) if is_common else ()) for end in each]
         return " to ".join(dict.fromkeys(f"{end(ends):.4g}" for end in (min, max))) if ends else ""
-    given = getattr(scenario, key)
-    if given is None or (key in scenarios.QUANTITY.otherwise and key not in scenario.model_fields_set):
+    value = getattr(scenario, key)
+    if value is None or (key in scenarios.QUANTITY.otherwise and key not in scenario.model_fields_set):
         return ""
-    if isinstance(given, tuple):
-        return ", ".join(map(_in_words, given))
+    if isinstance(value, tuple):
+        return ", ".join(map(_in_words, value))
     per = scenarios.QUANTITY.declared[key].per
-    return _in_words(given) + ("" if isinstance(given, float) or per == "world" else f", drawn for each {per}")
+    return _in_words(value) + ("" if isinstance(value, float) or per == "world" else f", drawn for each {per}")
 
 
 def _in_words(quantity: Any) -> str:
@@ -245,9 +248,9 @@ def _in_words(quantity: Any) -> str:
         return f"{quantity:g}"
     (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
     inner, ends = (shape, quantity.support) if isinstance(shape, dict) else (dict(more), shape)
-    told = [f"{name} {flow_text(each)}" for name, each in inner.items() if name not in ("low", "high")]
+    details = [f"{name} {flow_text(each)}" for name, each in inner.items() if name not in ("low", "high")]
     values = (" or " if kind == "choice" else " to ").join(f"{each:g}" for each in ends)
-    return f"{values} ({', '.join([kind.replace('_', ' '), *told])})"
+    return f"{values} ({', '.join([kind.replace('_', ' '), *details])})"
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
@@ -255,9 +258,9 @@ def _news_in_words(scenario: scenarios.Scenario) -> str:
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
-    told = "; ".join(f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items())
-    told += f"; {flow_text(scenario.v2x.vehicles)}" if scenario.v2x.vehicles else ""
-    return f"V2X preset {scenario.v2x.preset}: {told or 'from its latency on each vehicle knows the whole line'}."
+    text = "; ".join(f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items())
+    text += f"; {flow_text(scenario.v2x.vehicles)}" if scenario.v2x.vehicles else ""
+    return f"V2X preset {scenario.v2x.preset}: {text or 'from its latency on each vehicle knows the whole line'}."
 
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
@@ -271,7 +274,7 @@ def scenario_new(
 ) -> None:
     """Write a commented NAME.yaml with every key.
 
-    The rows of a table stand in NAME.csv beside it.
+    If the scenario has a table, its rows go to NAME.csv beside it.
     """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
@@ -288,7 +291,8 @@ def scenario_new(
 def scenario_parts(as_json: JsonOption = False) -> None:
     """List the names that scenarios and recipes may use.
 
-    Features of observations, V2X presets, objectives, training algorithms, recipes and measures, which rewards weigh.
+    These are features of observations, V2X presets, objectives, training algorithms, recipes and measures. A reward
+    is a weighted sum of measures.
     """
     from ethbrake_marl.game.features import FEATURES
     from ethbrake_marl.game.measures import MEASURES
@@ -314,7 +318,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
 def scenario_schema() -> None:
     """Print the JSON Schema of scenario files.
 
-    For editors that complete and check YAML.
+    Editors use it to complete and check YAML.
     """
     with Out() as out:
         out.print_json(scenarios.scenario_json_schema())
@@ -379,20 +383,20 @@ def agent_list(as_json: JsonOption = False) -> None:
         from ethbrake_marl.agents.protocol import Knowledge
         from ethbrake_marl.agents.registry import agent_entries, agents_refused
 
-        told, rows = [], []
+        content, rows = [], []
         for entry in agent_entries():
             knows, added = Knowledge.of(entry), "also " if entry.form.startswith("+") else ""
-            told.append(
+            content.append(
                 {"agent": entry.form, "about": entry.about, "knows": list(knows), "omniscient": knows.sees_through}
             )
             rows.append((entry.form, entry.about, f"{added}{knows.text}{' †' if knows.sees_through else ''}"))
         for reason in agents_refused():
             out.note(f"left out: {reason}")
         out.result(
-            told,
+            content,
             Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
             "† omniscient: reads what no channel brought. With :estimated behind it, it decides on what was received.",
-            "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.",
+            "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/evaluate.md and docs/shield.md.",
         )
 
 

@@ -53,7 +53,7 @@ class Lineup:
         harm_count: harm that agents minimise: each pair's first impact only (``first``) or all impacts (``total``).
         uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.
         measures: names or ``FILE:NAME`` of user measures to load, as ``load_measures`` takes them.
-        told: names of all user measures that the evaluation reports; measures registered later are not added.
+        reported: names of all user measures that the evaluation reports; measures registered later are not added.
         sets: names of the sets of measures in the requesting process.
         same: hash of everything that must be equal in every process; see ``Lineup.of``.
         packages: name and version of each package that provided a part in the requesting process; workers must have the
@@ -66,7 +66,7 @@ class Lineup:
     harm_count: HarmCount = "first"
     uncertainty: str | None = None
     measures: tuple[str, ...] = ()
-    told: tuple[str, ...] = ()
+    reported: tuple[str, ...] = ()
     sets: tuple[str, ...] = ()
     same: str = ""
     packages: Mapping[str, str] = field(default_factory=dict)
@@ -87,11 +87,11 @@ class Lineup:
         """
         load_measures(how.pop("measures", ()))
         sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
-        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), told=tuple(REPORTED), sets=sets, **how)
-        made = lineup._make_anew()
-        same = lineup._same(made)
+        lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), reported=tuple(REPORTED), sets=sets, **how)
+        drivers = lineup._make_anew()
+        same = lineup._same(drivers)
         _MADE.clear()
-        _MADE[same] = made
+        _MADE[same] = drivers
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
@@ -101,24 +101,30 @@ class Lineup:
         """
         if self.same not in _MADE:
             load_measures(self.measures)
-            made = self._make_anew()
-            same = self._same(made) == self.same and {*self.told} <= REPORTED.keys() and {*self.sets} <= {*MEASURE_SETS}
+            drivers = self._make_anew()
+            same = (
+                self._same(drivers) == self.same
+                and {*self.reported} <= REPORTED.keys()
+                and {*self.sets} <= {*MEASURE_SETS}
+            )
             if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
                     "evaluate: a worker has other policies, measures or versions than the process that asks it;"
                     " install the same everywhere, and change no file while an evaluation runs"
                 )
             _MADE.clear()
-            _MADE[self.same] = made
+            _MADE[self.same] = drivers
         return _MADE[self.same]
 
     def _make_anew(self) -> Mapping[str, Driver]:
         return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=self.uncertainty)
 
-    def _same(self, made: Mapping[str, Driver]) -> str:
-        policies = {name: policies_of(Team.of(agent, self.scenario.learners).drivers) for name, agent in made.items()}
+    def _same(self, drivers: Mapping[str, Driver]) -> str:
+        policies = {
+            name: policies_of(Team.of(agent, self.scenario.learners).drivers) for name, agent in drivers.items()
+        }
         asked = self.harm_count, self.uncertainty, scenario_sha256(self.scenario)
-        text = json.dumps([asked, policies, self._digests(), self.told, own_versions()], sort_keys=True)
+        text = json.dumps([asked, policies, self._digests(), self.reported, own_versions()], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
@@ -164,14 +170,16 @@ def evaluate_held(
 
 
 def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evaluation:
-    found = drive_chunk(part, lineup.make(), lineup.scenario, seed, lineup.scenario.learners, first)
-    return replace(found, outcomes={agent: _only(each, lineup.told) for agent, each in found.outcomes.items()})
+    evaluation = drive_chunk(part, lineup.make(), lineup.scenario, seed, lineup.scenario.learners, first)
+    return replace(
+        evaluation, outcomes={agent: _only(each, lineup.reported) for agent, each in evaluation.outcomes.items()}
+    )
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
     """Return the outcome without user measures (``Outcome.metrics``) other than those called ``names``."""
-    kept = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
-    return replace(outcome, metrics=kept)
+    metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
+    return replace(outcome, metrics=metrics)
 
 
 def tally_list(

@@ -11,7 +11,7 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.exploits import MARK, Exploits
-from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, told_of
+from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, recorded_value
 from ethbrake_marl.evaluation.statistics import Texts, paired_difference, unpaired_difference
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.physics.state import Floats
@@ -59,13 +59,13 @@ class Comparison:
 
         It says in which result they do; it is empty if no agent does.
         """
-        found: dict[str, Exploits] = {}
+        of_agents: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
             same = {each.agent: first}
             apart = {f"{each.agent} in the first": first, f"{each.agent} in the second": second}
-            found |= same if first == second else apart
-        return Exploits.sentence(found)
+            of_agents |= same if first == second else apart
+        return Exploits.sentence(of_agents)
 
     def to_json(self) -> dict[str, Any]:
         """Return the comparison as plain data for JSON, with one object per agent under ``agents``."""
@@ -88,10 +88,10 @@ def compare_results(first: Result, second: Result) -> Comparison:
     results of different kinds, on different worlds or scenarios, or without a common agent.
     """
     for key, what in SAME.items():
-        told, told_second = (told_of(result.about, key) for result in (first, second))
-        if told != told_second:
+        value, value_second = (recorded_value(result.about, key) for result in (first, second))
+        if value != value_second:
             raise InvalidInput(
-                f"{second.path}: is about {what} than {first.path} ({key} {told_second!s:.12} and {told!s:.12}):"
+                f"{second.path}: is about {what} than {first.path} ({key} {value_second!s:.12} and {value!s:.12}):"
                 " no comparison"
             )
     common = [agent for agent in first.rows if agent in second.rows]
@@ -100,7 +100,7 @@ def compare_results(first: Result, second: Result) -> Comparison:
         agents = " and ".join(f"{', '.join(names)}" for names in left_over)
         raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
     worlds, because = _worlds_of_both(first, second, common)
-    recordings = int(told_of(first.about, "recordings") or 0)
+    recordings = int(recorded_value(first.about, "recordings") or 0)
     differences = []
     for agent in common:
         one, other = first.rows[agent], second.rows[agent]
@@ -138,19 +138,19 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
         (one, named), (other, _) = first.harms(), second.harms()
     except InvalidInput as error:
         return None, f"one row per world is needed of both; {error}"
-    found: Worlds = {}
+    harms: Worlds = {}
     for agent in common:
         worlds = sorted(one.get(agent, {}))
         if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
             return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
         harms_of_both = [np.array([side[agent][world] for world in worlds]) for side in (one, other)]
         kinds = {RECORDING: np.array([named[world] for world in worlds])} if named else {}
-        found[agent] = harms_of_both[0], harms_of_both[1], clusters_of(kinds, np.array(worlds))
-        for result, harms in zip((first, second), harms_of_both, strict=True):
-            for name, mean in zip(HARMS, harms.mean(axis=0), strict=True):
-                told = result.rows[agent].get(name)
-                if told is not None and not math.isclose(told, mean, rel_tol=1e-9, abs_tol=1e-9):
+        harms[agent] = harms_of_both[0], harms_of_both[1], clusters_of(kinds, np.array(worlds))
+        for result, columns in zip((first, second), harms_of_both, strict=True):
+            for name, mean in zip(HARMS, columns.mean(axis=0), strict=True):
+                stated = result.rows[agent].get(name)
+                if stated is not None and not math.isclose(stated, mean, rel_tol=1e-9, abs_tol=1e-9):
                     raise InvalidInput(
-                        f"{result.path}: {agent}: {name} = {told:g}, but the mean of its worlds is {mean:g}"
+                        f"{result.path}: {agent}: {name} = {stated:g}, but the mean of its worlds is {mean:g}"
                     )
-    return found, None
+    return harms, None

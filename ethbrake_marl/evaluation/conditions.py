@@ -56,12 +56,12 @@ class Conditions(dict[str, Any]):
                 just the smallest and the largest one.
 
         """
-        found = {
+        ends_of = {
             key: [(float(np.nanmin(each)), float(np.nanmax(each))) for each in entries]
             for key, entries in ranges.items()
         }
-        told = {key: [low if low == high else [low, high] for low, high in ends] for key, ends in found.items()}
-        return cls({key: ends[0] if QUANTITY.declared[key].per == "world" else ends for key, ends in told.items()})
+        plain = {key: [low if low == high else [low, high] for low, high in ends] for key, ends in ends_of.items()}
+        return cls({key: ends[0] if QUANTITY.declared[key].per == "world" else ends for key, ends in plain.items()})
 
     @classmethod
     def of_test(
@@ -85,19 +85,19 @@ class Conditions(dict[str, Any]):
                 worlds; None if it applies.
             quantities: quantities of the worlds, as ``of`` returns them.
             recordings: number of recordings that the worlds come from; 0: they come from none.
-            rejected: number of draws that were rejected for an early impact; only told of a table's rows.
+            rejected: number of draws that were rejected for an early impact; reported only for rows of a table.
 
         """
         scenario = task.scenario
         tabled = any(each.table is not None for each in scenario.members or (scenario,))
-        driven = [scenario.vehicle_names[i] for i in task.vehicles]
+        controlled = [scenario.vehicle_names[i] for i in task.vehicles]
         scripts = {scenario.vehicle_names[i]: script for i, script in scenario.scripts.items()}
         return cls(
             scenario=scenario.name,
             seed=seed,
             count=count,
-            **({"controlled_vehicle": driven[0]} if len(driven) == 1 else {"controlled_vehicles": driven}),
-            scripts={name: script for name, script in scripts.items() if name not in driven},
+            **({"controlled_vehicle": controlled[0]} if len(controlled) == 1 else {"controlled_vehicles": controlled}),
+            scripts={name: script for name, script in scripts.items() if name not in controlled},
             time_step_s=scenario.time_step_s,
             horizon_s=scenario.horizon_s,
             **({} if scenario.v2x.channel.tells is None else {"tells": _plain(scenario.v2x.channel.tells)}),
@@ -111,10 +111,9 @@ class Conditions(dict[str, Any]):
     def line(self) -> str:
         """Caption in one line: scenario, number of worlds, seed, recordings, quantities, unusual messages."""
         seed = "" if self["seed"] is None else f", seed {self['seed']}"
-        told = f"; {_message_words(self['tells'])}" if "tells" in self else ""
-        return (
-            f"{self['scenario']}: {count_of(self['count'], 'world')}{seed}{self.by_recording}; {self.quantities}{told}"
-        )
+        messages = f"; {_message_words(self['tells'])}" if "tells" in self else ""
+        worlds = f"{count_of(self['count'], 'world')}{seed}{self.by_recording}"
+        return f"{self['scenario']}: {worlds}; {self.quantities}{messages}"
 
     @property
     def by_recording(self) -> str:
@@ -137,8 +136,8 @@ class Conditions(dict[str, Any]):
             if key in self:
                 entries = [self[key]] if QUANTITY.declared[key].per == "world" else self[key]
                 texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
-                told = texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"
-                parts.append(f"{symbol}{_STAY}={_STAY}{told}{f'{_STAY}{unit}' if unit else ''}")
+                value = texts[0] if len(set(texts)) == 1 else f"({f',{_STAY}'.join(texts)})"
+                parts.append(f"{symbol}{_STAY}={_STAY}{value}{f'{_STAY}{unit}' if unit else ''}")
         return "; ".join(parts)
 
 
@@ -155,4 +154,6 @@ def message_words(scenario: Scenario) -> str:
 
 def _message_words(tells: Tells) -> str:
     each = tells if isinstance(tells, Mapping) else {"all": tells}
-    return "; ".join(f"messages of {who} contain {', '.join(told) or 'the alert alone'}" for who, told in each.items())
+    return "; ".join(
+        f"messages of {who} contain {', '.join(pieces) or 'the alert alone'}" for who, pieces in each.items()
+    )

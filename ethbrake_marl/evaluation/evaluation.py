@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, unknown_name
+from ethbrake_marl.errors import InvalidInput, PhysicsError, count_of, naming_extras
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.measure_sets import MEASURE_SETS, Silent, contexts_of, silent_because
 from ethbrake_marl.evaluation.outcome import LeftOut, Outcome, none_for_nan
@@ -41,8 +38,6 @@ _TEXTS = {
 }  # columns of texts, in addition to those of sets of measures
 
 _ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in these tables even if all worlds agree
-
-_LIBRARIES = ("pandas", "polars", "columns")  # kinds of frame, in order of preference
 
 T = TypeVar("T")
 
@@ -98,8 +93,8 @@ class Evaluation:
         """Return ``compute(self)``. A later call with the same function returns the stored result."""
         if compute not in self._computed:
             self._computed[compute] = compute(self)
-        found: T = self._computed[compute]
-        return found
+        result: T = self._computed[compute]
+        return result
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
@@ -172,7 +167,7 @@ class Evaluation:
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as columns; None stands for a missing value.
 
-        The result maps the name of a column to its values; docs/per-world.md lists the columns. Initial quantities are
+        The result maps the name of a column to its values; docs/evaluate.md lists the columns. Initial quantities are
         named ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``. Each of ``objectives`` (``total``,
         ``social:45``) adds columns with its value for each vehicle.
         """
@@ -183,54 +178,48 @@ class Evaluation:
             values = rule.of(self.worlds)
             if key in _ALWAYS_SHOWN or np.ptp(values, axis=0).any():
                 initial |= {rule.column_of(i): none_for_nan(values[:, i]) for i in range(values.shape[1])}
-        found: Columns = {}
+        table: Columns = {}
         for agent, outcome in self.outcomes.items():
-            told = outcome.columns()
+            measured = outcome.columns()
             for name, each in MEASURE_SETS.items():
                 context = contexts[name]
                 for column, of in each.per_world.items():
-                    told[column] = None if isinstance(context, Silent) else of(outcome, context)
-            told |= {name: column for name, column in outcome.borne(objectives).items() if name not in told}
+                    measured[column] = None if isinstance(context, Silent) else of(outcome, context)
+            measured |= {name: column for name, column in outcome.borne(objectives).items() if name not in measured}
             columns: Columns = {
                 "agent": [agent] * n,
                 **initial,
-                **{name: [None] * n if column is None else none_for_nan(column) for name, column in told.items()},
+                **{name: [None] * n if column is None else none_for_nan(column) for name, column in measured.items()},
                 "knows": [outcome.knows.text] * n,
                 "hidden": self.hidden.astype(int).tolist(),
             }
             for left in self.left_out:
-                told_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
-                columns = {name: [*values, told_of.get(name)] for name, values in columns.items()}
-            found = {name: [*found.get(name, ()), *values] for name, values in columns.items()}
-        return found
+                values_of = {"agent": agent, "world": left.world, "ended": f"left out: {left.agent}: {left.reason}"}
+                columns = {name: [*values, values_of.get(name)] for name, values in columns.items()}
+            table = {name: [*table.get(name, ()), *values] for name, values in columns.items()}
+        return table
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
         """Return the columns of ``per_world`` as arrays, by name.
 
         NaN stands for a missing number, the empty text for a missing text. Each of ``objectives`` adds columns.
         """
-        found, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
+        arrays, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
             texts = name in _TEXTS.union(*of_sets) or (name.startswith("vehicle_") and name.endswith("_type"))
-            found[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
-        return found
+            arrays[name] = np.array([("" if texts else np.nan) if value is None else value for value in values])
+        return arrays
 
-    def to_frame(self, library: str | None = None) -> Any:
-        """Return a table with one row per agent and world: the columns of ``--per-world``, NaN for a missing number.
+    def to_pandas(self) -> Any:
+        """Return a pandas ``DataFrame`` with one row per agent and world: the columns of ``--per-world``.
 
-        docs/per-world.md lists the columns. The result is a pandas ``DataFrame`` if pandas is installed, else a polars
-        ``DataFrame``, else a mapping from column name to array. ``library`` chooses one of them: ``pandas``, ``polars``
-        or ``columns``. Raises ``UnknownName`` for another name, and ``InvalidInput`` for a library that is not
-        installed.
+        docs/evaluate.md lists the columns. NaN stands for a missing number. ``arrays`` has the same columns without
+        pandas. Raises ``MissingExtra`` if pandas is not installed.
         """
-        if library is not None and library not in _LIBRARIES:
-            raise unknown_name("library", library, _LIBRARIES)
-        chosen = library or next((name for name in _LIBRARIES[:-1] if find_spec(name) is not None), _LIBRARIES[-1])
-        if chosen == _LIBRARIES[-1]:
-            return self.arrays()
-        if find_spec(chosen) is None:
-            raise InvalidInput(f"to_frame: {chosen} is not installed: {sys.executable} -m pip install {chosen}")
-        return import_module(chosen).DataFrame(self.arrays())
+        with naming_extras():
+            from pandas import DataFrame
+
+        return DataFrame(self.arrays())
 
     def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
         """Return the mean harm of every agent, by vehicle, under several objectives and both counts of harm.
@@ -258,7 +247,7 @@ class Evaluation:
             for agent, each in self.outcomes.items()
         ]
         note = f"Means per world in m²/s², with their 95 % intervals{self.conditions.by_recording}."
-        note += " eb.summarise tells more."
+        note += " eb.summarise shows all measures."
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:

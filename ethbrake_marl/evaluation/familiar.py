@@ -44,16 +44,16 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
             before = trained.sample(_TRAINED, 0).worlds
         except ValueError:
             continue
-        found = [each for each in vehicles_driven if each not in manifest.learners]
+        unfamiliar = [each for each in vehicles_driven if each not in manifest.learners]
         if not np.isclose(trained.time_step_s, scenario.time_step_s):
-            found.append("time_step_s")
-        found += [f"{worlds.N} vehicles"] if worlds.N != before.N else _beyond(before, worlds)
-        found += _contents(trained, scenario) if worlds.N == before.N else []
+            unfamiliar.append("time_step_s")
+        unfamiliar += [f"{worlds.N} vehicles"] if worlds.N != before.N else _beyond(before, worlds)
+        unfamiliar += _contents(trained, scenario) if worlds.N == before.N else []
         for i, script in scenario.scripts.items():
             if str(trained.scripts.get(i, script)) != str(script):
-                found.append(f"{scenario.vehicle_names[i]} by {script}")
-        if found:
-            beyond = f"trained on {trained.name}, and not for what {scenario.name} has: {', '.join(found)}"
+                unfamiliar.append(f"{scenario.vehicle_names[i]} by {script}")
+        if unfamiliar:
+            beyond = f"trained on {trained.name}, and not for what {scenario.name} has: {', '.join(unfamiliar)}"
             warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=2)
 
 
@@ -62,12 +62,12 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
 
     Example: ``["latency_s in 40 % of the worlds", "no friction"]``.
     """
-    found, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
+    unfamiliar, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():
         if key == "harm_weight":  # no motion depends on it, and a policy observes shares, which are from 0 to 1 anyhow
             continue
         if key not in known:
-            found.append(key)
+            unfamiliar.append(key)
             continue
         values, seen = rule.of(worlds), rule.of(before)
         low, high = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
@@ -75,18 +75,18 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
         share = ((values < low - margin) | (values > high + margin)).any(axis=1).mean()
         none = np.isnan(values).any(axis=1).mean()
         if none > _MOST_BEYOND and not np.isnan(seen).any():
-            found.append(f"no {key} in {100.0 * none:.0f} % of the worlds")
+            unfamiliar.append(f"no {key} in {100.0 * none:.0f} % of the worlds")
         if share > _MOST_BEYOND:
-            found.append(f"{key} in {100.0 * share:.0f} % of the worlds")
+            unfamiliar.append(f"{key} in {100.0 * share:.0f} % of the worlds")
     absent = [key for key in known if key not in here and key != "harm_weight"]
     gone = {key: known[key].of(before) < known[key].high for key in absent}
-    return found + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before
+    return unfamiliar + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before
 
 
 def _contents(trained: Scenario, scenario: Scenario) -> list[str]:
     """Return descriptions of what messages contain in one of two scenarios alone, such as ``messages without mass``."""
     usual = np.array([piece in USUAL_PIECES for piece in PIECES])
-    told = [each.v2x.channel.contents(scenario.vehicles) for each in (trained, scenario)]
-    before, here = (np.tile(usual, (scenario.vehicles, 1)) if each is None else each for each in told)
+    contents = [each.v2x.channel.contents(scenario.vehicles) for each in (trained, scenario)]
+    before, here = (np.tile(usual, (scenario.vehicles, 1)) if each is None else each for each in contents)
     lost = [f"messages without {piece}" for k, piece in enumerate(PIECES) if (before & ~here)[:, k].any()]
     return lost + [f"messages with {piece}" for k, piece in enumerate(PIECES) if (here & ~before)[:, k].any()]

@@ -25,8 +25,8 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
     >>> import ethbrake_marl as eb
     >>> delays = eb.load_scenario("mixture-delays")
     >>> agents = {"full_brake": eb.make_agent("full_brake")}
-    >>> found = eb.summarise_by(eb.evaluate(delays.sample(30, seed=7), agents, scenario=delays), "scenario")
-    >>> {name: rows[0].episodes for name, rows in found.items()}
+    >>> tables = eb.summarise_by(eb.evaluate(delays.sample(30, seed=7), agents, scenario=delays), "scenario")
+    >>> {name: rows[0].episodes for name, rows in tables.items()}
     {'paper-delay-high': 11, 'paper-delay-low': 8, 'paper-delay-middle': 11}
 
     """

@@ -85,15 +85,15 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
     Arrays that say nothing are omitted: those of messages and braking profiles if the worlds have none, build-up rates
     of brakes that are all infinite, and weights of harm that are all 1.
     """
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     usual = {"brake_rate_mps3": np.inf, "release_rate_mps3": np.inf, "harm_weight": 1.0}
     for field in fields(value):
         part = getattr(value, field.name)
         if is_dataclass(part):
-            found |= _arrays(part)
+            arrays |= _arrays(part)
         elif 0 not in part.shape[1:] and not (field.name in usual and (part == usual[field.name]).all()):
-            found[field.name] = part
-    return found
+            arrays[field.name] = part
+    return arrays
 
 
 def scenario_sha256(scenario: Scenario) -> str:
@@ -141,11 +141,15 @@ def result_identity(
         left_out: rows of the sample that the results do not count; they are not hashed.
 
     """
-    found: dict[str, Any] = {"kind": kind, "scenario_sha256": scenario_sha256(scenario), "versions": result_versions()}
+    identity: dict[str, Any] = {
+        "kind": kind,
+        "scenario_sha256": scenario_sha256(scenario),
+        "versions": result_versions(),
+    }
     if sample is not None:
         worlds, index = sample.worlds, sample.index
         if left_out:
             rows = np.setdiff1d(np.arange(worlds.n), list(left_out))
             worlds, index = worlds.take(rows), index[rows]
-        found["worlds_sha256"] = worlds_sha256(worlds, index)
-    return found
+        identity["worlds_sha256"] = worlds_sha256(worlds, index)
+    return identity

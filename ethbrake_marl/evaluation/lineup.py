@@ -73,15 +73,15 @@ def make_lineup(
     written = [parse_spec(spec) for spec in specs]
     for k, each in enumerate(written):
         if each in written[:k]:
-            raise InvalidInput(f"agent {str(each)!r} is given twice; each agent drives every world once")
+            raise InvalidInput(f"agent {str(each)!r} is listed twice; each agent drives every world once")
     if uncertainty is not None and not any("uncertainty" in settings_needed(each.shield) for each in written):
         using = "".join(f"; an agent with +{shield} does: ppo@PATH+{shield}" for shield in shields_with("uncertainty"))
         raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it{using}")
-    found = {
+    lineup = {
         str(each): make_agent(str(each), scenario=scenario, harm_count=harm_count, uncertainty=uncertainty)
         for each in written
     }
-    for spec, agent in found.items():
+    for spec, agent in lineup.items():
         if isinstance(agent, Team) and (alone or (bare and len(scenario.learners) == 1)):
             raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
         if bare and parse_spec(spec).shield is not None:
@@ -89,7 +89,7 @@ def make_lineup(
                 f"agent {spec!r}: has a shield already; this command puts its own around each agent, so name the agent"
                 " alone, for instance ppo@PATH"
             )
-    return found
+    return lineup
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:

@@ -260,8 +260,8 @@ def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
 
     ``contexts`` are those of ``contexts_of``. Sets without such a key are omitted.
     """
-    found = {key: contexts[name] for name, each in MEASURE_SETS.items() if (key := each.because_key) is not None}
-    return {key: context.because if isinstance(context, Silent) else None for key, context in found.items()}
+    by_key = {key: contexts[name] for name, each in MEASURE_SETS.items() if (key := each.because_key) is not None}
+    return {key: context.because if isinstance(context, Silent) else None for key, context in by_key.items()}
 
 
 def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:

@@ -102,14 +102,14 @@ class _Follower(Tape):
         """Return the recorded motion of each world; ``episodes`` is the result of the finished run."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.episodes(), self._pieces()
-        found = []
+        motions = []
         for k in range(n):
             ledger = episodes.ledger.take([k])
             final, taken_over = episodes.final.take([k]), list(self._stepped_in[k])
             chosen = [memory["chosen_policy"][k] for i, memory in episodes.memories.items() if i in self._hybrids]
             if not all(chosen):
                 taken_over.append(float(self._first_s[k]))
-            found.append(
+            motions.append(
                 EpisodeMotion(
                     self.worlds.take([k]),
                     join_pieces(pieces[k], N),
@@ -121,7 +121,7 @@ class _Follower(Tape):
                     bool(episodes.at_rest[k]),
                 )
             )
-        return found
+        return motions
 
     def _pieces(self) -> list[Floats]:
         """Return the motion of each world as pieces, [k, 1 + 4 N] as in ``EpisodeMotion``.
@@ -149,7 +149,7 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
     A piece is dropped if the piece before it, continued, gives its state within rounding. Of several pieces that begin
-    within the same 0.1 ms, only the last is kept.
+    within the same 0.1 ms, only the last remains.
 
     Args:
         pieces: [k, 1 + 4 N] time and state at the beginning of each piece, as in ``EpisodeMotion``.
@@ -158,11 +158,11 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     """
     last_of_many = np.append(np.diff(np.floor(pieces[:, 0] / _SHORT_S)) > 0.0, True)
     last_of_many[0] = True
-    kept: list[Floats] = []
+    needed: list[Floats] = []
     for row in pieces[last_of_many]:
-        if not kept or not (np.abs(state_at(kept[-1], row[0], vehicles) - row[1:]) <= _SAME).all():
-            kept.append(row)
-    return np.array(kept)
+        if not needed or not (np.abs(state_at(needed[-1], row[0], vehicles) - row[1:]) <= _SAME).all():
+            needed.append(row)
+    return np.array(needed)
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:

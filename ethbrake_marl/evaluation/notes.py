@@ -64,11 +64,11 @@ def _rejected(row: SummaryRow) -> str:
     """Return the note about draws of a table's rows that were rejected for an early impact; empty if there are none."""
     rejected = row.parameters.get("rejected_draws", 0)
     draws = rejected + row.episodes + len(row.left_out)
-    told = (
+    text = (
         f"Drawn again: {rejected:,} of {draws:,} draws ({100.0 * rejected / draws:.1f} %), which had an impact before a"
         " learner may act (early_impacts: reject). These results say nothing about such rows."
     )
-    return told if rejected else ""
+    return text if rejected else ""
 
 
 def _cut_off(rows: Sequence[SummaryRow]) -> str:
@@ -113,8 +113,8 @@ def _knowledge(rows: Sequence[SummaryRow]) -> str:
     through = ", ".join(row.agent for row in rows if row.sees_through)
     if through:
         text += (
-            f" {SEES_THROUGH.strip()} {through}: drives by the line as it is all the same. That is a limit to"
-            " compare with, and nothing that a vehicle on this channel could do."
+            f" {SEES_THROUGH.strip()} {through}: sees the line as it is all the same. Take that as a limit to compare"
+            " with; no vehicle on this channel could do it."
         )
     silent = ", ".join(row.agent for row in rows if Source.UNSTATED in row.knows)
-    return text + (f" Not stated what it knows: {silent}." if silent else "")
+    return text + (f" These agents do not state what they know: {silent}." if silent else "")

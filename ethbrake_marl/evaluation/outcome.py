@@ -63,8 +63,8 @@ class Outcome:
 
     def take(self, rows: Ints | Bools) -> Outcome:
         """Return the same outcome with only the worlds ``rows``: row numbers, or a mask [n]."""
-        found = {name: getattr(self, name) for name in _COLUMNS}
-        columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in found.items()}
+        every = {name: getattr(self, name) for name in _COLUMNS}
+        columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in every.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
         return replace(self, ledger=self.ledger.take(rows), final=self.final.take(rows), metrics=metrics, **columns)
 
@@ -76,8 +76,8 @@ class Outcome:
         """
         first, columns = parts[0], dict[str, Any]()
         for name in _COLUMNS:  # None in one part makes the whole column None
-            told = [getattr(part, name) for part in parts]
-            columns[name] = None if any(each is None for each in told) else np.concatenate(told)
+            values = [getattr(part, name) for part in parts]
+            columns[name] = None if any(each is None for each in values) else np.concatenate(values)
         ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
         final = Worlds.concatenate([part.final for part in parts])
         metrics = {name: np.concatenate([part.metrics[name] for part in parts]) for name in first.metrics}
@@ -128,15 +128,15 @@ class Outcome:
         First-impact and total harm are both included. The columns of Vehicle 2 are ``first_impact_harm_2``,
         ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and ``social:45_total_2``.
         """
-        told = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
+        by_vehicle = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
         for objective in objectives:
             for harm_count in HARM_COUNTS:
                 (values,) = scored(self.ledger, harm_count, [objective]).values()
-                told[f"{objective}_{harm_count}"] = values
-        return {f"{name}_{i + 1}": each[:, i] for name, each in told.items() for i in range(each.shape[1])}
+                by_vehicle[f"{objective}_{harm_count}"] = values
+        return {f"{name}_{i + 1}": each[:, i] for name, each in by_vehicle.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """Return the results of each world as columns [n], by the names in docs/per-world.md; None: not measured."""
+        """Return the results of each world as columns [n], by the names in docs/evaluate.md; None: not measured."""
         final, obstacle = self.final, {}
         if (ahead := final.obstacle_ahead).any():  # part of the harm that comes from impacts with the obstacle
             obstacle = {

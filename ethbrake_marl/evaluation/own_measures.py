@@ -25,8 +25,8 @@ def load_measures(names: Iterable[str]) -> None:
         file, colon, own = name.rpartition(":")
         if colon:
             part = load_from_file(file, own)
-            given, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
-            register_measure(own, *given, **settings)
+            arguments, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
+            register_measure(own, *arguments, **settings)
         else:
             REPORTED.update({each: MEASURES[each] for each in MEASURES.load(name)})
         LOADED[name] = None
@@ -34,7 +34,7 @@ def load_measures(names: Iterable[str]) -> None:
 
 def heading_of(column: str) -> str:
     measure = registered_measure(column)
-    if measure is None:  # of results that were computed before it was forgotten
+    if measure is None:  # the result is older than the registration
         return column
     vehicle = column.removeprefix(measure.name).removeprefix("_")
     return f"{measure.name}{f', vehicle {vehicle}' if vehicle else ''} ({measure.unit})"

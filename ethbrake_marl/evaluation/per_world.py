@@ -33,7 +33,7 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world: Parquet if the name ends in ``.parquet``, else CSV.
 
-    docs/per-world.md lists the columns. The row of a left-out world holds only its number and the reason, in ``ended``.
+    docs/evaluate.md lists the columns. The row of a left-out world holds only its number and the reason, in ``ended``.
     The file is written completely or not at all.
 
     Args:
@@ -59,9 +59,9 @@ def write_per_world(
         return
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
-    told = evaluation.per_world(objectives)
-    writer.writerow(told)
-    writer.writerows(zip(*told.values(), strict=True))
+    table = evaluation.per_world(objectives)
+    writer.writerow(table)
+    writer.writerows(zip(*table.values(), strict=True))
     write_output(path, text.getvalue().encode(), force=force)
 
 
@@ -92,17 +92,17 @@ def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
             lines = csv.DictReader(data.decode("utf-8").splitlines())
             names = [*_HARMS, *({RECORDING} & {*(lines.fieldnames or ())})]
             rows = [tuple(line[name] for name in names) for line in lines]
-        found: Harms = {}
+        of_agents: Harms = {}
         recordings: dict[int, str] = {}
         for agent, world, *harms in rows:
-            told, harms = harms[2:], harms[:2]
+            recording, harms = harms[2:], harms[:2]
             if harms[0] not in (None, ""):
                 values = tuple(map(float, harms))
                 if not all(0.0 <= value <= _MOST_HARM for value in values):
                     raise ValueError(f"world {world}: harm {harms}")
-                found.setdefault(agent, {})[int(world)] = values
-                recordings |= {int(world): name for name in told}
-        return found, recordings
+                of_agents.setdefault(agent, {})[int(world)] = values
+                recordings |= {int(world): name for name in recording}
+        return of_agents, recordings
     except (KeyError, TypeError, ValueError, NotImplementedError, OSError, csv.Error) as error:
         raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
 
@@ -143,7 +143,7 @@ _NEEDED = {
 def results_to_json(
     rows: Sequence[SummaryRow],
     *,
-    told: Sequence[Rescored] = (),
+    rescored: Sequence[Rescored] = (),
     groups: Mapping[str, Sequence[SummaryRow]] | None = None,
     per_world: Path | None = None,
     settings: Mapping[str, str] = USUAL,
@@ -152,23 +152,24 @@ def results_to_json(
 
     Args:
         rows: rows of the results table, one per agent.
-        told: mean harms under other objectives (``Evaluation.rescore``), added to each agent's object.
+        rescored: mean harms under other objectives (``Evaluation.rescore``), added to each agent's object.
         groups: name of a group of worlds -> rows of the same agents on that group (``summarise_by``).
         per_world: existing file with one row per world; its name and hash go into every object.
         settings: settings of all agents by name: ``{"harm_count": "first"}`` is the harm that they minimise.
 
     """
-    found = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
-    if told:
-        found = [row | {"objectives": [t.to_json() for t in told if t.agent == row["agent"]]} for row in found]
-    for row in found if groups else ():
+    objects = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
+    if rescored:
+        of = {row["agent"]: [each.to_json() for each in rescored if each.agent == row["agent"]] for row in objects}
+        objects = [row | {"objectives": of[row["agent"]]} for row in objects]
+    for row in objects if groups else ():
         row["groups"] = {
             name: each.to_json() for name, part in (groups or {}).items() for each in part if each.agent == row["agent"]
         }
     if per_world is None:
-        return found
+        return objects
     beside = {"file": per_world.name, "sha256": hashlib.sha256(per_world.read_bytes()).hexdigest()}
-    return [row | {"per_world": beside} for row in found]
+    return [row | {"per_world": beside} for row in objects]
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +237,7 @@ def read_result(path: Path) -> Result:
             raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
         if not 0 <= row["horizon_ends"] <= row["episodes"]:
             raise InvalidInput(f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be 0 to {row['episodes']:,}")
-        draws = told_of(row, "recordings") or f"{row['episodes']}"
+        draws = recorded_value(row, "recordings") or f"{row['episodes']}"
         if not (draws.isdecimal() and len(draws) < 14 and 1 <= int(draws) <= row["episodes"]):
             raise InvalidInput(f"{who}: recordings = {draws:.40}: must be 1 to {row['episodes']:,}, or left out")
         shoved = row.get("vehicle_1_shoved_m")
@@ -245,7 +246,7 @@ def read_result(path: Path) -> Result:
         for harm in COMPARED[row["kind"]]:
             if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), int(draws)):
                 raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
-    if len({tuple(told_of(row, key) for key in SAME) for row in rows}) > 1:
+    if len({tuple(recorded_value(row, key) for key in SAME) for row in rows}) > 1:
         raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
     named = [
         f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
@@ -256,14 +257,14 @@ def read_result(path: Path) -> Result:
     return Result(path, dict(zip(named, rows, strict=True)))
 
 
-def told_of(row: Mapping[str, Any], key: str) -> str | None:
+def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
     """Return the value of ``key`` in ``row`` (an agent's JSON object), or else in its ``parameters``, as text.
 
     None if it is in neither.
     """
     parameters = row.get("parameters")
-    told = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
-    return None if told is None else str(told)
+    value = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
+    return None if value is None else str(value)
 
 
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:

@@ -84,18 +84,18 @@ def record_episode(
     """
     if world.n != 1:
         raise InvalidInput(
-            f"record_episode: {count_of(world.n, 'world')} given; exactly 1 is needed, for instance worlds.take([0])"
+            f"record_episode: {count_of(world.n, 'world')}; exactly 1 is needed, for instance worlds.take([0])"
         )
     if not (sample_s > 0.0 and math.isfinite(sample_s)):
         raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
     several = vehicle is None and len(scenario.learners) > 1
-    driven = scenario.learners if several else (controlled_vehicle(scenario, vehicle),)
+    vehicles = scenario.learners if several else (controlled_vehicle(scenario, vehicle),)
     tape = Tape(world)
-    episodes = drive(world, Team.of(agent, driven), scenario, watched_by=[tape])
+    episodes = drive(world, Team.of(agent, vehicles), scenario, watched_by=[tape])
     samples = list(_samples(tape.steps, sample_s))
     time, gaps, speeds, positions, command = (np.concatenate(column) for column in zip(*samples, strict=True))
     return EpisodeRecord(
-        agent.name, scenario, driven, world, time, gaps, speeds, positions, command, tape.episodes().rows,
+        agent.name, scenario, vehicles, world, time, gaps, speeds, positions, command, tape.episodes().rows,
         episodes.ledger, bool(episodes.at_rest[0]),
     )  # fmt: skip
 

@@ -34,7 +34,7 @@ class Rescores(list[Rescored]):
         self.recordings = recordings  # number of recordings that the intervals are by; 0: all worlds are independent
 
     def __str__(self) -> str:
-        return terminal_text(self.sheet("first"), "", self.sheet("total"))
+        return terminal_text(self.sheet("first"), "", self.sheet("total"), whole_rows=True)
 
     def _repr_html_(self) -> str:
         return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)

@@ -87,7 +87,7 @@ def evaluate(
         seed = LIST_SEED if seed is None else seed
         worlds = scenario.sample(EPISODES if episodes is None else episodes, seed=seed)
     elif episodes is not None:
-        raise InvalidInput(f"evaluate: episodes = {episodes!r}: the worlds are given; leave one of the two out")
+        raise InvalidInput(f"evaluate: episodes = {episodes!r}: worlds were passed too; leave one of the two out")
     _check_request(worlds, agents, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     if not sample.worlds.n:
@@ -166,7 +166,7 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
             f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo', or a mapping of agents"
         )
     if not agents:
-        raise InvalidInput("evaluate: no agents given; at least one is needed, for instance full_brake")
+        raise InvalidInput("evaluate: no agents; at least one is needed, for instance full_brake")
     for name, agent in agents.items():
         check_agent(agent, f"evaluate: agent {name!r}", alone=False)
         Knowledge.of(agent)  # raises for an invalid ``knows``
@@ -237,7 +237,7 @@ def _roll_out(
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """Return the ``Outcome`` of the episodes that a team has driven.
+    """Return the ``Outcome`` of a team's episodes.
 
     It lacks what watchers measure during the episodes: ``shoved_m``, ``sampled_harm`` and ``metrics``. The fields
     ``predicted_harm`` and ``chosen_policy`` come from the memory of an agent that drives alone, or from a shield.

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.statistics import CONFIDENCE, check, of_amounts, wilson
+from ethbrake_marl.evaluation.statistics import CONFIDENCE, Texts, check, of_amounts, share_of, wilson
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.physics.state import Floats
+from ethbrake_marl.physics.state import Floats, Ints
 
 RESAMPLES = 10_000  # bootstrap resamples of seeds
 
@@ -61,44 +61,52 @@ def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES
         shape = drawn[0].shape[:-1]
         return statistic(*drawn, *(np.broadcast_to(one, (*shape, 1)) for one in fixed), axis=axis)
 
-    found = bootstrap(
+    resampled = bootstrap(
         again, resample, n_resamples=resamples, confidence_level=CONFIDENCE, method="percentile", rng=seed,
         vectorized=True,
     )  # fmt: skip
-    return Estimate(value, (float(found.confidence_interval.low), float(found.confidence_interval.high)))
+    return Estimate(value, (float(resampled.confidence_interval.low), float(resampled.confidence_interval.high)))
 
 
-def mean_over_seeds(values: ArrayLike, baseline: ArrayLike | None = None, *, seed: int = 0) -> Estimate:
+def mean_over_seeds(
+    values: ArrayLike, baseline: ArrayLike | None = None, *, clusters: Texts | None = None, seed: int = 0
+) -> Estimate:
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, with a bootstrap interval.
 
-    The bootstrap resamples the seeds of each side, and the worlds, which both sides share. So an interval of
-    differences that excludes 0 holds for other seeds *and* other worlds. There is no interval for a single world, nor
-    without a baseline if all values are 0. The interval of true/false values without a baseline also covers Wilson's
-    interval, because resamples of values that hardly ever differ are too narrow.
+    The bootstrap resamples the seeds of each side, and the worlds or clusters, which both sides share. So an interval
+    of differences that excludes 0 holds for other seeds *and* other worlds. There is no interval for a single world or
+    cluster, nor without a baseline if all values are 0. The interval of true/false values without a baseline also
+    covers Wilson's interval, because resamples of values that hardly ever differ are too narrow.
 
     Args:
         values: [seeds, worlds] result of the training with each seed in each world.
         baseline: [seeds, worlds] results to subtract, in the same worlds; the number of seeds may differ.
+        clusters: name of each world's cluster, [worlds]; only clusters are independent. None: all worlds are.
         seed: seed of the bootstrap.
 
     Raises ``InvalidInput`` for arrays that cannot be paired or are not finite.
 
     """
-    given = np.atleast_2d(np.asarray(values))
-    sides = _pair_sides("mean_over_seeds", given, np.zeros((1, given.shape[-1])) if baseline is None else baseline)
+    array = np.atleast_2d(np.asarray(values))
+    sides = _pair_sides("mean_over_seeds", array, np.zeros((1, array.shape[-1])) if baseline is None else baseline)
     value = float((sides[0].mean(axis=0) - sides[1].mean(axis=0)).mean())
-    found = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], seed)
-    if baseline is not None or (given < 0).any():
-        return found
-    if given.dtype != np.bool_:
-        return of_amounts(found, nothing=not given.any())
+    estimate = _resampled(value, sides, lambda means: means[:, 0] - means[:, 1], clusters, seed)
+    if baseline is not None or (array < 0).any():
+        return estimate
+    if array.dtype != np.bool_:
+        return of_amounts(estimate, nothing=not array.any())
     share = min(value, 1.0)  # a mean of ones may be rounded up
-    low, high = wilson(share, given.shape[1])
-    ends = found.interval or (low, high)
+    if clusters is None:
+        low, high = wilson(share, array.shape[1])
+    else:
+        low, high = share_of(array.ravel(), np.tile(clusters, len(array))).interval or (0.0, 1.0)
+    ends = estimate.interval or (low, high)
     return Estimate(share, (max(min(low, ends[0]), 0.0), min(max(high, ends[1]), 1.0)))
 
 
-def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, seed: int = 0) -> Estimate | None:
+def share_over_seeds(
+    values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, clusters: Texts | None = None, seed: int = 0
+) -> Estimate | None:
     """Return the share of the possible reduction that ``values`` reaches: 0 like ``worst``, 1 like ``best``.
 
     It is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with the bootstrap interval of
@@ -109,6 +117,7 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
         values: [seeds, worlds] harms to judge.
         worst: [seeds, worlds] harms that count as share 0, in the same worlds.
         best: [seeds, worlds] harms that count as share 1, in the same worlds.
+        clusters: as in ``mean_over_seeds``.
         seed: seed of the bootstrap.
 
     """
@@ -123,7 +132,7 @@ def share_over_seeds(values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, se
         share: Floats = (means[there, 1] - means[there, 0]) / possible[there]
         return share if there.mean() > CONFIDENCE else np.full(1, np.nan)
 
-    share = _resampled((high - reached) / (high - low), sides, shares, seed)
+    share = _resampled((high - reached) / (high - low), sides, shares, clusters, seed)
     return None if share.interval is not None and np.isnan(share.interval).any() else share
 
 
@@ -132,7 +141,7 @@ def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
 
     Raises ``InvalidInput``, naming the function ``who``, if their numbers of worlds differ or a value is not finite.
     """
-    arrays = tuple(np.atleast_2d(np.asarray(given, np.float64)) for given in sides)
+    arrays = tuple(np.atleast_2d(np.asarray(side, np.float64)) for side in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
         shapes = " and ".join(str(side.shape) for side in arrays)
         raise InvalidInput(f"{who}: shapes {shapes}: must be [seeds, worlds] with the same worlds")
@@ -141,31 +150,37 @@ def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
     return arrays
 
 
-def _resampled(value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], seed: int) -> Estimate:
-    """Return ``value`` with a bootstrap interval, or without one for a single world.
+def _resampled(
+    value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Texts | None, seed: int
+) -> Estimate:
+    """Return ``value`` with a bootstrap interval, or without one for a single world or cluster.
 
     The interval holds the percentiles of ``of(means)``, where ``means`` [resamples, sides] are the resampled means.
-    ``seed`` is the seed of the bootstrap.
+    ``clusters`` names the cluster of each world (None: all are independent); ``seed`` is the seed of the bootstrap.
     """
-    if sides[0].shape[1] < 2:
+    worlds = sides[0].shape[1]
+    cluster = np.arange(worlds) if clusters is None else np.unique(clusters, return_inverse=True)[1]
+    if cluster.max() == 0:
         return Estimate(value, None)
     tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(of(_resample_means(sides, _RESAMPLES, seed)), [tail, 100.0 - tail])
+    low, high = np.percentile(of(_resample_means(sides, cluster, _RESAMPLES, seed)), [tail, 100.0 - tail])
     return Estimate(value, (float(low), float(high)))
 
 
-def _resample_means(sides: Sequence[Floats], resamples: int, seed: int) -> Floats:
+def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed: int) -> Floats:
     """Return the mean of each of ``sides`` (arrays [seeds, worlds]) in each bootstrap resample, [resamples, sides].
 
-    Seeds are resampled separately for each side; worlds are resampled once for all sides.
+    Seeds are resampled separately for each side; clusters are resampled once for all sides, each with all its worlds.
+    ``cluster`` [worlds] is the number of each world's cluster, from 0.
     """
-    worlds = sides[0].shape[1]
+    worlds, number = len(cluster), int(cluster.max()) + 1
     rng = np.random.default_rng(seed)
     parts: list[Floats] = []
     chunk = max(1, _AT_ONCE // worlds)
     for size in (min(chunk, resamples - begin) for begin in range(0, resamples, chunk)):
-        drawn = rng.integers(worlds, size=(size, worlds)) + worlds * np.arange(size)[:, np.newaxis]
-        weights = np.bincount(drawn.ravel(), minlength=size * worlds).reshape(size, worlds) / worlds
+        drawn = rng.integers(number, size=(size, number)) + number * np.arange(size)[:, np.newaxis]
+        times = np.bincount(drawn.ravel(), minlength=size * number).reshape(size, number).take(cluster, axis=1)
+        weights = times / times.sum(axis=1, keepdims=True)
         means = np.empty((size, len(sides)))
         for column, side in enumerate(sides):
             seeds = rng.integers(len(side), size=(size, len(side)))

@@ -148,8 +148,8 @@ class Moments:
 
         Raises ``ZeroDivisionError`` without values.
         """
-        found = self._around(self.mean, self.standard_error if self.independent > 1 else 0.0)
-        return found if self.negative else of_amounts(found, nothing=not self.squares)
+        estimate = self._around(self.mean, self.standard_error if self.independent > 1 else 0.0)
+        return estimate if self.negative else of_amounts(estimate, nothing=not self.squares)
 
     @property
     def share(self) -> Estimate:
@@ -217,18 +217,18 @@ class Moments:
         return Estimate(value, (value - half, value + half))
 
 
-def of_amounts(found: Estimate, *, nothing: bool) -> Estimate:
+def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
     """Return an estimate of a mean of non-negative values, with its interval cut off below 0.
 
     Args:
-        found: the estimate with the usual interval.
+        estimate: the estimate with the usual interval.
         nothing: whether all values are 0. Then there is no interval, because such a sample bounds the share of worlds
             with other values (see ``rate``), but not their mean.
 
     """
-    if nothing or found.interval is None:
-        return Estimate(found.value, None)
-    return Estimate(found.value, (max(found.interval[0], 0.0), found.interval[1]))
+    if nothing or estimate.interval is None:
+        return Estimate(estimate.value, None)
+    return Estimate(estimate.value, (max(estimate.interval[0], 0.0), estimate.interval[1]))
 
 
 def root(number: Fraction) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ethbrake_marl.agents.protocol import Knowledge
-from ethbrake_marl.errors import count_of
+from ethbrake_marl.errors import count_of, naming_extras
 from ethbrake_marl.evaluation.agent_tally import AgentTally, estimate_all, lower_bounds, tally_agents
 from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.evaluation import Evaluation
@@ -20,13 +20,13 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.files.sheet import Column, Row, Sheet, Shown, terminal_text
 
 _HEAD = {
-    "Agent": "What drives the controlled vehicle; all other vehicles follow the scenario. full_brake is the paper's"
-    " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration found in this simulation;"
+    "Agent": "The agent that controls the vehicle; all other vehicles follow the scenario. full_brake is the paper's"
+    " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration in this simulation;"
     " e_v2x_bm:pairwise is the paper's closed form, which treats the pairs as independent.",
-    "Knows": "What the agent has to know of the line. own sensors: its own vehicle and what its sensors see. messages:"
+    "Knows": "What the agent must know about the line. own sensors: its own vehicle and what its sensors see. messages:"
     " also the messages that have reached it. true state: the others' states, capacities and latencies as they are,"
     " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
-    " behind a shield or +search both parts are told. † marks agents that see through a channel that hides"
+    " behind a shield or +search both parts are listed. † marks agents that see through a channel that hides"
     " something here.",
 }
 
@@ -72,8 +72,12 @@ class SummaryTable(list[SummaryRow]):
     def _repr_html_(self) -> str:
         note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of full braking's harm."
         note += "".join(f" {warning}" for warning in warnings_of(self))
-        told = self[0].parameters if self else Conditions()
-        worlds = f"{told['scenario']}, {count_of(self[0].episodes, 'world')}{told.by_recording}" if self else "no agent"
+        conditions = self[0].parameters if self else Conditions()
+        worlds = (
+            f"{conditions['scenario']}, {count_of(self[0].episodes, 'world')}{conditions.by_recording}"
+            if self
+            else "no agent"
+        )
         sheet = replace(SummaryTable(self).sheet(), title=worlds, note=note)
         shown = {"Agent", "Knows"}.union(*(each.notebook for _, each in every_set()))
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
@@ -161,6 +165,25 @@ class SummaryTable(list[SummaryRow]):
             " below a value: its 95 % interval; decreases are relative to full braking."
         )
         return "\n\n".join([ours, *(text for _, text in self.notes())])
+
+    def to_pandas(self) -> Any:
+        """Return a pandas ``DataFrame`` with one row per agent, whose index is the agent's name.
+
+        Column ``x`` is the value of measure ``x`` of the JSON results, in the unit that it has there; ``x_low`` and
+        ``x_high`` are the ends of its 95 % interval. NaN stands for a missing number. Raises ``MissingExtra`` if pandas
+        is not installed.
+        """
+        with naming_extras():
+            from pandas import DataFrame, Index
+
+        columns: dict[str, list[float | None]] = {}
+        for row in self:
+            for name, each in row.estimates.items():
+                low, high = (None if each is None else each.interval) or (None, None)
+                columns.setdefault(name, []).append(None if each is None else each.value)
+                columns.setdefault(f"{name}_low", []).append(low)
+                columns.setdefault(f"{name}_high", []).append(high)
+        return DataFrame(columns, index=Index([row.agent for row in self], name="agent"), dtype=float)
 
     def notes(self) -> list[Note]:
         """Return the notes to print below the table: those about the agents, then those about rows of other sources.

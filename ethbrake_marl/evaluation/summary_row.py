@@ -70,8 +70,10 @@ class SummaryRow:
     @property
     def metrics(self) -> dict[str, Estimate]:
         """Estimates of the measures that the user registered, by column; a measure by vehicle has ``NAME_1``, ..."""
-        found = {name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)}
-        return {name: each for name, each in found.items() if each is not None}
+        registered = {
+            name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)
+        }
+        return {name: each for name, each in registered.items() if each is not None}
 
     @property
     def sees_through(self) -> bool:

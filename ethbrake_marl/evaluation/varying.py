@@ -42,7 +42,7 @@ def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Float
     of the vehicles (or pairs) for which the scenario declares the same smallest and largest value. Its name lists them,
     such as ``vehicle_2``; it is "" if they are all vehicles of the line. Worlds without the quantity are omitted.
     """
-    found: dict[str, dict[str, Floats]] = {}
+    of_quantities: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():
         values, groups = rule.of(worlds), dict[object, list[int]]()
         values = values[~np.isnan(values).any(axis=1)]
@@ -51,7 +51,7 @@ def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Float
         for number, alike in enumerate(groups.values()):
             names = ", ".join(map(rule.owner, alike))
             few = names if len(names) <= _LONGEST_OWNERS else f"{len(alike)} {rule.per}s"
-            of_key = found.setdefault(key, {})
+            of_key = of_quantities.setdefault(key, {})
             few += f" ({number + 1})" if few in of_key else ""
             of_key["" if len(alike) == values.shape[1] else few] = values[:, alike]
-    return found
+    return of_quantities

@@ -283,11 +283,19 @@ class Sheet:
         return csv_text(self.json())
 
 
-def terminal_text(*shown: RenderableType) -> str:
-    """Return tables and texts as ``print`` would show them, as wide as the terminal."""
+def terminal_text(*shown: RenderableType, whole_rows: bool = False) -> str:
+    """Return tables and texts as ``print`` would show them, as wide as the terminal.
+
+    ``whole_rows``: never break a cell of a table; the text is then wider than the terminal if a table needs it.
+    """
     from rich.console import Console
+    from rich.measure import measure_renderables
 
     console = Console(highlight=False)
+    if whole_rows:
+        tables = [replace(each, note="").rich(console.width) for each in shown if isinstance(each, Sheet)]
+        needed = measure_renderables(console, console.options.update_width(10_000), tables).maximum
+        console.width = max(console.width, needed)
     with console.capture() as captured:
         console.print(*shown)
     return captured.get()

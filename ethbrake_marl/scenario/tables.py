@@ -159,6 +159,11 @@ def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> l
     if twice := [name for name, times in Counter(header).items() if times > 1]:
         raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
     for name in header:
+        if name == RECORDING:
+            raise InvalidInput(
+                f"{where}: column {name!r}: worlds that are read carry no recordings, so intervals would take them as"
+                " independent; make the table the scenario's own (key table), or leave the column out"
+            )
         if name not in known:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
             separator = "; columns are separated by commas" if ";" in name or "\t" in name else ""

@@ -31,7 +31,7 @@ _KINDS = {
     "progress": str,
 }
 
-KEPT = 2  # checkpoints kept during a training, so that an older one remains if the last is damaged
+MOST_CHECKPOINTS = 2  # number of checkpoints during a training, so that an older one remains if the last is damaged
 
 
 class TrainingState(NamedTuple):
@@ -58,7 +58,7 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
         with (partial / ARRAYS).open("rb") as stream:
             numbers = state.numbers | {"sha256": _digest(stream, state.numbers)}
         write_file(partial / NUMBERS, json.dumps(numbers, allow_nan=False).encode())
-    for old in checkpoint_folders(folder.parent)[KEPT:]:
+    for old in checkpoint_folders(folder.parent)[MOST_CHECKPOINTS:]:
         remove_folder(old)
 
 

@@ -71,6 +71,9 @@ class RunReport:
 
     tables: tuple[Any, ...]  # tables to print instead of the usual ones
     note: str  # text that says where the report is
+    interrupted: str = (
+        ""  # what Ctrl-C stopped, so that the report lacks it: "the training alone/vehicle_2"; "": nothing
+    )
 
 
 MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report; the second argument takes its progress
@@ -97,6 +100,7 @@ class ExperimentResult:
     results: list[dict[str, Any]]  # content of results.json: one object per agent
     tables: tuple[Any, ...]  # tables of the evaluation for a terminal
     notes: tuple[str, ...]  # texts that say where results and reports are
+    interrupted: str = ""  # what Ctrl-C stopped after the training (``RunReport.interrupted``); "": nothing
 
 
 def run_experiment(
@@ -118,8 +122,9 @@ def run_experiment(
     extensions then write their reports.
 
     Ctrl-C during the training ends it after the current update, and the policy so far is evaluated. A second Ctrl-C, or
-    one during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the policy. ``run.json`` records
-    how the run ended.
+    one during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the policy. Ctrl-C during a
+    further training of a report ends that training, and the report is written without it
+    (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
 
     Args:
         scenario: scenario with at least one learner. Several are trained as a team, by the recipe's scheme.
@@ -145,7 +150,7 @@ def run_experiment(
         recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
     )
     run, harm_count = RunDirectory(trained.directory), recipe.reward.harm_count
-    with _status(run, trained.status):
+    with _status(run):
         agents = compared_agents(trained.trained, scenario, harm_count)
         order, n = list(agents), sample.worlds.n
         total = n * len(order)
@@ -169,6 +174,8 @@ def run_experiment(
         tell(Progress("results", 1, 1))
         experiment = Experiment(trained, agents, evaluation, rows, list_seed, harm_count, started)
         written = [make(experiment, tell) for make in reports]
+    stopped = ", ".join(report.interrupted for report in written if report.interrupted)
+    _note(run, trained.status, "report", f"interrupted: {stopped}" if stopped else None)
     tables = tuple(table for report in written for table in report.tables)
     notes = tuple(report.note for report in written)
     return ExperimentResult(
@@ -176,6 +183,7 @@ def run_experiment(
         results,
         tables or (*rows.tables(),),
         notes or (f"results, with every measure: {run.path / 'results.json'}",),
+        stopped,
     )
 
 
@@ -253,19 +261,22 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 
 @contextmanager
-def _status(run: RunDirectory, status: str) -> Iterator[None]:
-    """Context manager around the evaluation of a run: record in ``run.json`` that it is running, then how it ended.
+def _status(run: RunDirectory) -> Iterator[None]:
+    """Context manager around the evaluation of a run: record in ``run.json`` that it is running, and if it fails.
 
-    Without an exception, ``status`` (the status of the training) is recorded. For an exception inside, ``interrupted``
-    (Ctrl-C) or ``failed`` is recorded with the error, which is raised again.
+    For an exception inside, ``interrupted`` (Ctrl-C) or ``failed`` is recorded with the error, which is raised again.
+    The new files are recorded too (``RunDirectory.WRITTEN``), so that ``resume`` can delete them.
     """
     _note(run, "running", "evaluation", None)
+    before = {path.name for path in run.path.iterdir()}
     try:
         yield
     except BaseException as error:
         _note(run, "interrupted" if isinstance(error, KeyboardInterrupt) else "failed", "evaluation", repr(error))
         raise
-    _note(run, status, "report", None)
+    finally:
+        written = sorted({path.name for path in run.path.iterdir()} - before)
+        run.write_json(run.status, {**read_object(run.status), RunDirectory.WRITTEN: written})
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:

@@ -12,6 +12,7 @@ from ethbrake_marl.agents.driving import Episodes, drive, script_agents
 from ethbrake_marl.agents.learned import LearnedAgent
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.errors import AgentFailed, PhysicsError
+from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.game.objectives import objective_harm
 from ethbrake_marl.physics.left_out import leaving_out_failed
@@ -33,36 +34,56 @@ Measure = Callable[[Training], Evaluate]  # takes a training; returns the functi
 def measure_on_list(training: Training) -> Evaluate:
     """Draw the fixed list of worlds that the recipe names, and return the function that measures policies on it.
 
-    That function takes a ``Policy`` or ``PolicyTeam``, and returns means over the list by name, equal to the results of
-    ``evaluate``: ``first_impact_harm``, ``total_harm``, ``collision_rate`` and ``horizon_rate``. If a learner has
-    another objective than the line's harm, it adds ``objective_vehicle_2`` and so on, and their mean ``objective``.
+    That function takes a ``Policy`` or ``PolicyTeam``, and returns the metrics of ``measure_team``.
+    """
+    names, worlds = training.scenario.vehicle_names, fixed_list(training)
+
+    def measure(trained: Trained) -> dict[str, float]:
+        drivers = {names.index(name): LearnedAgent(policy, "policy") for name, policy in trained.drivers.items()}
+        return measure_team(training, worlds, Team(drivers, "policy"))
+
+    return measure
+
+
+def measure_full_braking(training: Training) -> dict[str, float]:
+    """Return the metrics of ``measure_team`` if every learner brakes fully, on the fixed list of the recipe."""
+    scenario = training.scenario
+    braking: Any = make_agents(["full_brake"], scenario)["full_brake"]
+    return measure_team(training, fixed_list(training), Team(dict.fromkeys(scenario.learners, braking), "full_brake"))
+
+
+def fixed_list(training: Training) -> Worlds:
+    """Return the fixed list of worlds that the recipe names."""
+    plan = training.recipe.evaluation
+    return training.scenario.sample(plan.worlds, plan.seed).worlds
+
+
+def measure_team(training: Training, worlds: Worlds, team: Team) -> dict[str, float]:
+    """Return the means of a team over worlds by name, equal to the results of ``evaluate``.
+
+    They are ``first_impact_harm``, ``total_harm``, ``collision_rate`` and ``horizon_rate``. If a learner has another
+    objective than the line's harm, ``objective_vehicle_2`` and so on, and their mean ``objective``, are added.
     """
     recipe, scenario = training.recipe, training.scenario
     names, harm_count = scenario.vehicle_names, recipe.reward.harm_count
     objectives = recipe.reward.settled(scenario.objective, scenario.vehicles)[1]
-    worlds = scenario.sample(recipe.evaluation.worlds, recipe.evaluation.seed).worlds
+    parts = list(drive_list(worlds, team, scenario))
 
-    def measure(trained: Trained) -> dict[str, float]:
-        drivers = {names.index(name): LearnedAgent(policy, "policy") for name, policy in trained.drivers.items()}
-        parts = list(drive_list(worlds, Team(drivers, "policy"), scenario))
+    def joined(column: Callable[[Episodes], NDArray[Any]]) -> NDArray[Any]:
+        return np.concatenate([column(part) for part in parts])
 
-        def joined(column: Callable[[Episodes], NDArray[Any]]) -> NDArray[Any]:
-            return np.concatenate([column(part) for part in parts])
-
-        metrics = {
-            "first_impact_harm": mean(joined(lambda part: part.ledger.world_harm("first"))).value,
-            "total_harm": mean(joined(lambda part: part.ledger.world_harm("total"))).value,
-            "collision_rate": float(joined(lambda part: part.ledger.collided).mean()),
-            AT_HORIZON: float(joined(lambda part: ~part.at_rest).mean()),
-        }
-        if objectives:
-            harm = joined(lambda part: objective_harm(part.ledger, harm_count, objectives))
-            each = {names[i]: mean(harm[:, i]).value for i in scenario.learners}
-            metrics[RunDirectory.OBJECTIVE] = sum(each.values()) / len(each)
-            metrics |= {f"{RunDirectory.OBJECTIVE}_{name}": value for name, value in each.items()}
-        return metrics
-
-    return measure
+    metrics = {
+        "first_impact_harm": mean(joined(lambda part: part.ledger.world_harm("first"))).value,
+        "total_harm": mean(joined(lambda part: part.ledger.world_harm("total"))).value,
+        "collision_rate": float(joined(lambda part: part.ledger.collided).mean()),
+        AT_HORIZON: float(joined(lambda part: ~part.at_rest).mean()),
+    }
+    if objectives:
+        harm = joined(lambda part: objective_harm(part.ledger, harm_count, objectives))
+        each = {names[i]: mean(harm[:, i]).value for i in scenario.learners}
+        metrics[RunDirectory.OBJECTIVE] = sum(each.values()) / len(each)
+        metrics |= {f"{RunDirectory.OBJECTIVE}_{name}": value for name, value in each.items()}
+    return metrics
 
 
 def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:

@@ -1,4 +1,4 @@
-"""The actors of a training loop of one's own, written as a team that drives as ``team@FOLDER``."""
+"""Write the actors of your own training loop as a team, which the agent ``team@FOLDER`` then loads."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def save_team(
 
 
 def network_of(layers: nn.Sequential) -> NetworkSpec:
-    """The shape of an actor's layers; raises ``InvalidInput`` naming what is not a perceptron's."""
+    """Return the shape of an actor's layers; raise ``InvalidInput`` naming the layers of anything but a perceptron."""
     linear, between = list(layers)[::2], list(layers)[1::2]
     known = {kind: name for name, kind in ACTIVATIONS.items()}
     kinds = {type(layer) for layer in between}

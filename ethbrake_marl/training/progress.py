@@ -47,7 +47,7 @@ class Course:
         return self.best or self.policy
 
     def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> None:
-        """Record an evaluation of ``policy``, and keep the policy if it is the best so far.
+        """Record an evaluation of ``policy``, and remember the policy if it is the best so far.
 
         Args:
             policy: the evaluated policy, at the current ``steps`` and ``updates``.

@@ -124,7 +124,7 @@ class TrainingRecipe(FileModel):
 
     name: str = Field(pattern=NAME_PATTERN, description="equal to the file's name without .yaml")
     title: str = Field("", description="one line for lists")
-    description: str = Field("", description="what it is for")
+    description: str = Field("", description="what the recipe is for")
     source: str = Field("", description="where the values come from")
     algorithm: str = Field(description="a registered name: ppo, sac, or another one (ethbrake scenario parts)")
     scheme: Scheme | None = Field(  # None: single for one learner, shared for several
@@ -132,14 +132,14 @@ class TrainingRecipe(FileModel):
     )
     total_steps: int = Field(ge=1, description="decisions of all learners")
     n_envs: int = Field(ge=1, description="worlds that are advanced together")
-    learning_rate: LearningRate = Field(description="of the optimiser, from its start to its end")
-    gamma: Fraction = Field(description="discount of one time step; equal to reward.shaping_discount")
+    learning_rate: LearningRate = Field(description="learning rate of the optimiser, from its start to its end")
+    gamma: Fraction = Field(description="discount factor per time step; equal to reward.shaping_discount")
     reward: RewardParams = Field(description="weights and constants of the reward's terms (docs/reference/rewards.md)")
     observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = Field(
         None, description="groups and features that learners observe, [own, front_1, rear_1]; left out: the scenario's"
     )
     horizon_is_end: bool = Field(True, description="true: nothing is expected beyond the horizon")
-    seed: int = Field(0, ge=0, lt=2**32, description="of worlds, networks and exploration")
+    seed: int = Field(0, ge=0, lt=2**32, description="seed of worlds, networks and exploration")
     evaluation: EvaluationPlan = Field(
         description="the fixed list on which the policy is measured while it learns, and how often"
     )

@@ -38,13 +38,13 @@ class PpoRecipe(TrainingRecipe):
     algorithm: Literal["ppo"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     n_steps: int = Field(ge=2, description="decisions of each world between two updates")
-    n_epochs: int = Field(ge=1, le=1000, description="how often an update goes through what was collected")
-    gae_lambda: Fraction = Field(description="memory of the advantages, from 0 (one step) to 1 (all)")
+    n_epochs: int = Field(ge=1, le=1000, description="passes of one update over the collected decisions")
+    gae_lambda: Fraction = Field(description="lambda of the advantage estimates, from 0 (one step) to 1 (all)")
     clip_range: Rate = Field(description="how far the probability of an action may move in one update")
     ent_coef: NonNegative = Field(description="weight of the policy's entropy")
     vf_coef: NonNegative = Field(description="weight of the critic's loss")
-    max_grad_norm: Positive = Field(description="longest gradient")
-    target_kl: Positive | None = Field(None, description="an update stops beyond this divergence")
+    max_grad_norm: Positive = Field(description="largest norm of a gradient; a longer one is scaled down")
+    target_kl: Positive | None = Field(None, description="an update stops beyond this KL divergence")
     turns: Annotated[int, Field(ge=1, le=1000)] | None = Field(  # None: all learn at once
         None, description="rounds in which independent learners learn one after the other"
     )
@@ -95,11 +95,11 @@ class SacRecipe(TrainingRecipe):
     learning_starts: int = Field(ge=0, description="decisions before the first update")
     tau: Rate = Field(description="share by which the target critic follows in one update")
     ent_coef: float | str = Field("auto", description="weight of the policy's entropy: auto, or a number")
-    initial_ent_coef: Positive = Field(1.0, description="where an automatic ent_coef starts")
+    initial_ent_coef: Positive = Field(1.0, description="value at which an automatic ent_coef starts")
     target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = Field(
-        None, description="what an automatic ent_coef keeps; without it -1 per action"
+        None, description="entropy that an automatic ent_coef aims at; without it -1 per action"
     )
-    target_update_interval: int = Field(1, ge=1, description="updates between two of the target critic")
+    target_update_interval: int = Field(1, ge=1, description="updates between two changes of the target critic")
     network: SquashedShape = Field(description=NETWORK)
     log_every_updates: int = Field(ge=1, description="updates between two rows of the progress table")
 

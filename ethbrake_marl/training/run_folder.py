@@ -32,6 +32,8 @@ class RunDirectory:
     OBJECTIVE = "objective"  # mean of the learners' objectives, if one of them is not total harm
     HARM: ClassVar[dict[HarmCount, str]] = {"first": "first_impact_harm", "total": "total_harm"}
 
+    WRITTEN = "written"  # key of run.json: names of the files that ``ethbrake run`` wrote after the training
+
     def __init__(self, path: Path) -> None:
         self.path = path
         self.config = path / "config.json"  # recipe, scenario, seeds and versions of the run
@@ -85,7 +87,8 @@ class RunDirectory:
     def write_status(self, status: RunStatus, **more: Any) -> None:
         """Replace ``run.json`` by this status.
 
-        The start time is kept; a status other than ``running`` also records the end time. ``more`` are other entries.
+        The start time does not change; a status other than ``running`` also records the end time. ``more`` are other
+        entries.
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {}
@@ -93,6 +96,14 @@ class RunDirectory:
         if status != "running":
             times["ended_utc"] = now
         self.write_json(self.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
+
+    def remove_results(self) -> None:
+        """Delete the results and reports of ``ethbrake run``, because the training goes on to other weights."""
+        own, written = {path.name for path in vars(self).values()}, read_object(self.status).get(self.WRITTEN)
+        names = written if isinstance(written, list) else []
+        for path in [*self.path.iterdir()]:
+            if path.name in names and path.name not in own and (path.is_symlink() or path.is_file()):
+                path.unlink()
 
     def read_config(self) -> dict[str, Any]:
         """Return the content of ``config.json``: recipe, scenario, seeds and versions.

@@ -60,6 +60,16 @@ class TrainResult:
     evaluations: tuple[Mapping[str, float], ...]  # steps, updates and metrics of each evaluation, in order
 
     @property
+    def agent(self) -> str:
+        """Name of what was trained as an agent, for ``make_agent`` and ``--agents``: ``ppo@runs/mine``."""
+        return self.training.agent_in(self.directory)
+
+    @property
+    def metrics(self) -> Mapping[str, float] | None:
+        """Results of ``trained`` on the fixed list (an entry of ``evaluations``); None if nothing was measured."""
+        return next((each for each in self.evaluations if each["steps"] == self.trained.steps), None)
+
+    @property
     def policies(self) -> dict[str, Policy]:
         """The policy of each learner, by the vehicle's name."""
         return dict(self.trained.drivers)
@@ -144,7 +154,8 @@ def resume(
     """Continue a training that was stopped or killed. Its policies are the same, bit for bit, as without the stop.
 
     Training continues from the newest undamaged checkpoint, or from the beginning if there is none. Rows and events
-    after that checkpoint are dropped.
+    after that checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about the policy so far are
+    deleted.
 
     Args:
         directory: the run's folder.
@@ -164,6 +175,7 @@ def resume(
         run.write_json(run.team, training.team())  # the one that is there may be damaged
         with hold_lock(run.lock, _BUSY):
             state, damaged = _newest_checkpoint(run, training, other_versions)
+            run.remove_results()
             return learn(callback, state, [f"a damaged checkpoint was left aside: {reason}" for reason in damaged])
 
 
@@ -280,11 +292,9 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
-        single = len(training.drivers) == 1
-        agents = f"{training.recipe.algorithm}@{run.path}+episode" if single else f"team@{run.path}"
         raise InvalidInput(
             f"{run.path}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
-            f" {training.scenario.name} --agents {agents}"
+            f" {training.scenario.name} --agents full_brake,{training.agent_in(run.path)}"
         )
 
 

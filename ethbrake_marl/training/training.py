@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ethbrake_marl.agents.registry import AGENTS
 from ethbrake_marl.errors import RENAMED, InvalidInput, new_name
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.yaml import Document
@@ -107,6 +108,11 @@ class Training:
         """Return the content of ``team.json``: scheme, number of vehicles, and the folder of each learner's policy."""
         file = TeamFile(scheme=self.scheme, vehicles=self.scenario.vehicles, drivers=dict(self.drivers))
         return file.model_dump(mode="json")
+
+    def agent_in(self, folder: Path) -> str:
+        """Return the name, as an agent, of what this training leaves in the run's ``folder``: ``ppo@runs/mine``."""
+        several, algorithm = len(self.drivers) > 1, self.recipe.algorithm
+        return f"{'team' if several else algorithm if algorithm in AGENTS else 'policy'}@{folder}"
 
     def who_drives(self) -> str:
         """Return scheme and drivers in words: ``scheme shared: policy drives vehicle_2, vehicle_3``."""

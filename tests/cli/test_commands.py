@@ -100,8 +100,8 @@ def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys,
 @pytest.mark.parametrize(
     ("loaded", "temporary", "told"),
     [
-        ([], False, "compiling the physics, once: minutes of one core, then it is kept\n"),
-        (["advance-1"], False, "compiling what was not used before, once, then it is kept\n"),
+        ([], False, "compiling the physics, once: minutes of one core; the result is stored\n"),
+        (["advance-1"], False, "compiling new parts of the physics, once; the result is stored\n"),
         ([], True, "no folder can be written"),
     ],
 )
@@ -251,7 +251,7 @@ def test_progress__on_a_terminal_each_part_has_one_bar_above_what_comes_next(mon
 
 
 def test_command__ctrl_c_is_one_line_and_the_status_of_an_interruption(capsys) -> None:
-    with pytest.raises(typer.Exit) as raised, Out(kept="what was found is kept"):
+    with pytest.raises(typer.Exit) as raised, Out(remains="what was found is kept"):
         raise KeyboardInterrupt
     assert raised.value.exit_code == 130
     assert capsys.readouterr().err == "interrupted; what was found is kept\n"
@@ -372,7 +372,7 @@ def test_sigterm__is_as_ctrl_c_while_processes_work_unless_somebody_else_answers
 
 
 def test_evaluate__says_where_the_uncertainty_of_robust_is_given_and_keeps_no_place_for_it(ethbrake: Command) -> None:
-    assert "+robust needs an uncertainty, which is given in Python" in " ".join(
+    assert "+robust needs an uncertainty, which only Python can set" in " ".join(
         ethbrake("evaluate", "--help").out.split()
     )
     (row,) = told_json(ethbrake("evaluate", "--episodes", "2", "--agents", "full_brake", "--json"))

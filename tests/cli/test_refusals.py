@@ -62,7 +62,7 @@ EVALUATIONS = [
     ("evaluate --seed -1", "seed of the list = -1: must be a whole number, at least 0"),
     ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command takes no recipe, so nothing of one can be set"),
     ("evaluate --agents full_brke", "unknown agent 'full_brke'; did you mean 'full_brake'?"),
-    ("evaluate --agents ladder,coast", "agent 'coast' is given twice; each agent drives every world once"),
+    ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; each agent drives every world once"),
     (
         "evaluate --agents coast,",
         "agent '': must be name or name:argument, the name in lower case letters, digits and _ @ . -",

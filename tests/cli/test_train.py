@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import shlex
 import signal
 import sys
 from collections.abc import Callable
@@ -13,6 +14,8 @@ import onnx
 import pytest
 
 from ethbrake_marl.cli.command import Out
+from ethbrake_marl.progress import OnProgress
+from ethbrake_marl.training.experiment import Experiment, RunReport
 from tests.fixtures.commands import Command, check_refused, rows_of, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -150,6 +153,34 @@ def test_train__names_its_folder_and_ends_at_the_number_that_it_announces(ethbra
     assert ": 0 of 256\n" in answer.err and "after 256 training steps" in answer.err and "of 200" not in answer.err
 
 
+def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_the_same(
+    ethbrake, tiny_recipe, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    chosen = ("--recipe", tiny_recipe, "--set", "mass_t=40", "--set", "gamma=0.98", "--set", "reward.harm_count=total")
+    answer = ethbrake("train", *chosen, "--output", "runs/mine")
+    command = (
+        "ethbrake evaluate --scenario paper-random --agents full_brake,ppo@runs/mine --set mass_t=40"
+        " --set harm_count=total"
+    )
+    assert answer.status == 0 and answer.out.splitlines()[-1].strip() == command
+    assert "The agent is ppo@runs/mine." in answer.out and "the 10 worlds of seed 7" in answer.out
+    figures = told_json(ethbrake("train", *chosen, "--output", "runs/mine", "--force", "--json"))
+    assert (figures["agent"], figures["next_command"]) == ("ppo@runs/mine", command)
+    rows = told_json(ethbrake(*shlex.split(command)[1:], "--episodes", "10", "--json"))  # the recipe's fixed list
+    assert (figures["fixed_list"]["worlds"], figures["fixed_list"]["seed"]) == (10, 7)
+    for told, row in zip(figures["fixed_list"]["results"], rows, strict=True):
+        assert told == {name: pytest.approx(row[name]) if name != "agent" else row[name] for name in told}
+        assert f"{row['first_impact_harm']:.2f}" in answer.out and f"{row['total_harm']:.2f}" in answer.out
+
+
+def test_train__of_a_team_with_own_objectives_shows_them(ethbrake, tiny_recipe, tmp_path) -> None:
+    own = ("--scenario", "cooperation-3-pair", "--set", "reward.objective=own", "--output", tmp_path / "run")
+    answer = ethbrake("train", *own, "--recipe", tiny_recipe)
+    assert answer.status == 0 and f"The agent is team@{tmp_path / 'run'}." in answer.out
+    assert "First-impact harm (own)" in answer.out
+
+
 def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_recipe, tmp_path) -> None:
     scenario, folder = ("--scenario", "cooperation-3-pair"), tmp_path / "run"
     told = "policy/vehicle_2 drives vehicle_2; policy/vehicle_3 drives vehicle_3"
@@ -159,7 +190,9 @@ def test_train__by_a_scheme_leaves_a_team_that_evaluate_takes(ethbrake, tiny_rec
     alone, team = told_json(ethbrake("evaluate", *scenario, *words))
     assert alone["first_impact_harm"] == team["first_impact_harm"]
     check_refused(ethbrake("evaluate", *scenario, "--agents", f"sac@{folder}"), "was trained by ppo", f"ppo@{folder}")
-    check_refused(ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents team@")
+    check_refused(
+        ethbrake("train", "--resume", folder), "evaluate --scenario cooperation-3-pair --agents full_brake,team@"
+    )
 
 
 def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, monkeypatch) -> None:
@@ -173,7 +206,41 @@ def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, 
     told = told_json(ethbrake("train", "--resume", folder, "--json"))
     assert (told["status"], told["steps"]) == ("finished", 256)
     again = ethbrake("train", "--resume", folder)
-    check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents ppo@")
+    check_refused(again, "has finished", "ethbrake evaluate --scenario paper-random --agents full_brake,ppo@")
+
+
+@pytest.mark.usefixtures("core_alone")
+def test_resume__deletes_the_results_of_the_policy_before_and_nothing_else(
+    ethbrake, tiny_recipe, tmp_path, monkeypatch
+) -> None:
+    folder = tmp_path / "stopped"
+    with monkeypatch.context() as patch:
+        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        assert ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder).status == 130
+    written = {"results.json", "results.csv", "per_world.csv"}
+    assert {*status_of(folder, "written")[0]} == written and all((folder / name).exists() for name in written)
+    (folder / "notes.txt").write_text("mine")
+    (tmp_path / "precious.txt").write_text("mine")
+    status = json.loads((folder / "run.json").read_text())
+    hostile = {"written": [*written, "policy", "config.json", "../precious.txt", "..", ".", 7]}
+    (folder / "run.json").write_text(json.dumps(status | hostile))
+    assert ethbrake("train", "--resume", folder).status == 0
+    there = {path.name for path in folder.iterdir()}
+    assert not there & written and {"notes.txt", "policy", "config.json"} <= there
+    assert (tmp_path / "precious.txt").exists()
+
+
+def test_run__whose_further_training_was_interrupted_ends_with_130(
+    ethbrake, tiny_recipe, tmp_path, monkeypatch
+) -> None:
+    def make(experiment: Experiment, tell: OnProgress) -> RunReport:
+        return RunReport(("a table",), "report: here", "the training alone/vehicle_3")
+
+    monkeypatch.setattr("ethbrake_marl.training.experiment.RUN_REPORTS", {"mine": make})
+    answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "run")
+    assert answer.status == 130 and "a table" in answer.out
+    told = "interrupted: the training alone/vehicle_3; the report is without it: "
+    assert answer.err.splitlines()[-1].startswith(told)
 
 
 # Learning curves

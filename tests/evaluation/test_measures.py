@@ -7,7 +7,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -213,8 +212,8 @@ def check_marked(text: str, share: float) -> None:
     assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
     assert "† messages |" not in text and "† own sensors" not in text
     assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
-    assert "† ppo+episode, e_v2x_bm:pairwise: drives by the line as it is" in text
-    assert "Not stated what it knows: mine." in text
+    assert "† ppo+episode, e_v2x_bm:pairwise: sees the line as it is" in text
+    assert "These agents do not state what they know: mine." in text
 
 
 class Silent:
@@ -266,6 +265,15 @@ def check_unmarked(text: str) -> None:
 
 
 # ---------------------------------------------------------------- other objectives
+
+
+def test_rescored__breaks_no_name_in_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    line, name = load_scenario("cooperation-4-five"), "policy@runs/a-long-name-of-a-run-of-mine"
+    shown = str(evaluate(line.sample(20, 7), {name: eb.make_agent("full_brake")}, scenario=line).rescore(["own"]))
+    assert shown.count(f"{name}   own ") == 2
+    words = shown.replace("\n", " ").split()
+    assert "(injury:CURVE:" in words and {"Agent", "Objective", name} <= {*words}
 
 
 def test_rescored__one_impact_by_hand_in_json_and_as_columns(pair: Scenario, tmp_path: Path) -> None:
@@ -353,30 +361,38 @@ def test_per_world__a_quantity_that_differs_between_worlds_has_its_columns(tmp_p
     assert told == [("0.5", "0.0", "", ""), ("0.25", "0.0", "", "")] and "mass_1_t" not in rows[0]
 
 
-@pytest.mark.parametrize("library", ["pandas", "polars", None])
-def test_frame__is_made_by_the_library_that_is_there(
-    evaluation: Evaluation, library: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    planted = SimpleNamespace(DataFrame=lambda columns: (library, columns))
-    monkeypatch.setitem(sys.modules, str(library), planted)
-    monkeypatch.setattr("ethbrake_marl.evaluation.evaluation.find_spec", lambda name: name == library or None)
-    found = evaluation.to_frame()
-    made, columns = found if library else (None, found)  # without any, a mapping of columns
-    assert made == library and isinstance(columns, dict) and len(columns["agent"]) == 600
+def test_frame__has_a_row_per_agent_and_world(evaluation: Evaluation) -> None:
+    pytest.importorskip("pandas")
+    frame = evaluation.to_pandas()
+    assert len(frame) == 600 and list(frame.columns) == list(evaluation.arrays())
+    harms = frame.groupby("agent", sort=False)["total_harm"].sum()
+    assert harms.to_dict() == pytest.approx({name: o.total_harm.sum() for name, o in evaluation.outcomes.items()})
 
 
-@pytest.mark.parametrize("library", ["pandas", "polars"])
-def test_frame__of_the_library_itself_has_a_row_per_agent_and_world(evaluation: Evaluation, library: str) -> None:
-    pytest.importorskip(library)
-    frame = evaluation.to_frame(library)
-    assert type(frame).__module__.split(".")[0] == library and len(frame) == 600
-    harms = sum(float(outcome.total_harm.sum()) for outcome in evaluation.outcomes.values())
-    assert float(frame["total_harm"].sum()) == pytest.approx(harms)
+def test_frame__of_a_table_has_a_row_per_agent_with_the_ends_of_each_interval(evaluation: Evaluation) -> None:
+    pytest.importorskip("pandas")
+    rows = summarise(evaluation)
+    frame = rows.to_pandas()
+    assert frame.index.name == "agent" and list(frame.index) == [row.agent for row in rows]
+    assert {str(kind) for kind in frame.dtypes} == {"float64"} and len(frame.columns) == 3 * len(rows[0].estimates)
+    for row in rows:
+        got = frame.loc[row.agent, ["total_harm", "total_harm_low", "total_harm_high"]]
+        assert got.tolist() == [row.total_harm.value, *row.total_harm.ends]
+    alone = summarise(evaluation.take(np.array([0])), baseline="nobody").to_pandas()  # no interval, no comparison
+    missing = alone.columns[alone.loc["full_brake"].isna()]
+    assert {"total_harm_low", "total_harm_high", "harm_decrease_total"} <= {*missing} and "total_harm" not in missing
+
+
+def test_frame__names_the_extra_without_pandas(evaluation: Evaluation, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    for make in (evaluation.to_pandas, summarise(evaluation).to_pandas):
+        with pytest.raises(eb.MissingExtra, match=r"the package pandas.*pip install 'ethbrake-marl\[data\]'"):
+            make()
 
 
 def test_parquet_and_columns__hold_what_the_csv_file_holds(evaluation: Evaluation, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    rows, columns = per_world(evaluation, tmp_path), evaluation.to_frame("columns")
+    rows, columns = per_world(evaluation, tmp_path), evaluation.arrays()
     write_per_world(tmp_path / "out.parquet", evaluation)
     one, other = (read_harms(file, file.read_bytes()) for file in (tmp_path / "out.csv", tmp_path / "out.parquet"))
     table = parquet.read_table(tmp_path / "out.parquet")

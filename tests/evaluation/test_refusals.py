@@ -54,7 +54,7 @@ class Confused:
 
 
 EVALUATIONS: dict[str, Callable[[], object]] = {
-    "evaluate: no agents given; at least one": lambda: eb.evaluate(WORLDS, {}, scenario=PAPER),
+    "evaluate: no agents; at least one": lambda: eb.evaluate(WORLDS, {}, scenario=PAPER),
     "evaluate: chunk = 0: must be a whole number, at least 1": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER, chunk=0
     ),
@@ -82,7 +82,7 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "must be worlds or a sample, as scenario.sample(n, seed) gives": lambda: eb.evaluate(5, BRAKE, scenario=PAPER),
     "must be specs such as 'full_brake,ppo', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
     "agent 5: must be name or name:argument": lambda: eb.evaluate(agents=[5], scenario=PAPER, episodes=2),
-    "the worlds are given; leave one of the two out": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER, episodes=2),
+    "worlds were passed too; leave one of the two out": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER, episodes=2),
     "number of worlds = 0: must be a whole number, at least 1": lambda: eb.evaluate(
         agents="coast", scenario=PAPER, episodes=0
     ),
@@ -125,9 +125,6 @@ NAMES: dict[str, Callable[[], object]] = {
         WORLDS, BRAKE, scenario="paper-randm"
     ),
     "unknown agent 'full_brak'; did you mean 'full_brake'?": lambda: eb.evaluate(WORLDS, ["full_brak"], scenario=PAPER),
-    "unknown library 'panda'; did you mean 'pandas'?": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER).to_frame(
-        "panda"
-    ),
 }
 
 
@@ -241,7 +238,7 @@ def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_
 
 @pytest.mark.parametrize("sample_s", [0.0, nan, inf])
 def test_record__is_of_one_world_at_a_positive_time(sample_s: float) -> None:
-    with refused("record_episode: 3 worlds given; exactly 1 is needed, for instance worlds.take([0])"):
+    with refused("record_episode: 3 worlds; exactly 1 is needed, for instance worlds.take([0])"):
         eb.record_episode(WORLDS, BRAKE["full_brake"], scenario=PAPER)
     with refused(f"record_episode: sample_s = {sample_s}; must be finite and above 0"):
         eb.record_episode(WORLDS.take([0]), BRAKE["full_brake"], scenario=PAPER, sample_s=sample_s)

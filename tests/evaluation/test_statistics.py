@@ -131,7 +131,8 @@ def test_mean_over_seeds__worlds_of_both_sides_are_drawn_together() -> None:
 @pytest.mark.parametrize("resamples", [1, 2, 3])
 def test_resamples__are_as_many_as_asked_for(resamples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(seeds_module, "_AT_ONCE", 4)  # two at a time
-    assert seeds_module._resample_means((np.arange(4.0).reshape(2, 2),), resamples, 0).shape == (resamples, 1)
+    sides = (np.arange(4.0).reshape(2, 2),)
+    assert seeds_module._resample_means(sides, np.arange(2), resamples, 0).shape == (resamples, 1)
 
 
 def rounded(estimate):

@@ -305,7 +305,7 @@ def test_measure__of_each_vehicle_stands_in_rows_frame_and_markdown() -> None:
     told = rows[0].to_json()
     assert told["metric_squared"] == near(told["total_harm"]) and len(told["metric_injured_3_interval"]) == 2
     assert told["metrics"]["injured_3"] == "injured, vehicle 3 (1)"
-    frame = found.to_frame("columns")
+    frame = found.arrays()
     assert frame["metric_squared"] == near(frame["total_harm"])
     text = rows.markdown()
     assert "squared (m2/s2)" in text and "injured, vehicle 2 (1)" in text

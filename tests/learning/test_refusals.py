@@ -302,13 +302,13 @@ def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: st
 def test_training_that_has_finished__says_how_to_measure_it(run: RunDirectory) -> None:
     run.write_status("finished")
     with refused(
-        "finished; measure what it has learned with: ethbrake evaluate --scenario paper-random --agents ppo@run+epis"
+        "finished; measure what it has learned with: ethbrake evaluate --scenario paper-random --agents full_brake,ppo@"
     ):
         resume(run.path)
     team = RunDirectory(Path("team")).create(Training.of(TINY_PPO, PAIR, scheme="independent").config())
     team.write_status("finished")
     with refused(
-        "measure what it has learned with: ethbrake evaluate --scenario cooperation-3-pair --agents team@team"
+        "what it has learned with: ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@team"
     ):
         resume(team.path)
 

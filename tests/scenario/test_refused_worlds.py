@@ -97,6 +97,10 @@ GIVEN: dict[str, Callable[[], object]] = {
     "initial states: unknown column 'gaps_1_m'; did you mean gap_1_m (metres)?": lambda: worlds_from_table(
         PAPER, COLUMNS | {"gaps_1_m": [1, 2, 3]}
     ),
+    "initial states: column 'recording': worlds that are read carry no recordings, so intervals would take them as "
+    "independent; make the table the scenario's own (key table)": lambda: worlds_from_table(
+        PAPER, COLUMNS | {"recording": ["a", "a", "b"]}
+    ),
     "initial states: column obstacle_gap_m is missing, and random": lambda: worlds_from_table(OBSTACLE, COLUMNS),
     "initial_state: speeds_mps[0] is missing, and random in scenario 'paper-random'": lambda: worlds_from_state(
         PAPER, {"gaps_m": [7, 7]}

@@ -208,7 +208,7 @@ def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grou
     agents = {"full_brake": eb.make_agent("full_brake"), "e_v2x_bm": eb.make_agent("e_v2x_bm")}
     sample = DELAYS.sample(120, 7)
     found = eb.evaluate(sample, agents, scenario=DELAYS, seed=7)
-    assert found.to_frame("columns")["scenario"].tolist() == sample.scenarios.tolist() * 2
+    assert found.arrays()["scenario"].tolist() == sample.scenarios.tolist() * 2
     groups = eb.summarise_by(found, "scenario")
     for name in MEMBERS:
         member, rows = eb.load_scenario(name), np.flatnonzero(sample.scenarios == name)
@@ -217,7 +217,7 @@ def test_results__tell_scenario_and_types_agree_with_the_members_and_can_be_grou
         assert [row.total_harm for row in groups[name]] == [row.total_harm for row in eb.summarise(own)]
     sample = MIXED.sample(200, 7)
     found = eb.evaluate(sample, {"full_brake": eb.make_agent("full_brake")}, scenario=MIXED, seed=7)
-    assert found.to_frame("columns")["vehicle_3_type"].tolist() == sample.types[:, 2].tolist()
+    assert found.arrays()["vehicle_3_type"].tolist() == sample.types[:, 2].tolist()
     groups = eb.summarise_by(found, "vehicle_3_type")
     assert list(groups) == ["car", "truck", "van"]
     told = [(row.episodes, row.collisions) for (row,) in groups.values()]

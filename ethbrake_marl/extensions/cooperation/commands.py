@@ -9,7 +9,7 @@ from rich.text import Text
 
 from ethbrake_marl.cli.command import JobsOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.studies.commands import KEPT, FolderOption
+from ethbrake_marl.extensions.studies.commands import REMAINS, FolderOption
 from ethbrake_marl.registry import Part
 
 
@@ -61,7 +61,7 @@ def ablate_command(
     begun ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures. With --sweep the
     levels are one level with several numbers: axis of its two figures, and column of its tables.
     """
-    with Out(as_json=as_json, kept=KEPT) as out:
+    with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.cooperation.ablation import HOW_MEASURED, ablation_cost, run_ablation
         from ethbrake_marl.extensions.cooperation.levels import plan_ablation
         from ethbrake_marl.extensions.studies.machine import this_machine
@@ -84,7 +84,7 @@ def ablate_command(
         out.note(str(estimate))
         written = run_ablation(plan, jobs or 1, str(this_machine()), out.show_progress)
         if written is None:
-            out.interrupted(f"interrupted; {KEPT}")
+            out.interrupted(f"interrupted; {REMAINS}")
         results, (page, text, *figures) = written
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
         out.result(results, text.read_text("utf-8"), *alarms, end="")

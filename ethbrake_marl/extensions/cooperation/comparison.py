@@ -4,17 +4,19 @@ A *level* is a scenario; the *ladder* is the sequence of levels, each compared w
 is the least known harm that all learners of a level can achieve together.
 
 Confidence intervals cover other training seeds and other worlds: both are resampled (``evaluation.seeds``).
+Worlds of one recording are resampled together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from ethbrake_marl.evaluation.seeds import interquartile_mean, mean_over_seeds, share_over_seeds
-from ethbrake_marl.extensions.cooperation.joint_optimum import Goal, Harms, Measured
+from ethbrake_marl.extensions.cooperation.joint_optimum import Harms, Measured
 from ethbrake_marl.extensions.cooperation.levels import TOLERANCE, Json
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.physics.state import Floats
@@ -25,9 +27,9 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     """Return the comparison of all levels as plain data for JSON; docs/ablate-cooperation.md describes it.
 
     Keys: ``levels`` (results of each level), ``steps`` (each level against the one before), ``channels`` (each level
-    with a worse V2X channel against the level that it varies), and ``undertrained`` (a sentence for each level whose
-    trained policies do worse than full braking). Steps are compared for one algorithm at a time; a level without
-    learners counts in the comparison of every algorithm.
+    with a worse V2X channel against the level that it varies), and ``undertrained`` (a list of one sentence that names
+    the levels whose trained policies do worse than full braking; empty without such a level). Steps are compared for
+    one algorithm at a time; a level without learners counts in the comparison of every algorithm.
 
     Args:
         measured: results of ``measure``.
@@ -48,15 +50,18 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
         "levels": [_level(one, searched) for one in measured],
         "steps": steps,
         "channels": channels,
-        "undertrained": [_undertrained(one, one.goal) for one in measured if one.goal is not None and one.goal.missed],
+        "undertrained": _undertrained(measured),
     }
 
 
-def _undertrained(one: Measured, goal: Goal) -> str:
-    return (
-        f"{one.level.name} ({one.algorithm}) is not trained enough to say anything: its {goal.name} is"
-        f" {goal.reached:.2f}, and {goal.full_brake:.2f} if everybody brakes fully."
-    )
+def _undertrained(measured: Sequence[Measured]) -> list[str]:
+    named = [
+        f"{one.level.name} ({one.algorithm}), {one.goal.name} {one.goal.reached:.2f} ({one.goal.full_brake:.2f} if"
+        " everybody brakes fully)"
+        for one in measured
+        if one.goal is not None and one.goal.missed
+    ]
+    return [f"Not trained enough to say anything: {'; '.join(named)}."] if named else []
 
 
 def _level(one: Measured, searched: int) -> Json:
@@ -65,6 +70,9 @@ def _level(one: Measured, searched: int) -> Json:
     The ``searched`` part also has the joint optimum and the share of the possible reduction.
     """
     scenario = one.level.scenario
+    of_searched = None if one.clusters is None else one.clusters[:searched]
+    mean = partial(mean_over_seeds, clusters=one.clusters)
+    mean_searched = partial(mean_over_seeds, clusters=of_searched)
     entry: Json = {
         **one.identity,
         "policy_sha256": [dict(seed) for seed in one.reached.policies],
@@ -76,25 +84,29 @@ def _level(one: Measured, searched: int) -> Json:
         "learners": [scenario.vehicle_names[i] for i in scenario.learners],
         "seeds": len(one.reached.collided),
         "worlds": one.reached.collided.shape[1],
-        "collision_rate": mean_over_seeds(one.reached.collided).to_json(),
+        "collision_rate": mean(one.reached.collided).to_json(),
         "goal": None if one.goal is None else {**one.goal._asdict(), "missed": one.goal.missed},
     }
     for harm_count in HARM_COUNTS:
         reached, braking = one.reached.world[harm_count], one.full_brake.world[harm_count]
         best = None if one.best is None else one.best[harm_count]
-        share = None if best is None else share_over_seeds(reached[:, :searched], braking[:, :searched], best)
+        share = (
+            None
+            if best is None
+            else share_over_seeds(reached[:, :searched], braking[:, :searched], best, clusters=of_searched)
+        )
         entry[harm_count] = {
-            "full_brake": mean_over_seeds(braking).to_json(),
-            "harm": mean_over_seeds(reached).to_json(),
+            "full_brake": mean(braking).to_json(),
+            "harm": mean(reached).to_json(),
             "each_seed": reached.mean(axis=1).tolist(),
             "interquartile_mean": interquartile_mean([reached.mean(axis=1)], resamples=2000).to_json(),
-            "vehicles": [mean_over_seeds(column).to_json() for column in _columns(one.reached, harm_count)],
+            "vehicles": [mean(column).to_json() for column in _columns(one.reached, harm_count)],
             "searched": {
                 "worlds": min(searched, reached.shape[1]),
-                "full_brake": mean_over_seeds(braking[:, :searched]).to_json(),
-                "harm": mean_over_seeds(reached[:, :searched]).to_json(),
+                "full_brake": mean_searched(braking[:, :searched]).to_json(),
+                "harm": mean_searched(reached[:, :searched]).to_json(),
                 "each_seed": reached[:, :searched].mean(axis=1).tolist(),
-                "best_known": None if best is None else mean_over_seeds(best).to_json(),
+                "best_known": None if best is None else mean_searched(best).to_json(),
                 "share_of_possible_reduction": None if share is None else share.to_json(),
             },
             "shielded": None if one.shielded is None else _behind(one, one.shielded[harm_count], harm_count, searched),
@@ -113,21 +125,23 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
+    mean = partial(mean_over_seeds, clusters=one.clusters)
+    of_searched = None if one.clusters is None else one.clusters[:searched]
     actions = shielded.decisions * shielded.replaced.shape[2]
     return {
-        "harm": mean_over_seeds(shielded.harm).to_json(),
+        "harm": mean(shielded.harm).to_json(),
         "each_seed": shielded.harm.mean(axis=1).tolist(),
-        "difference": mean_over_seeds(shielded.harm - one.reached.world[harm_count]).to_json(),
-        "bound": mean_over_seeds(shielded.bound).to_json(),
+        "difference": mean(shielded.harm - one.reached.world[harm_count]).to_json(),
+        "bound": mean(shielded.bound).to_json(),
         "above_bound": int((shielded.harm > shielded.bound).sum()),
         "replaced": float(shielded.replaced.sum() / actions.sum()),
         "replaced_vehicles": (shielded.replaced.sum(axis=(0, 1)) / shielded.decisions.sum()).tolist(),
-        "stepped_in": mean_over_seeds((shielded.replaced > 0).any(axis=2)).to_json(),
-        "vehicles": [mean_over_seeds(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
-        "worse_off": mean_over_seeds((after > before + TOLERANCE).any(axis=2)).to_json(),
-        "above_baseline": mean_over_seeds((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
+        "stepped_in": mean((shielded.replaced > 0).any(axis=2)).to_json(),
+        "vehicles": [mean(column).to_json() for column in np.moveaxis(after - before, 2, 0)],
+        "worse_off": mean((after > before + TOLERANCE).any(axis=2)).to_json(),
+        "above_baseline": mean((after > shielded.baseline + TOLERANCE).any(axis=2)).to_json(),
         "moving": int(shielded.moving.sum()),
-        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched]).to_json()},
+        "searched": {"harm": mean_over_seeds(shielded.harm[:, :searched], clusters=of_searched).to_json()},
     }
 
 
@@ -141,15 +155,16 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     if before.level.swept is not None and after.level.swept is not None:
         entry |= {"swept_key": after.level.swept.key}
         entry |= {"from_number": before.level.swept.number, "to_number": after.level.swept.number}
+    mean = partial(mean_over_seeds, clusters=after.clusters)  # both levels are measured in the same worlds
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
         # compares seed k with seed k, or with the only seed
         old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
         worse = new > old + TOLERANCE
         entry[harm_count] = {
-            "difference": mean_over_seeds(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
-            "vehicles": [mean_over_seeds(new, old).to_json() for new, old in pairs],
-            "worse_off": mean_over_seeds(worse.any(axis=2)).to_json(),
+            "difference": mean(after.reached.world[harm_count], before.reached.world[harm_count]).to_json(),
+            "vehicles": [mean(new, old).to_json() for new, old in pairs],
+            "worse_off": mean(worse.any(axis=2)).to_json(),
             "worse_off_vehicles": [float(share) for share in worse.mean(axis=(0, 1))],
         }
     return entry

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ethbrake_marl.agents.protocol import Driver, Team
 from ethbrake_marl.evaluation.identity import result_identity
@@ -211,6 +212,7 @@ class Measured:
     # Count of harm -> results [seeds, worlds] behind a shield that bounds that harm; None: no shield requested.
     shielded: dict[HarmCount, Shielded] | None = None
     goal: Goal | None = None  # what the training minimises; None: the level has no learner
+    clusters: NDArray[np.str_] | None = None  # name of each world's cluster (``clusters_of``); None: no recordings
 
 
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
@@ -250,7 +252,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
         about = result_identity("ablate", level.scenario, sample)
         if not level.scenario.learners:
             scripts = _drive(level.scenario, sample, [Team({}, f"scripts of {level.name}")], say)
-            measured.append(Measured(level, None, scripts, braking, None, about))
+            measured.append(Measured(level, None, scripts, braking, None, about, clusters=sample.clusters))
             continue
         known = best_known(answers[level.name], list(answers.values()))
         best = {harm_count: harm[np.newaxis] for harm_count, harm in known.items()}
@@ -266,7 +268,9 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
                     say(Progress(name, sample.worlds.n, sample.worlds.n))
                 behind[harm_count] = Shielded.stack(parts)
             goal = Goal.of(trainings[level.name, algorithm], reached, braking)
-            measured.append(Measured(level, algorithm, reached, braking, best, about, behind or None, goal))
+            measured.append(
+                Measured(level, algorithm, reached, braking, best, about, behind or None, goal, sample.clusters)
+            )
     return measured
 
 

@@ -12,11 +12,12 @@ import numpy as np
 from ethbrake_marl.agents.learned import TRAINED_TEAM
 from ethbrake_marl.agents.protocol import Agent, Driver, Team
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, PhysicsError, count_of
+from ethbrake_marl.evaluation.evaluation import Evaluation
 from ethbrake_marl.evaluation.lineup import make_agents
 from ethbrake_marl.evaluation.outcome import Outcome
 from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.seeds import share_over_seeds
-from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.evaluation.statistics import Texts, mean, paired_difference
 from ethbrake_marl.extensions.cooperation.levels import HARM
 from ethbrake_marl.extensions.report.experiment import RunSection
 from ethbrake_marl.extensions.search.best_harm import search_list, task_problem
@@ -39,7 +40,17 @@ Harms = Mapping[HarmCount, Floats]  # count of harm -> harm of the whole line in
 
 
 class Stopped(Exception):
-    """A further training did not finish; nothing more is compared."""
+    """A further training did not finish; nothing more is compared.
+
+    Args:
+        told: sentence about it, without the full stop.
+        interrupted: name of the training that Ctrl-C stopped; "": it failed.
+
+    """
+
+    def __init__(self, told: str, interrupted: str = "") -> None:
+        super().__init__(told)
+        self.interrupted = interrupted
 
 
 class Compared(NamedTuple):
@@ -48,6 +59,7 @@ class Compared(NamedTuple):
     name: str
     other: Harms
     team: Harms
+    clusters: Texts | None  # name of each world's cluster (``Evaluation.clusters``)
 
 
 def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
@@ -64,32 +76,33 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     Returns None for one learner.
 
     """
-    evaluation, team = experiment.evaluation, experiment.learned
+    evaluation, team, by = experiment.evaluation, experiment.learned, experiment.evaluation.clusters
     if team != TRAINED_TEAM:
         return None
     outcomes, note = dict(evaluation.outcomes), "The training was interrupted: nothing more was trained to compare."
     rows: list[Compared] = []
+    interrupted = ""
     if experiment.trained.status == "finished":
         try:
             alone = _train_alone(experiment, tell)
             found = evaluate(evaluation.worlds, alone, scenario=evaluation.scenario, aftermath=False).complete()
             outcomes |= found.outcomes
             best = min(alone, key=lambda name: float(outcomes[name].world_harm(experiment.harm_count).mean()))
-            rows = [Compared(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]))]
+            rows = [Compared(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]), by)]
             silent, why_silent = _without_messages(experiment, tell)
             optimum, why_optimum = _joint_optimum(experiment, outcomes, tell)
             rows += [*silent, *optimum]
             note = f"{why_silent} {why_optimum}"
         except Stopped as stopped:
-            note = f"{stopped}: nothing more was compared."
-    sheets = {f"borne_{each}": _borne(outcomes, each, evaluation.scenario) for each in HARM_COUNTS}
+            note, interrupted = f"{stopped}: nothing more was compared.", stopped.interrupted
+    sheets = {f"borne_{each}": _borne(outcomes, each, evaluation) for each in HARM_COUNTS}
     sheets["added"] = _added(experiment)
     if rows:
         sheets |= {f"compared_{each}": _compared(rows, each) for each in HARM_COUNTS}
     content = {name: sheet.json() for name, sheet in sheets.items()} | {"note": note}
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"
     write_output(experiment.run.path / "cooperation.json", text.encode(), force=True)
-    return RunSection("Several learners", (*sheets.values(), note))
+    return RunSection("Several learners", (*sheets.values(), note), interrupted)
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
@@ -128,8 +141,9 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
     driven = evaluate(listed.take(rows), agents, scenario=silent, aftermath=False).complete()
     ours = _harms(evaluation.outcome(TRAINED_TEAM).take(rows))
     left_out = ", without those in which something is hit before that" if len(rows) < evaluation.worlds.n else ""
+    by = evaluation.take(rows).clusters
     found = [
-        Compared(f"{name} without messages", _harms(driven.outcome(name)), ours) for name in ("team", "full_brake")
+        Compared(f"{name} without messages", _harms(driven.outcome(name)), ours, by) for name in ("team", "full_brake")
     ]
     return found, (
         "The team without messages is trained and driven with sensors only, which see the next vehicle ahead and"
@@ -154,16 +168,16 @@ def _joint_optimum(
     except (InvalidInput, PhysicsError) as error:
         return [], f"The joint optimum was not searched: {error}."
     identity = task_problem(part.worlds, evaluation.task).identity
-    best, shares = {}, []
+    best, shares, by = {}, [], evaluation.take(rows).clusters
     for harm_count in HARM_COUNTS:
         harms = [outcome.take(rows).world_harm(harm_count) for outcome in outcomes.values()]
         best[harm_count] = np.fmin.reduce([table.harm(identity, harm_count), *harms])
         ours, worst = (outcomes[name].take(rows).world_harm(harm_count) for name in (TRAINED_TEAM, "full_brake"))
-        share = share_over_seeds(ours[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis])
+        share = share_over_seeds(ours[np.newaxis], worst[np.newaxis], best[harm_count][np.newaxis], clusters=by)
         if share is not None and share.value >= 0.0:
             reached = share.in_words(digits=0, scale=100.0, unit=" %")
             shares.append(f"{reached} of the possible reduction of {HARM[harm_count]}")
-    return [Compared("joint optimum", best, _harms(outcomes[TRAINED_TEAM].take(rows)))], (
+    return [Compared("joint optimum", best, _harms(outcomes[TRAINED_TEAM].take(rows)), by)], (
         f"The joint optimum is the least harm known that these learners can do together, from a search of {BUDGET:,}"
         f" candidates per world in the first {count_of(len(rows), 'world')}"
         + (f"; the team reaches {' and '.join(shares)}." if shares else ".")
@@ -188,7 +202,7 @@ def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, 
     except EthBrakeError as error:
         raise Stopped(f"The training {folder} failed ({error})") from error
     if result.status == "interrupted":
-        raise Stopped(f"The training {folder} was interrupted")
+        raise Stopped(f"The training {folder} was interrupted", f"the training {folder}")
     return load_team(path, scenario, folder)
 
 
@@ -206,14 +220,15 @@ def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
         Column("The team's minus its", "difference", sign="+"),
     ]
     cells: list[Row] = []
-    for name, other, team in rows:
+    for name, other, team, by in rows:
         ours, its = team[harm_count], other[harm_count]
-        cells.append((name, len(ours), mean(its), mean(ours), paired_difference(ours, its)))
+        cells.append((name, len(ours), mean(its, by), mean(ours, by), paired_difference(ours, its, by)))
     return Sheet(f"The trained team compared: {HARM[harm_count]}, mean per world (m²/s²)", columns, cells)
 
 
-def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, scenario: Scenario) -> Sheet:
+def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: Evaluation) -> Sheet:
     """Return a table of the harm that each vehicle bears, one row for each agent."""
+    scenario, by = evaluation.scenario, evaluation.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     learn = ", ".join(names[i] for i in scenario.learners)
     columns = [Column("Agent", "agent", text=True)]
@@ -222,7 +237,7 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, scenario: Sce
     rows: list[Row] = []
     for agent, outcome in outcomes.items():
         each = outcome.vehicle_harm(harm_count).T
-        rows.append((agent, *map(mean, each), mean(outcome.world_harm(harm_count))))
+        rows.append((agent, *(mean(harm, by) for harm in each), mean(outcome.world_harm(harm_count), by)))
     return Sheet(f"Who bears what: {HARM[harm_count]}, mean per world (m²/s²)", columns, rows, f"{learn} learn.")
 
 

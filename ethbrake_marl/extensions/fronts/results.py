@@ -10,9 +10,10 @@ import numpy as np
 
 from ethbrake_marl.agents.protocol import Team
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.conditions import Conditions
 from ethbrake_marl.evaluation.identity import result_versions, scenario_sha256, worlds_sha256
 from ethbrake_marl.evaluation.rollout import evaluate
-from ethbrake_marl.evaluation.statistics import mean, paired_difference
+from ethbrake_marl.evaluation.statistics import Texts, mean, paired_difference
 from ethbrake_marl.extensions.fronts.front import Borne, Front, amounts_of
 from ethbrake_marl.extensions.fronts.hypervolume import MOST_DIMENSIONS, hypervolume
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
@@ -31,8 +32,9 @@ def front_results(
 ) -> Json:
     """Return the content of ``front.json``: the front, full braking, and the agents beside it.
 
-    All means have 95 % intervals over worlds. An agent's ``ratio`` is its mean weighted harm divided by the front's;
-    null where the front's is 0. ``above`` is the mean difference of the two.
+    All means have 95 % intervals over worlds, or over recordings where the worlds come from these. An agent's
+    ``ratio`` is its mean weighted harm divided by the front's; null where the front's is 0. ``above`` is the mean
+    difference of the two.
 
     Args:
         front: the searched front.
@@ -42,13 +44,14 @@ def front_results(
         seed: seed of the list, or None.
 
     """
-    least = front.amounts
+    least, by = front.amounts, sample.clusters
+    recordings = {} if by is None else {"recordings": len(np.unique(by))}
     agents = {}
     for name, borne in front.agents.items():
-        points = _points(front, borne)
+        points = _points(front, borne, by)
         for k, (point, row) in enumerate(zip(points, front.weights, strict=True)):
             amounts, best = amounts_of(borne[front.harm_count][k], row), float(least[k].mean())
-            point["above"] = paired_difference(amounts, least[k]).to_json()
+            point["above"] = paired_difference(amounts, least[k], by).to_json()
             point["ratio"] = float(amounts.mean()) / best if best > 0.0 else None
         agents[name] = points
     return {
@@ -56,45 +59,47 @@ def front_results(
         "scenario": scenario.name,
         "seed": seed,
         "episodes": len(sample.index),
+        **recordings,
         "harm_count": front.harm_count,
         "vehicles": list(scenario.vehicle_names),
-        "beside": {name: _vehicles(borne) for name, borne in beside.items()},
-        "points": _points(front, front.borne),
+        "beside": {name: _vehicles(borne, by) for name, borne in beside.items()},
+        "points": _points(front, front.borne, by),
         "agents": agents,
-        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count]),
+        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count], by),
         "scenario_sha256": scenario_sha256(scenario),
         "worlds_sha256": worlds_sha256(sample.worlds, sample.index),
         "versions": result_versions(),
     }
 
 
-def _points(front: Front, borne: Borne) -> list[Json]:
+def _points(front: Front, borne: Borne, by: Texts | None) -> list[Json]:
     return [
         {
             "weights": row.tolist(),
-            "vehicles": _vehicles({count: borne[count][k] for count in HARM_COUNTS}),
-            "amount": mean(amounts_of(borne[front.harm_count][k], row)).to_json(),
-            "sum": mean(borne[front.harm_count][k].sum(axis=1)).to_json(),
+            "vehicles": _vehicles({count: borne[count][k] for count in HARM_COUNTS}, by),
+            "amount": mean(amounts_of(borne[front.harm_count][k], row), by).to_json(),
+            "sum": mean(borne[front.harm_count][k].sum(axis=1), by).to_json(),
         }
         for k, row in enumerate(front.weights)
     ]
 
 
-def _vehicles(borne: Borne) -> Mapping[str, list[Json]]:
-    return {count: [mean(each).to_json() for each in borne[count].T] for count in HARM_COUNTS}
+def _vehicles(borne: Borne, by: Texts | None) -> Mapping[str, list[Json]]:
+    return {count: [mean(each, by).to_json() for each in borne[count].T] for count in HARM_COUNTS}
 
 
-def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
+def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None) -> list[Json]:
     """Return hypervolumes of the mean harm of the front and of each agent, for two reference points.
 
     The first one is the mean harm of full braking: points count that are better for every vehicle. The second one is
     the largest mean harm of each vehicle under full braking or at any point of the front, so that points count that
     take somebody's side. ``share`` is an agent's hypervolume divided by the front's. Intervals are percentiles over
-    ``RESAMPLES`` resamples of the worlds.
+    ``RESAMPLES`` resamples of the worlds, or of their clusters.
 
     Args:
         front: the front, and the agents' harm beside it.
         full_brake: [n, N] harm of each vehicle if the learners brake fully.
+        clusters: name of each world's cluster, [n]; None: all worlds are independent.
 
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
@@ -103,7 +108,10 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     if "front" in front.agents:
         raise InvalidInput("agent 'front': this name stands for the front itself; give the agent another name")
     n = len(full_brake)
-    draws = [np.arange(n), *np.random.default_rng(0).integers(n, size=(RESAMPLES, n))]  # first: all worlds, each once
+    names = np.arange(n) if clusters is None else np.unique(clusters, return_inverse=True)[1]
+    members = [np.flatnonzero(names == k) for k in range(names.max() + 1)]  # rows of each cluster
+    drawn = np.random.default_rng(0).integers(len(members), size=(RESAMPLES, len(members)))
+    draws = [np.arange(n), *(np.concatenate([members[k] for k in row]) for row in drawn)]  # first: each world once
     points = {name: np.stack([borne[:, rows].mean(axis=1) for rows in draws]) for name, borne in sets.items()}
     braking = np.stack([full_brake[rows].mean(axis=0) for rows in draws])
     found = []
@@ -163,7 +171,7 @@ def front_sheet(results: Json) -> Sheet:
     note = (
         f"Mean {words} harm of each vehicle, and of the line by first and by all impacts, m2/s2. Agents: their weighted"
     )
-    note += " harm divided by the front's."
+    note += f" harm divided by the front's{Conditions(recordings=results.get('recordings', 0)).by_recording}."
     return Sheet(f"Front of {results['scenario']}, {results['episodes']:,} worlds", columns, rows, note, gap=2)
 
 

@@ -52,6 +52,7 @@ class RunSection:
 
     title: str  # heading
     body: tuple[str | Sheet, ...]  # sentences, which become paragraphs, and tables; all are printed, too
+    interrupted: str = ""  # what Ctrl-C stopped, as ``RunReport.interrupted``; "": nothing
 
 
 MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: it has nothing to say about this run
@@ -115,7 +116,9 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     printed = [part for section in sections for part in section.body]
     with_rows = " and the paper's rows" if is_papers else ""
     return RunReport(
-        (brief(rows, beside), *rows.tables()[1:], *printed), f"report, with every measure{with_rows}: {page}"
+        (brief(rows, beside), *rows.tables()[1:], *printed),
+        f"report, with every measure{with_rows}: {page}",
+        ", ".join(section.interrupted for section in sections if section.interrupted),
     )
 
 

@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.registry import Part
 
-KEPT = "the same command goes on with what is in the folder"
+REMAINS = "the same command goes on with what is in the folder"
 
 PAPER_EPISODES = 10_000
 
@@ -45,7 +45,7 @@ def reproduce_command(
     Says what agrees, what differs and what cannot agree. Writes one page (index.html), and for each item its figures,
     its data and its result. Prints first how long it will take. The same command goes on after an interruption.
     """
-    with Out(as_json=as_json, force=force, kept=KEPT) as out:
+    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         from ethbrake_marl.extensions.reproduction.folder import Reproduction
         from ethbrake_marl.extensions.reproduction.making import choose_items, make_items
         from ethbrake_marl.extensions.studies.machine import this_machine
@@ -72,7 +72,7 @@ def reproduce_command(
         out.result([result.in_words() for result in results], Sheet("", ("Item", "Verdict", "Because"), verdicts))
         out.note(f"page: {output / 'index.html'}")
         if not finished:
-            out.interrupted(f"interrupted: items are made of the trainings that were finished; {KEPT}")
+            out.interrupted(f"interrupted: items are made of the trainings that were finished; {REMAINS}")
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

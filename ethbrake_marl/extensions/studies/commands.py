@@ -15,7 +15,7 @@ from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.errors import InvalidInput, count_of, need
 from ethbrake_marl.files.sheet import Sheet
 
-KEPT = "the same command goes on with what is in the folder"
+REMAINS = "the same command goes on with what is in the folder"
 
 ROUNDING = 1e-6  # m2/s2
 
@@ -60,7 +60,7 @@ def sweep_command(
     The same command goes on after an interruption: finished jobs are kept, begun ones go
     on. Exit status 1 where jobs failed: failures.csv says why.
     """
-    with Out(as_json=as_json, kept=KEPT) as out:
+    with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.studies.sweep import SweepPlan
 
         plan = SweepPlan.read(file)
@@ -112,7 +112,7 @@ def tune_command(
     Harm is measured on a list of worlds of its own. The same command goes on after an interruption: trials that ended
     are kept, those that were begun go on. Exit status 1 where no trial came to its end.
     """
-    with Out(as_json=as_json, force=force, kept=KEPT) as out:
+    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         need("optuna")
         from ethbrake_marl.extensions.studies.tuning import TuningPlan
 
@@ -169,7 +169,7 @@ def tune_command(
 def _end_study(out: Out, summary: str, *, interrupted: bool, failed: bool) -> None:
     """Print ``summary`` of a sweep or tuning, then end the command: status 130 if interrupted, 1 if failed."""
     if interrupted:
-        out.interrupted(f"interrupted; {summary}; {KEPT}")
+        out.interrupted(f"interrupted; {summary}; {REMAINS}")
     out.note(summary)
     if failed:
         raise typer.Exit(1)

@@ -5,11 +5,14 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.statistics import mean, paired_difference
 from ethbrake_marl.extensions.fronts.front import Front, amounts_of, least_largest, search_front
+from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolumes
 from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
 from ethbrake_marl.extensions.search.best_harm import task_problem
 from ethbrake_marl.extensions.search.shipped import best_known
 from ethbrake_marl.scenario.task import Task
+from tests.evaluation.test_clusters import recorded
 
 PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(40, 7).worlds
@@ -98,3 +101,21 @@ def test_team__has_a_front_but_no_agents() -> None:
 def test_weights__of_another_number_are_refused() -> None:
     with pytest.raises(InvalidInput, match="must be 3 numbers"):
         search_front(PAPER, WORLDS, [[1.0, 1.0]])
+
+
+def test_results__of_recorded_rows_have_intervals_by_recording() -> None:
+    scenario = recorded(8)
+    sample = scenario.sample(80, 7)
+    borne = full_braking(scenario, sample)
+    some = {count: each[np.newaxis] for count, each in borne.items()}
+    less = {count: 0.9 * each for count, each in some.items()}
+    front = Front(np.ones((1, 3)), "first", less, (), {"agent": some})
+    found = front_results(front, scenario, sample, {"full_brake": borne}, 7)
+    (point,), (driven,), by = found["points"], found["agents"]["agent"], sample.clusters
+    amounts = [amounts_of(each["first"][0], front.weights[0]) for each in (less, some)]
+    assert found["beside"]["full_brake"]["total"][1] == mean(borne["total"][:, 1], by).to_json()
+    assert point["amount"] == mean(amounts[0], by).to_json()
+    assert driven["above"] == paired_difference(amounts[1], amounts[0], by).to_json()
+    assert found["recordings"] == 8 and "95 % intervals by 8 recordings." in front_sheet(found).note
+    wide, narrow = (hypervolumes(front, borne["first"], names)[0]["of"]["front"]["volume"] for names in (by, None))
+    assert wide["value"] == narrow["value"] and np.ptp(wide["interval"]) > np.ptp(narrow["interval"])

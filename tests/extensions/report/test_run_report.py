@@ -93,6 +93,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
     assert "interrupted" in (folder / "report.html").read_text()
     assert ethbrake("train", "--resume", folder).status == 0
     assert status_of(folder, "status", "steps") == ("finished", 256)
+    assert not [*folder.glob("*.html"), *folder.glob("*.png"), *folder.glob("results.*")]  # of the policy before
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.evaluation.seeds import mean_over_seeds
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.figures import ablation_figures
 from ethbrake_marl.extensions.cooperation.joint_optimum import (
@@ -248,12 +249,27 @@ def test_compare__the_share_follows_from_what_stands_beside_the_joint_optimum(le
     assert level["full_brake"]["value"] == pytest.approx(20.0 * mild.mean())
 
 
+def test_compare__worlds_of_one_recording_are_one_cluster(levels) -> None:
+    one = levels[1]
+    uneven = np.repeat([0.5, 0.7, 1.0, 1.8], WORLDS // 4)
+    reached = replace(one.reached, world={count: harm * uneven for count, harm in one.reached.world.items()})
+    alone = replace(one, reached=reached)
+    together = replace(alone, clusters=np.repeat(["a", "b", "c", "d"], WORLDS // 4))
+    narrow, wide = (compare([each, each], SEARCHED) for each in (alone, together))
+    harms = [found["levels"][0]["first"]["harm"] for found in (narrow, wide)]
+    assert harms[0]["value"] == harms[1]["value"]
+    assert harms[1] == mean_over_seeds(reached.world["first"], clusters=together.clusters).to_json()
+    assert np.ptp(harms[1]["interval"]) > 2.0 * np.ptp(harms[0]["interval"])
+
+
 def test_undertrained__full_braking_does_better_is_said_in_table_page_and_figures(levels) -> None:
-    told = "cooperation-3-pair (ppo) is not trained enough to say anything: its total harm is 38.20, and 24.20 if"
-    told += " everybody brakes fully."
+    told = "Not trained enough to say anything: cooperation-3-pair (ppo), total harm 38.20 (24.20 if everybody brakes"
+    told += " fully)."
     worse, better = Goal("total harm", 38.2, 24.2), Goal("total harm", 24.2, 24.2)
     found = compare([levels[0], replace(levels[1], goal=better), replace(levels[2], goal=worse)], SEARCHED)
     assert found["undertrained"] == [told]
+    (both,) = compare([replace(level, goal=worse) for level in levels[1:3]], SEARCHED)["undertrained"]
+    assert both.count("Not trained enough") == 1 and both.count("total harm 38.20 (24.20") == 2
     assert [level["goal"] and level["goal"]["missed"] for level in found["levels"]] == [None, False, True]
     assert markdown(found, "Conditions.").startswith(f"**{told}**\n\n## Levels")
     page = ablation_page({**found, "settings": {}}, "Conditions.", {})
@@ -300,7 +316,7 @@ def test_ablate__goals_are_those_of_the_recipe(finished_ablation: Path) -> None:
         assert goal["name"] == "total harm"
         assert goal["reached"] == pytest.approx(level["total"]["harm"]["value"])
         assert goal["full_brake"] == pytest.approx(level["total"]["full_brake"]["value"])
-        said = any(line.startswith(f"{level['level']} (") for line in found["undertrained"])
+        said = any(f" {level['level']} (" in line for line in found["undertrained"])
         assert said == goal["missed"] == (goal["reached"] > goal["full_brake"] + 1e-6)
 
 

@@ -61,7 +61,7 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent coast --against coast --budget 10",
-        "agent 'coast' is given twice; each agent drives every world once",
+        "agent 'coast' is listed twice; each agent drives every world once",
     ),
     (
         "study falsify --agent full_brake --measure harm --against coast --budget 10",

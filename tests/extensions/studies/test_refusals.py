@@ -309,7 +309,7 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "--measure difference: compares two agents; say which is the other one, --against AGENT": lambda: Measure.of(
         "difference", "full_brake", None, PAPER, "first"
     ),
-    "agent 'full_brake' is given twice; each agent drives every world once": lambda: Measure.of(
+    "agent 'full_brake' is listed twice; each agent drives every world once": lambda: Measure.of(
         "regret", "full_brake", "full_brake", PAPER, "first"
     ),
     "agent 'full_brake': tells no bound; --measure bound is for an agent behind a shield": lambda: Measure.of(
