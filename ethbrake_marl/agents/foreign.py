@@ -90,16 +90,16 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
 
     def predict(seen: Observations, **memory: Any) -> tuple[Any, State]:
         statistics = normalisation(model)
-        given = seen if statistics is None else statistics.normalize_obs(seen)
-        found = model.predict(given, deterministic=True, **memory)
-        return found if isinstance(found, tuple) else (found, None)
+        inputs = seen if statistics is None else statistics.normalize_obs(seen)
+        output = model.predict(inputs, deterministic=True, **memory)
+        return output if isinstance(output, tuple) else (output, None)
 
     def world_axis(two: Any, three: Any) -> int:
         shapes = np.shape(two), np.shape(three)
-        found = [axis for axis, sizes in enumerate(zip(*shapes, strict=True)) if sizes == (2, 3)]
-        if len(found) != 1:
+        candidates = [axis for axis, sizes in enumerate(zip(*shapes, strict=True)) if sizes == (2, 3)]
+        if len(candidates) != 1:
             raise InvalidInput(f"its state has arrays of shape {shapes[0]} for two worlds and {shapes[1]} for three")
-        return found[0]
+        return candidates[0]
 
     try:
         like, of_three = (predict(np.zeros((n, features), np.float32))[1] for n in (2, 3))
@@ -111,8 +111,8 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
 
     def infer(seen: Observations, state: State) -> tuple[Any, State]:
         begins, memory = state
-        kept = None if begins.all() else map_memory(lambda array, axis: np.moveaxis(array, 0, axis), memory, axes)
-        action, memory = predict(seen, state=kept, episode_start=begins)
+        carried = None if begins.all() else map_memory(lambda array, axis: np.moveaxis(array, 0, axis), memory, axes)
+        action, memory = predict(seen, state=carried, episode_start=begins)
         after = map_memory(lambda array, axis: np.moveaxis(to_array(array), axis, 0), memory, axes)
         return action, (np.zeros(len(seen), np.bool_), after)
 
@@ -124,9 +124,9 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
 
 
 def _ask_onnx(session: Any) -> Infer:
-    given, names = session.get_inputs()[0].name, [output.name for output in session.get_outputs()]
+    input_name, names = session.get_inputs()[0].name, [output.name for output in session.get_outputs()]
     wanted = "action" if "action" in names else names[0]
-    return lambda seen, _: (session.run([wanted], {given: seen})[0], None)
+    return lambda seen, _: (session.run([wanted], {input_name: seen})[0], None)
 
 
 def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
@@ -143,8 +143,8 @@ def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
     def call(seen: Observations, state: State) -> tuple[Any, State]:
         parameter = next(iter(module.parameters()), None)
         with torch.no_grad():
-            given = torch.from_numpy(np.array(seen)).to("cpu" if parameter is None else parameter.device)
-            return module(given, state) if with_state else (module(given), None)
+            inputs = torch.from_numpy(np.array(seen)).to("cpu" if parameter is None else parameter.device)
+            return module(inputs, state) if with_state else (module(inputs), None)
 
     return call
 
@@ -411,10 +411,10 @@ class PolicyAgent:
         rows = np.arange(len(seen))
         while len(rows) > 1:
             halves = (rows[: len(rows) // 2], rows[len(rows) // 2 :])
-            found = next((half for half in halves if fails(half)), None)
-            if found is None:
+            failing = next((half for half in halves if fails(half)), None)
+            if failing is None:
                 return None
-            rows = found
+            rows = failing
         return int(rows[0])
 
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:

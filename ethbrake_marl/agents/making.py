@@ -168,11 +168,11 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     function = load_from_file(*named, reads=settings.policy)
     if not callable(function):
         raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is no function; name the one that makes the agent")
-    given: tuple[Any, ...] = (argument, settings)
+    arguments: tuple[Any, ...] = (argument, settings)
     with suppress(TypeError, ValueError):  # a built-in function may have no signature
         if not inspect.signature(function).parameters:
-            given = ()
-    if not given and (argument, settings.policy) != (None, None):
+            arguments = ()
+    if not arguments and (argument, settings.policy) != (None, None):
         raise InvalidInput(f"agent {settings.spec!r}: {named[1]} has no parameters, so it takes no argument")
-    made: Driver = function(*given)
-    return made
+    driver: Driver = function(*arguments)
+    return driver

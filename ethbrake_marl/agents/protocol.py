@@ -159,8 +159,8 @@ def fixed_commands(
                 f"{who}: vehicle_{i + 1} is controlled by {name!r}, whose command is not fixed at the alert{advice}"
             )
         command[:, i], _ = ask_script(script, worlds, begin_script(script, worlds, i, scripts), i)
-    told = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
-    if not np.array_equal(worlds.play_pieces(told).vehicles.pieces, worlds.vehicles.pieces):
+    pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
+    if not np.array_equal(worlds.play_pieces(pieces).vehicles.pieces, worlds.vehicles.pieces):
         raise InvalidInput(
             f"{who}: a profile: the pieces in which vehicles brake in these worlds are not those of its scripts; draw"
             " or read the worlds with the same scenario"

@@ -56,10 +56,10 @@ class Entry:
         Only for a wrapper whose ``form`` lists all arguments that it takes.
         """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
-        found = [name]
+        words = [name]
         for option in options:
-            found += [f"{each}{option}" for each in found]
-        return tuple(found)
+            words += [f"{each}{option}" for each in words]
+        return tuple(words)
 
     def takes(self, argument: str) -> bool:
         """Return whether a wrapper takes this argument, the text after the colon; an empty text means no argument."""
@@ -80,8 +80,8 @@ class Entry:
         before, _, last = (argument or "").rpartition(":")
         if last in variants_of(self.name):
             argument, make = before or None, VARIANTS[f"{self.name}.{last}"].make
-        made: Driver = make(*inside, argument, settings)
-        return made
+        driver: Driver = make(*inside, argument, settings)
+        return driver
 
 
 def around_entry(each: str) -> Entry:
@@ -124,8 +124,8 @@ def agents_refused() -> list[str]:
 
     The list is empty if everything can be loaded.
     """
-    found = [each.why_not(name) for each in (AGENTS, SHIELDS, VARIANTS) for name in each]
-    return [reason for reason in found if reason is not None]
+    reasons = [each.why_not(name) for each in (AGENTS, SHIELDS, VARIANTS) for name in each]
+    return [reason for reason in reasons if reason is not None]
 
 
 def around_forms() -> tuple[str, ...]:

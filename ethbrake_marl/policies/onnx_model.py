@@ -83,9 +83,9 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
     above = node("Mul", [node("Max", [action, zero]), capacities[1]])
     node("Add", [below, above], output="acceleration_mps2")
 
-    given = [helper.make_tensor_value_info("observation", float32, ["n", spec.observation_size])]
-    found = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
-    graph = helper.make_graph(nodes, "policy", given, found, constants)
+    model_inputs = [helper.make_tensor_value_info("observation", float32, ["n", spec.observation_size])]
+    model_outputs = [helper.make_tensor_value_info(name, float32, ["n", 1]) for name in ("action", "acceleration_mps2")]
+    graph = helper.make_graph(nodes, "policy", model_inputs, model_outputs, constants)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], producer_name="ethbrake-marl")
     model.ir_version = 8  # supported by every runtime since 2022
     metadata = {

@@ -46,17 +46,17 @@ def proposing_agents(
 
     """
     if isinstance(policy, Team):
-        given: dict[int, Agent] = policy.drivers
+        drivers: dict[int, Agent] = policy.drivers
     elif isinstance(policy, Mapping):
         by_name = {f"vehicle_{i + 1}": i for i in vehicles}
-        given = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
+        drivers = {by_name.get(name, -1): proposing_agent(each, where) for name, each in policy.items()}
     else:
         agent = proposing_agent(policy, where)
         return dict.fromkeys(vehicles, agent)
-    if set(given) != set(vehicles):
+    if set(drivers) != set(vehicles):
         names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
         raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
-    return {i: given[i] for i in vehicles}
+    return {i: drivers[i] for i in vehicles}
 
 
 Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]

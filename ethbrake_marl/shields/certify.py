@@ -454,8 +454,8 @@ def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
     A plan holds one action for each decision: ``past`` and the result are [n, L] or [n, L, K]; ``later`` has the same
     shape or is one action.
     """
-    made = np.arange(past.shape[1]) < steps[:, np.newaxis]
-    return np.where(made if past.ndim == 2 else made[:, :, np.newaxis], past, later)
+    past_steps = np.arange(past.shape[1]) < steps[:, np.newaxis]
+    return np.where(past_steps if past.ndim == 2 else past_steps[:, :, np.newaxis], past, later)
 
 
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
@@ -476,11 +476,11 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     """
     n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)
     _check_plan(running, backup.plan)
-    given = np.ascontiguousarray(proposed, np.float64)
+    actions = np.ascontiguousarray(proposed, np.float64)
     shape = (n, *backup.plan.shape[2:])
-    if not (given.shape == shape and backup.harm.shape == budget.shape == (n,)):
+    if not (actions.shape == shape and backup.harm.shape == budget.shape == (n,)):
         raise InvalidInput(
-            f"certify: proposed {given.shape}, backup's harm {backup.harm.shape}, budget {budget.shape};"
+            f"certify: proposed {actions.shape}, backup's harm {backup.harm.shape}, budget {budget.shape};"
             f" {shape}, and twice ({n},) needed"
         )
     if not (budget >= backup.harm).all():
@@ -488,7 +488,7 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     plans, after, out = backup.plan.copy(), np.empty_like(running.states), np.empty((n, vehicles, 4))
     over, failed = np.zeros(problem.n, np.bool_), np.zeros(n, np.bool_)
     certify_worlds(
-        running, given.reshape(n, vehicles), budget, backup.harm,
+        running, actions.reshape(n, vehicles), budget, backup.harm,
         backup.constants.reshape(-1, vehicles), plans.reshape(n, plans.shape[1], vehicles), after, out, over, failed,
     )  # fmt: skip
     _raise_if_any(failed)

@@ -137,8 +137,8 @@ class ShieldGuard(ABC):
         ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is None before the first episode.
         """
         shield, policies = memory or Guarded(self._fresh, {})
-        begun = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
-        policies = renew_memory(policies, rows, begun) if policies else begun
+        memories = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
+        policies = renew_memory(policies, rows, memories) if policies else memories
         return Guarded(self._started(copy.copy(shield), alert, rows), policies)
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
@@ -162,13 +162,13 @@ class ShieldGuard(ABC):
         the alert of the new episode.
         """
         memory: Any = running.guarded
-        ruling, begun = running.ruling, running.steps == 0
-        if ruling is None or begun.all():
+        ruling, first = running.ruling, running.steps == 0
+        if ruling is None or first.all():
             return self._of_vehicles(self.tell(memory, None), running)
         last = self._of_vehicles(self.tell(ruling.memory, ruling), running)
-        if begun.any():
+        if first.any():
             alert = self._of_vehicles(self.tell(memory, None), running)
-            last = {name: np.where(begun[:, np.newaxis], alert[name], each) for name, each in last.items()}
+            last = {name: np.where(first[:, np.newaxis], alert[name], each) for name, each in last.items()}
         return last
 
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:

@@ -120,8 +120,8 @@ class EpisodeGuard(ShieldGuard):
         self._hybrid = hybrid
 
     def _started(self, shield: Memory, alert: Worlds, rows: Ints) -> Memory:
-        begun = begin_script(self._hybrid, alert, self.vehicles[0], self.scripts)
-        return begun if shield is None else renew_memory(shield, rows, begun)
+        memory = begin_script(self._hybrid, alert, self.vehicles[0], self.scripts)
+        return memory if shield is None else renew_memory(shield, rows, memory)
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
         """Return the actions of the driver that was chosen at the alert.

@@ -83,8 +83,8 @@ def certify_by_policy(
     margin, plan = decision.margin.copy(), again.backup.plan
     margin[rows] = np.maximum(margin[rows], again.margin)
     assert (plan == from_now(decision.backup.plan[rows], plan, again.after.steps - 1)).all()  # same past
-    kept = np.flatnonzero((again.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
-    return decision._replace(margin=margin).put(rows[kept], again._replace(margin=margin[rows]), kept)
+    certified = np.flatnonzero((again.reason != NO_CERTIFICATE).reshape(len(rows), -1).all(axis=1))
+    return decision._replace(margin=margin).put(rows[certified], again._replace(margin=margin[rows]), certified)
 
 
 def certify_rollouts(
@@ -113,15 +113,15 @@ def certify_rollouts(
     plan = _later_plan(running.nominal(), first, rows, budget, held, proposer)
     with renumbered(rows):
         harm = plan_harm(part, plan)
-        kept = harm <= least
+        improved = harm <= least
         if part.caps.size:
             within = (ends_under(part, plan)[1] <= part.caps).all(axis=1)
-            kept &= within.reshape(part.n, -1).all(axis=1)
+            improved &= within.reshape(part.n, -1).all(axis=1)
         decision = certify(part, first, Backup(plan, harm, no_constants(plan)), np.maximum(least, harm))
-    each = kept.reshape(-1, *[1] * (first.ndim - 1))
-    told = np.where(silent, NOT_A_NUMBER, ShieldReason.POLICY_ROLLOUT)
+    each = improved.reshape(-1, *[1] * (first.ndim - 1))
+    reason = np.where(silent, NOT_A_NUMBER, ShieldReason.POLICY_ROLLOUT)
     margin = np.broadcast_to((least - harm).reshape(each.shape), first.shape)
-    return decision._replace(intervened=silent | ~each, margin=margin, reason=np.where(each, told, NO_CERTIFICATE))
+    return decision._replace(intervened=silent | ~each, margin=margin, reason=np.where(each, reason, NO_CERTIFICATE))
 
 
 def _later_plan(

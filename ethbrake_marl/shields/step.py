@@ -352,11 +352,11 @@ class StepShield:
         goes_on, asked = asked & before.finished, asked & ~before.finished
         each = np.repeat(asked, before.members)
         now = before._replace(ended=before.ended | ~each)
-        given = np.array(proposed, np.float64)
-        given[memory.distrusted] = np.nan
-        decision = certify(now, given, held, budget)
+        actions = np.array(proposed, np.float64)
+        actions[memory.distrusted] = np.nan
+        decision = certify(now, actions, held, budget)
         if proposer is not None:
-            decision = certify_by_policy(decision, now, given, budget, held.plan, proposer)
+            decision = certify_by_policy(decision, now, actions, budget, held.plan, proposer)
         decision = self._also_certified(now, memory, budget, decision, asked & ~memory.distrusted)
         decision.reason[asked & memory.distrusted] = ShieldReason.ASSUMPTION_BROKEN
         decision.applied[goes_on] = -1.0  # full braking where the episode should have ended

@@ -98,9 +98,9 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
         ``seed`` and ``options`` are the environment's. ``infos[agent]["shield_bound_harm"]`` already holds the bound.
         """
         self.attached.check_open()
-        begun: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
+        result: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
         self.attached.check_open()
-        return begun
+        return result
 
     def step(self, actions: Mapping[str, Any]) -> Told:
         """Advance by one step with the learners' actions certified or replaced.
@@ -110,11 +110,11 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
         agent name.
         """
         self.attached.check_open()
-        found: Told = super().step(actions)
+        result: Told = super().step(actions)
         if not self.attached.engine.components:
             for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
-                found[1][agent] -= penalty
-        return found
+                result[1][agent] -= penalty
+        return result
 
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
@@ -162,9 +162,9 @@ class ShieldedEnv(
         ``seed`` and ``options`` are the environment's. ``info["shield_bound_harm"]`` already holds the bound.
         """
         self.attached.check_open()
-        begun = self.env.reset(seed=seed, options=options)
+        result = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
-        return begun
+        return result
 
     def step(self, action: NDArray[Any]) -> Any:
         """Advance by one time step with the action [1] certified or replaced.
@@ -212,9 +212,9 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
         ``seed`` and ``options`` are the environment's. ``infos["shield_bound_harm"]`` already holds the bounds.
         """
         self.attached.check_open()
-        begun = self.env.reset(seed=seed, options=options)
+        result = self.env.reset(seed=seed, options=options)
         self.attached.check_open()  # a wrapper inside may have put another environment there
-        return begun
+        return result
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [rows, 1] certified or replaced.

@@ -82,15 +82,15 @@ def optimise_coupled(
     # closed form cannot represent a vehicle that coasts or drives; it keeps its capacity.
     braking = np.where(command < 0.0, -command, capacity)
     braking[:, vehicle] = capacity[:, vehicle]
-    told = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
-    best = closed_form(told, vehicle).deceleration_mps2  # only a first guess if brakes build up
+    closed_form_worlds = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
+    best = closed_form(closed_form_worlds, vehicle).deceleration_mps2  # only a first guess if brakes build up
     command[:, vehicle] = -best
     _, impacts = advance(worlds, command, until_s=horizon_s)
     first = impacts.first_impact_harm.sum(axis=1) + impacts.obstacle_first_harm
     total = impacts.total_harm.sum(axis=1) + impacts.obstacle_total_harm
     hit = np.flatnonzero(total > 0.0)
     if hit.size:
-        optimum = _minimise(worlds, told, command, vehicle, hit, harm_count, horizon_s)
+        optimum = _minimise(worlds, closed_form_worlds, command, vehicle, hit, harm_count, horizon_s)
         harms = (first, total) if harm_count == "first" else (total, first)
         for column, values in zip((best, *harms), optimum, strict=True):
             column[hit] = values

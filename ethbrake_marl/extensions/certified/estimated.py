@@ -227,18 +227,18 @@ class Ranges:
         """
         worlds.refuse_build_up(":estimated")
         vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
-        told, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
+        known, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
         given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
                  "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
-        some, pieces = told.pieces.any(axis=2), told.pieces
+        some, pieces = known.pieces.any(axis=2), known.pieces
         has = {"mass_t": pieces[..., MASS], "speed_limit_mps": some}
         of = {
             key: np.where(has.get(key, pieces[..., BRAKING_CAPACITY]), values, self.at(share, key))
             for key, values in given.items()
         }
-        at_s = np.where(told.known, told.at_s, 0.0)
+        at_s = np.where(known.known, known.at_s, 0.0)
         own_part = np.where(pieces[..., LATENCY], v.own_latency_s, self.at(share, "latency_s"))
-        latency = np.where(told.reacts, at_s, np.maximum(np.maximum(own_part, self.at(share, "news_s")), at_s))
+        latency = np.where(known.reacts, at_s, np.maximum(np.maximum(own_part, self.at(share, "news_s")), at_s))
         past = v.latency_s[:, vehicle] <= worlds.time_s
         latency[:, vehicle] = np.where(
             past, v.latency_s[:, vehicle], np.maximum(v.own_latency_s[:, vehicle], worlds.time_s)
@@ -247,28 +247,28 @@ class Ranges:
             of["braking_capacity_mps2"], of["driving_capacity_mps2"], latency, of["mass_t"], of["speed_limit_mps"],
             v.restitution, harm_weight=v.harm_weight,
         )  # fmt: skip
-        place = np.where(told.known, told.place_m, self.at(share, "place") - way_m[:, np.newaxis])
-        speed = np.maximum(np.where(told.known, told.speed_mps, self.at(share, "speeds_mps")), 0.0)
+        place = np.where(known.known, known.place_m, self.at(share, "place") - way_m[:, np.newaxis])
+        speed = np.maximum(np.where(known.known, known.speed_mps, self.at(share, "speeds_mps")), 0.0)
         usual_gaps = np.repeat(-np.diff(self.middle["place"])[np.newaxis], n, axis=0)
         line = replace(
-            worlds, vehicles=vehicles, speeds_mps=np.minimum(speed, of["speed_limit_mps"]), pair_hit=told.hit,
-            command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)), obstacle_hit=told.obstacle_hit,
-            road=np.zeros((n, 0)),
+            worlds, vehicles=vehicles, speeds_mps=np.minimum(speed, of["speed_limit_mps"]), pair_hit=known.hit,
+            command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)),
+            obstacle_hit=known.obstacle_hit, road=np.zeros((n, 0)),
         )  # fmt: skip
         command = fixed_commands(self.others, line, "estimated", vehicle=vehicle)
         speed, way = move_on(
             line.speeds_mps, command, latency - at_s, of["speed_limit_mps"], worlds.time_s[:, None] - at_s
         )
         speed[:, vehicle], way[:, vehicle] = line.speeds_mps[:, vehicle], 0.0
-        place, hit = place + way, told.hit
+        place, hit = place + way, known.hit
         if foretold is not None:
             (expected, keeps), hit = foretold, hit | foretold[0].pair_hit
             place = np.where(keeps, _places_of(expected, vehicle), place)
             speed = np.where(keeps, np.maximum(expected.speeds_mps, 0.0), speed)
-        place = _in_order(place, told.known, vehicle)
+        place = _in_order(place, known.known, vehicle)
         gaps = np.maximum(place[:, :-1] - place[:, 1:], 0.0)
         usual_obstacle = self.obstacle_gap_m + self.middle["place"][0] - way_m
-        obstacle = np.where(np.isfinite(told.obstacle_m), told.obstacle_m, usual_obstacle)
+        obstacle = np.where(np.isfinite(known.obstacle_m), known.obstacle_m, usual_obstacle)
         command[:, own] = worlds.command_mps2[:, own]
         return replace(
             line,

@@ -149,12 +149,12 @@ class EstimatedShield:
         if len(rows) >= len(self._wanted):
             self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
         n, N, fresh = len(rows), worlds.N, self._wanted.size == 0
-        begun = {
+        memories = {
             "_odometer": Odometer.begun(worlds, self.vehicle), "predicted_harm": np.full(n, np.nan),
             "_heard": np.full((n, 2 * N), np.nan), "_impact_s": np.full((n, N), -1.0), "_asked_s": np.full(n, np.nan),
             "_wanted": np.zeros(n), "interventions": np.zeros(n, np.int64),
         }  # fmt: skip
-        for name, part in begun.items():
+        for name, part in memories.items():
             setattr(self, name, part if fresh else renew_memory(getattr(self, name), rows, part))
 
     def decide(
@@ -203,21 +203,21 @@ class EstimatedShield:
 
         """
         shield, vehicle = self.shield, self.vehicle
-        told = Told.to(worlds, vehicle)
-        heard = np.concatenate([told.heard, told.reacts], axis=1)
-        fresh, begun = np.isnan(self._heard[:, 0]), shield.memory.running is not None
-        keeps, anew = np.zeros_like(told.known), fresh
+        known = Told.to(worlds, vehicle)
+        heard = np.concatenate([known.heard, known.reacts], axis=1)
+        fresh, started = np.isnan(self._heard[:, 0]), shield.memory.running is not None
+        keeps, anew = np.zeros_like(known.known), fresh
         if self.robust != INTERIOR:  # in interior mode, plans are certified once, at the first decision
-            if begun:
+            if started:
                 self._note_impacts(worlds)
-            keeps = self._keeps(told, worlds.time_s)
-            surprised = self._is_surprised(estimated, told.known & ~keeps) if begun else fresh
+            keeps = self._keeps(known, worlds.time_s)
+            surprised = self._is_surprised(estimated, known.known & ~keeps) if started else fresh
             anew = fresh | surprised | (heard != self._heard).any(axis=1)
         rows = np.flatnonzero(due & anew)
-        rows = rows if begun else np.arange(worlds.n)
+        rows = rows if started else np.arange(worlds.n)
         if not rows.size:
             return
-        before = copy.copy(shield) if begun and self.robust != INTERIOR else None
+        before = copy.copy(shield) if started and self.robust != INTERIOR else None
         keeps = keeps & ~fresh[:, np.newaxis]
         self._begin_shield(worlds.take(rows), estimated.take(rows), way_m[rows], rows, keeps[rows], before)
         if before is not None and (held_before := rows[~fresh[rows]]).size:

@@ -117,10 +117,10 @@ class Estimating(AgentAround):
 
         Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
         """
-        told = Told.to(worlds, vehicle)
+        known = Told.to(worlds, vehicle)
         # a latency that was told predicts the reaction, unless a channel may extend it
-        unforetold = told.reacts & (self.scenario.v2x.delays | ~told.pieces[..., LATENCY])
-        return np.concatenate([told.heard, unforetold], axis=1)
+        unforetold = known.reacts & (self.scenario.v2x.delays | ~known.pieces[..., LATENCY])
+        return np.concatenate([known.heard, unforetold], axis=1)
 
     def _estimate(self, worlds: Worlds, vehicle: int, way_m: Floats) -> Worlds:
         if vehicle not in self._ranges:

@@ -150,12 +150,12 @@ def certify_inside(
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
     bound = np.where(asked & ~other, held.harm, decision.bound)  # an unchanged plan keeps its bound
     changed = np.flatnonzero(asked & other)
-    found = boxes.bound(changed, plan[changed], budget[changed], only_enough=True)
+    bounds = boxes.bound(changed, plan[changed], budget[changed], only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
-    good = found <= least
-    bound[changed[good]] = found[good]
-    known = np.isfinite(found)
-    decision.margin[changed[known]] = (budget[changed] - found)[known]
+    good = bounds <= least
+    bound[changed[good]] = bounds[good]
+    known = np.isfinite(bounds)
+    decision.margin[changed[known]] = (budget[changed] - bounds)[known]
     bad = changed[~good]
     plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
     decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))

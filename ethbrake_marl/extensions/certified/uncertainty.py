@@ -64,9 +64,9 @@ class Interval:
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
             raise unknown_name("uncertain quantity", self.quantity, QUANTITIES)
-        most, told = (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a number, at least 0")
+        most, right = (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a number, at least 0")
         if not is_amount(self.half_width, most):
-            raise InvalidInput(f"uncertainty: {self.quantity}: half-width {self.half_width!r}: must be {told}")
+            raise InvalidInput(f"uncertainty: {self.quantity}: half-width {self.half_width!r}: must be {right}")
         if self.place is not None and not (isinstance(self.place, int | np.integer) and self.place >= 0):
             raise InvalidInput(f"uncertainty: {self.quantity}: place {self.place!r}: must be an index from 0")
         if self.quantity == "friction" and self.place is not None:
@@ -173,13 +173,13 @@ class Uncertainty:
             if interval.place is not None and interval.place >= every.shape[1]:
                 raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} of these")
             for place in range(every.shape[1]) if interval.place is None else (interval.place,):
-                told = every[:, place]
-                half = interval.half_width * told if interval.relative else np.full(worlds.n, interval.half_width)
-                low, high = told - half, told + half
+                values = every[:, place]
+                half = interval.half_width * values if interval.relative else np.full(worlds.n, interval.half_width)
+                low, high = values - half, values + half
                 if name in POSITIVE and not (low > 0.0).all():
                     k = int(np.argmin(low))
                     raise InvalidInput(
-                        f"uncertainty: {interval}: {told[k]:g}{_of(name, place)} in world {k} may be as low as"
+                        f"uncertainty: {interval}: {values[k]:g}{_of(name, place)} in world {k} may be as low as"
                         f" {low[k]:g}; it must stay above 0"
                     )
                 most = worlds.vehicles.speed_limit_mps[:, place] if name == "speeds_mps" else np.inf
@@ -187,7 +187,7 @@ class Uncertainty:
                 if not (high <= rule.high).all():
                     k = int(np.argmax(high))
                     raise InvalidInput(
-                        f"uncertainty: {interval}: {told[k]:g}{_of(name, place)} in world {k} may be as high as"
+                        f"uncertainty: {interval}: {values[k]:g}{_of(name, place)} in world {k} may be as high as"
                         f" {high[k]:g}; must be {rule.interval}"
                     )
                 sides.append((name, place, np.maximum(low, 0.0), high))
@@ -206,16 +206,16 @@ def parse_uncertainty(text: str) -> Uncertainty:
         raise InvalidInput(f"uncertainty: {text!r}: entry {entries.index('') + 1} is empty; it {_FORM}")
     intervals = []
     for entry in entries:
-        found = _ENTRY.fullmatch(entry)
-        if found is None or _NUMBER.fullmatch(found["width"]) is None:
+        match = _ENTRY.fullmatch(entry)
+        if match is None or _NUMBER.fullmatch(match["width"]) is None:
             raise InvalidInput(f"uncertainty: {entry!r}: {_FORM}")
-        name, width = found["name"], float(found["width"])
-        if name in QUANTITIES and found["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
+        name, width = match["name"], float(match["width"])
+        if name in QUANTITIES and match["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
             raise InvalidInput(
                 f"uncertainty: {entry!r}: gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)"
             )
-        place = None if found["number"] is None else int(found["number"]) - 1
-        intervals.append(Interval(name, width / 100.0 if found["share"] else width, bool(found["share"]), place))
+        place = None if match["number"] is None else int(match["number"]) - 1
+        intervals.append(Interval(name, width / 100.0 if match["share"] else width, bool(match["share"]), place))
     return Uncertainty(tuple(intervals))
 
 

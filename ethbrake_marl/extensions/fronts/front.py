@@ -251,8 +251,8 @@ def _searched(
     for k, share in enumerate((FIRST_SHARE, 1.0 - FIRST_SHARE)):
         spent = {**effort, "budget": max(int(share * effort["budget"]), 1)}
         for row, aim in zip(weights, aims, strict=True):
-            given = [startable(pool.best(row, task.harm_count)), *(starts if k == 0 else ())]
-            pool.add(problem, search_profiles(aim, joined(given, worlds.n), **spent)[0])
+            first_profiles = [startable(pool.best(row, task.harm_count)), *(starts if k == 0 else ())]
+            pool.add(problem, search_profiles(aim, joined(first_profiles, worlds.n), **spent)[0])
             tell(worlds.n)
     borne, best = pool.least(weights, task.harm_count)
     values = {
@@ -278,10 +278,10 @@ class Pool:
     def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
         """Add one profile for each world of ``problem``, and return the harm of each vehicle, [n, N] by count."""
         self._profiles.append(profiles)
-        found = problem.borne(profiles)
-        for count, borne in found.items():
+        all_borne = problem.borne(profiles)
+        for count, borne in all_borne.items():
             self._borne[count].append(borne)
-        return found
+        return all_borne
 
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
         """Return the number of the profile of least weighted harm in each world, [n]; of equals, of least harm in all.

@@ -114,7 +114,7 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
     draws = [np.arange(n), *(np.concatenate([members[k] for k in row]) for row in drawn)]  # first: each world once
     points = {name: np.stack([borne[:, rows].mean(axis=1) for rows in draws]) for name, borne in sets.items()}
     braking = np.stack([full_brake[rows].mean(axis=0) for rows in draws])
-    found = []
+    entries = []
     for words, reference in (
         ("full braking", braking),
         ("largest harm of each vehicle", np.maximum(braking, points["front"].max(axis=1))),
@@ -128,8 +128,8 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = volume / volumes["front"]
             entry["of"][name] = {"volume": _interval(volume), "share": _interval(share)}
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def _interval(values: Floats) -> Json | None:

@@ -68,9 +68,9 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
     for k, row in enumerate(rows):
         good = (row == 0.0) | ((row >= LEAST_WEIGHT) & (row <= 1.0 / LEAST_WEIGHT))
         if row.shape != (vehicles,) or not (good.all() and row.any()):
-            told = ",".join(f"{weight:g}" for weight in row.ravel())
+            text = ",".join(f"{weight:g}" for weight in row.ravel())
             raise InvalidInput(
-                f"weights[{k}] = {told}: must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6 to 1e6 and"
+                f"weights[{k}] = {text}: must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6 to 1e6 and"
                 " not all 0, as in 1,4,1"
             )
     if not rows:

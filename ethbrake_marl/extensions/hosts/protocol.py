@@ -400,11 +400,11 @@ class _Run:
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
         try:
             state = HostState(*self.host.state())
-            given = [np.array(np.ma.filled(each, np.nan), np.float64) for each in state[:3]]
+            numbers = [np.array(np.ma.filled(each, np.nan), np.float64) for each in state[:3]]
         except Exception as error:
             self._fail(f"state raised {describe_error(error)}", error)
-        given[0] = given[0] if given[0].ndim else np.full(n, given[0])
-        for name, each, shape in zip(HostState._fields, given, ((n,), (n, N - 1), (n, N)), strict=False):
+        numbers[0] = numbers[0] if numbers[0].ndim else np.full(n, numbers[0])
+        for name, each, shape in zip(HostState._fields, numbers, ((n,), (n, N - 1), (n, N)), strict=False):
             if each.shape != shape:
                 self._fail(f"{name} is of shape {each.shape}; {shape} is needed: worlds, then vehicles or pairs")
             if not np.isfinite(each).all():

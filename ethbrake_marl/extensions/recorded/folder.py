@@ -85,9 +85,9 @@ def read_rows(
         each_of = seen * numbers // MOST_NUMBERS + 1
         # Every k-th row of a trio, because k-th rows of a moment would be the same trios again and again.
         counted = "SELECT *, rowid AS row, ROW_NUMBER() OVER (ORDER BY file, vehicles, rowid) AS at FROM chain"
-        kept = store.execute(f"SELECT * FROM ({counted}) WHERE at % ? = 0 ORDER BY row", (each_of,)).fetchall()
-    left_out[f"chains: a table holds {MOST_NUMBERS:,} numbers, so one in {each_of} is kept"] = seen - len(kept)
-    lines, of = [list(row[:-4]) for row in kept], [row[-4:-2] for row in kept]
+        chosen = store.execute(f"SELECT * FROM ({counted}) WHERE at % ? = 0 ORDER BY row", (each_of,)).fetchall()
+    left_out[f"chains: a table holds {MOST_NUMBERS:,} numbers, so one in {each_of} is kept"] = seen - len(chosen)
+    lines, of = [list(row[:-4]) for row in chosen], [row[-4:-2] for row in chosen]
     return Rows(lines, of, seen, longest, left_out, refused, [*others, *twice])
 
 

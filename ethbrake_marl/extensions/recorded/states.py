@@ -86,10 +86,10 @@ def keep_states(
         near = max(1, min(stride, int(CHECK_S * entry.hertz)))
         taken = np.isin(np.rint(ticks) % stride, (0.0, near % stride))
         some = piece._replace(values=piece.values[taken], lines=piece.lines[taken])
-        kept = _states(some, entry, np.rint(ticks[taken]) / stride, turned)
-        store.executemany(f"INSERT INTO state VALUES ({', '.join('?' * len(State._fields))})", kept.tolist())
-        lengths = kept[:, State._fields.index("length")]
-        cars, states = cars + int(((lengths > CAR_M[0]) & (lengths < CAR_M[1])).sum()), states + len(kept)
+        kept_states = _states(some, entry, np.rint(ticks[taken]) / stride, turned)
+        store.executemany(f"INSERT INTO state VALUES ({', '.join('?' * len(State._fields))})", kept_states.tolist())
+        lengths = kept_states[:, State._fields.index("length")]
+        cars, states = cars + int(((lengths > CAR_M[0]) & (lengths < CAR_M[1])).sum()), states + len(kept_states)
     if not entry.gaps and cars < LEAST_CARS * states:
         raise InvalidInput(
             f"{file}: {cars:,} of {states:,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, fewer than a third; its"

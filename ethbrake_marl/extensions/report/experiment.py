@@ -221,7 +221,7 @@ def _page(
 ) -> Report:
     trained, evaluation, harm_count = experiment.trained, experiment.evaluation, experiment.harm_count
     reward = RewardParams(**config["recipe"]["reward"]).model_dump(exclude_defaults=True)
-    told = {
+    facts = {
         "Training": f"{config['recipe']['title'] or config['recipe']['name']}: {trained.steps:,} steps"
         f" of {config['recipe']['total_steps']:,} ({trained.status}), {trained.wall_s:.0f} s",
         "Start": trained.training.begins,
@@ -258,6 +258,6 @@ def _page(
         harm_count=harm_count,
         remarks=[stopped] if trained.status == "interrupted" else [],
         summary=summary,
-        settings={name: value for name, value in told.items() if value},
+        settings={name: value for name, value in facts.items() if value},
         versions=installed_versions(),
     )

@@ -336,9 +336,9 @@ class Report:
         )
         until = until if moving else "from the alert to rest"
         shown, every = len(played), evaluation.worlds.n
-        told = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
+        how_many = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
         player = Part.player(played, evaluation.vehicles, focus=self.focus)
-        body: list[str | Part] = [f"{told}, {until}.", *(Part.paragraph(text, "note") for text in notes), player]
+        body: list[str | Part] = [f"{how_many}, {until}.", *(Part.paragraph(text, "note") for text in notes), player]
         return Section("Episodes", body)
 
 

@@ -75,8 +75,8 @@ def series_style(number: int) -> dict[str, Any]:
 def label_text(text: str, most: int = 40) -> str:
     """Return text that is safe in a figure: no formula, only characters that the font has, at most ``most`` of them."""
     signs = font_signs()
-    told = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
-    return (told if len(told) <= most else f"{told[: most - 16]}…{told[-15:]}").replace("$", r"\$")
+    label = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
+    return (label if len(label) <= most else f"{label[: most - 16]}…{label[-15:]}").replace("$", r"\$")
 
 
 @cache

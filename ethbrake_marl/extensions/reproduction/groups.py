@@ -57,12 +57,12 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
     The second result has the form ``{"10-12 m": {"PPO": harm, ...}, ...}`` with the harm of each world in the group.
     Empty groups are left out.
     """
-    total, found = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
+    total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}
     for k, (low, high) in enumerate(pairwise(_ENDS_M)):
         if (rows := inner == k).any():
             at.append(float(total[rows].mean()))
-            groups[f"{low:g}-{high:g} m"] = {name: harm[rows] for name, harm in found.items()}
+            groups[f"{low:g}-{high:g} m"] = {name: harm[rows] for name, harm in each_harm.items()}
     return at, groups
 
 

@@ -125,9 +125,11 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
     printed = {row.agent: row for row in PAPER_ROWS if row.table == "hybrid test"}
     episodes = min(_HYBRID_WORLDS, settings.episodes)
     both = "uniform (18, 22) m/s, the random test's, and (20, 18, 20) m/s, the figure's"
-    found = scenario_parameters(load_scenario(RANDOM), gaps_m="text to Table:hybrid", latency_s="identical settings")
+    conditions = scenario_parameters(
+        load_scenario(RANDOM), gaps_m="text to Table:hybrid", latency_s="identical settings"
+    )
     parameters = [
-        *(Parameter("speeds", both) if each.name == "speeds" else each for each in found),
+        *(Parameter("speeds", both) if each.name == "speeds" else each for each in conditions),
         Parameter("policy", unconverged_policy(settings)[1]),
         H_STAR,
         FIRST_IMPACTS,

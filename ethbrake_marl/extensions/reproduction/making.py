@@ -99,7 +99,7 @@ def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
     ``trained`` names the trainings that it uses, as ``group/recipe``.
     """
     place, started = asked.folder / item.name, time.process_time()
-    made = item.make(asked)
+    product = item.make(asked)
     result = Result(
         name=item.name,
         labels=item.labels,
@@ -111,23 +111,23 @@ def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
         processor_s=round(time.process_time() - started, 1),
         made_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         machine=asked.machine,
-        verdict=summarise_verdicts(made.verdicts),
-        comparisons=made.verdicts,
-        parameters=made.parameters,
+        verdict=summarise_verdicts(product.verdicts),
+        comparisons=product.verdicts,
+        parameters=product.parameters,
         tables=[
             Table(each.title, each.headings, [row for row in each.shown() if not isinstance(row, str)], each.note)
-            for each in made.tables
+            for each in product.tables
         ],
-        figures=list(made.figures),
-        data=sorted(f"{stem}.csv" for stem in made.data),
-        notes=made.notes,
+        figures=list(product.figures),
+        data=sorted(f"{stem}.csv" for stem in product.data),
+        notes=product.notes,
     )
     if place.is_symlink() or (place.exists() and not place.is_dir()):
         raise InvalidInput(f"{place}: is no plain folder; move it away")
     place.mkdir(exist_ok=True)
-    for drawn, figure in made.figures.items():
+    for drawn, figure in product.figures.items():
         for ending in (".svg", ".png"):
             write_picture(place / f"{drawn.stem}{ending}", figure, force=True)
-    for stem, text in made.data.items():
+    for stem, text in product.data.items():
         write_output(place / f"{stem}.csv", text.encode(), force=True)
     write_output(place / RESULT, json_text(asdict(result)), force=True)

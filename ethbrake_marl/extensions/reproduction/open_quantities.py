@@ -213,11 +213,13 @@ def reproduce_gaps(settings: Reproduction) -> Made:
             f" with our weights. Each had {PPO_PAPER.decisions:,} of the recipe's"
             f" {load_recipe(PPO_PAPER.recipe).total_steps:,} decisions; two seeds say little about others."
         )
-        told = [
+        conditions = [
             (name, len(policy), float(np.mean(policy)), ", ".join(f"{harm:.2f}" for harm in policy))
             for name, policy in trained.items()
         ]
-        tables.append(Sheet("What is open in training", ("Training", "Seeds", "Mean harm", "Each seed"), told, note))
+        tables.append(
+            Sheet("What is open in training", ("Training", "Seeds", "Mean harm", "Each seed"), conditions, note)
+        )
     else:
         verdicts.append(Verdict("what is open in training", "not run", "no training; --full trains"))
     data = [

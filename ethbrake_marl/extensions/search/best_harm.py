@@ -84,19 +84,19 @@ def best_harm(
     if known is not None:
         known.check_fits(problem)
     effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
-    found: list[Found] = []
+    results: list[Found] = []
     for count in counts:
-        given = [profiles for profiles, _ in found]
+        starts = [profiles for profiles, _ in results]
         if known is not None:
-            given.append(startable(known.profiles(identity, count, problem.last_step)[0]))
-        found.append(_searched(worlds, replace(task, harm_count=count), others, given, task.vehicles, effort, aimed))
+            starts.append(startable(known.profiles(identity, count, problem.last_step)[0]))
+        results.append(_searched(worlds, replace(task, harm_count=count), others, starts, task.vehicles, effort, aimed))
     rows = np.arange(worlds.n)
     best: dict[HarmCount, BestKnown] = {}
     for count in counts:
-        harms = np.stack([harm[count] for _, harm in found])
+        harms = np.stack([harm[count] for _, harm in results])
         pick = np.argmin(harms, axis=0)
-        ends = np.stack([profiles.ends for profiles, _ in found])[pick, rows]
-        commands = np.stack([profiles.commands_mps2 for profiles, _ in found])[pick, rows]
+        ends = np.stack([profiles.ends for profiles, _ in results])[pick, rows]
+        commands = np.stack([profiles.commands_mps2 for profiles, _ in results])[pick, rows]
         best[count] = BestKnown(harms[pick, rows], Profiles(ends, commands))
     names = [scenario.vehicle_names[i] for i in task.vehicles]
     header = {"scenario": scenario.name, "vehicles": names, "budget": budget, "search_seed": seed}
@@ -106,12 +106,12 @@ def best_harm(
         return table
     for count in [count for count in counts if count in known.best]:
         if known.header.get(OBJECTIVE, "total") != objective:
-            kept, _ = known.profiles(identity, count, problem.last_step)
-            table, _ = table.improved(identity, count, aimed(problem).values(kept)[count], kept)
+            stored, _ = known.profiles(identity, count, problem.last_step)
+            table, _ = table.improved(identity, count, aimed(problem).values(stored)[count], stored)
             continue
-        kept, has_profile = known.profiles(identity, count, np.ones(worlds.n, np.int64))
-        kept.ends[~has_profile] = 0
-        table, _ = table.improved(identity, count, known.harm(identity, count), kept)
+        stored, has_profile = known.profiles(identity, count, np.ones(worlds.n, np.int64))
+        stored.ends[~has_profile] = 0
+        table, _ = table.improved(identity, count, known.harm(identity, count), stored)
     return replace(table, header={**table.header, "after": dict(known.header)})
 
 
@@ -229,11 +229,11 @@ def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path
     for first in range(0, len(identity), CHUNK):
         file, wanted = chunk_file(chunks, first), identity[first : first + CHUNK]
         try:
-            kept = kept_chunk(file, wanted, question)
+            stored = kept_chunk(file, wanted, question)
         except CorruptBundle:
-            kept = None
+            stored = None
             damaged.append(file)
-        left += 0 if kept is not None else len(wanted)
+        left += 0 if stored is not None else len(wanted)
     return left, damaged
 
 

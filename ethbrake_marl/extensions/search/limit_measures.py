@@ -156,17 +156,17 @@ class LimitMeasures(MeasureSet):
         row, first, total = rows[0], rows[0]["best_known_first_impact_harm"], rows[0]["best_known_total_harm"]
         if first is None or total is None:
             return []
-        told = [_unavoidable(row), _best(row, first.value, total.value)]
+        lines = [_unavoidable(row), _best(row, first.value, total.value)]
         known = row.more[NAME]["known_best_share"]
         if known is not None and known < 1.0:
-            told.append(
+            lines.append(
                 f"Found beforehand in {100.0 * known:.1f} % of the worlds; in the others it is the best of the agents"
                 " above, so that regrets are lower bounds and no share of the possible reduction is stated."
             )
         counts = {each.agent: each.more[NAME]["below_best_known"] for each in rows}
         below = [f"{agent} in {count_of(count, 'world')}" for agent, count in counts.items() if count]
-        told += [f"Less harm than the best known before: {', '.join(below)}."] if below else []
-        return [" ".join(told)]
+        lines += [f"Less harm than the best known before: {', '.join(below)}."] if below else []
+        return [" ".join(lines)]
 
 
 def best_known_words(row: SummaryRow) -> str:

@@ -92,9 +92,9 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
     proof = prove(worlds, task)
     if isinstance(proof, Unproven):
         return proof
-    found = best_known(worlds, task)
+    limits = best_known(worlds, task)
     avoidable = np.zeros(worlds.n, np.bool_) if proof.avoidable is None else proof.avoidable
-    first, total = (np.where(avoidable, 0.0, found[harm_count]) for harm_count in HARM_COUNTS)
+    first, total = (np.where(avoidable, 0.0, limits[harm_count]) for harm_count in HARM_COUNTS)
     return Limits(proof, first, total)
 
 

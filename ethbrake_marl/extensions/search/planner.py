@@ -188,8 +188,8 @@ class Planner:
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
         commands = constants.commands_mps2.reshape(n, -1, K, 1)
         commands = np.concatenate([plan.commands_mps2[:, np.newaxis], commands], axis=1)
-        given = Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
-        plan, harm = search_profiles(problem, given, budget=self._candidates, seed=0)
+        starts = Profiles(ends.reshape(-1, K), commands.reshape(-1, K, 1))
+        plan, harm = search_profiles(problem, starts, budget=self._candidates, seed=0)
         return plan, harm[self._outlook.harm_count]
 
 

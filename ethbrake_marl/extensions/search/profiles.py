@@ -123,23 +123,23 @@ def compact(ends: Ints, commands: Floats, phases: int) -> int:
         phases: number of phases in use before.
 
     """
-    last, kept = ends[ends.shape[0] - 1], 0
+    last, count = ends[ends.shape[0] - 1], 0
     for k in range(phases):
-        begin = ends[kept - 1] if kept > 0 else 0
+        begin = ends[count - 1] if count > 0 else 0
         if ends[k] <= begin:
             continue
-        same = kept > 0
+        same = count > 0
         for c in range(commands.shape[1]):
-            same = same and commands[kept - 1, c] == commands[k, c]
+            same = same and commands[count - 1, c] == commands[k, c]
         if same:
-            ends[kept - 1] = ends[k]
+            ends[count - 1] = ends[k]
             continue
-        ends[kept] = ends[k]
+        ends[count] = ends[k]
         for c in range(commands.shape[1]):
-            commands[kept, c] = commands[k, c]
-        kept += 1
-    ends[kept - 1] = last
-    return kept
+            commands[count, c] = commands[k, c]
+        count += 1
+    ends[count - 1] = last
+    return count
 
 
 DRAWN_PHASES = 6  # number of phases of a random profile
@@ -433,12 +433,12 @@ def select_stepwise(
     best_ends, best_commands = np.zeros(K, np.int64), np.zeros(field.commands.shape[1:])
     least, size = math.inf, 0
     for s in range(SMALLEST_FIELD + Q):
-        given = s >= SMALLEST_FIELD
-        n = K if given else field.phases[s]
+        speed = s >= SMALLEST_FIELD
+        n = K if speed else field.phases[s]
         if n == 0:
             continue
-        ends = seed_ends[s - SMALLEST_FIELD] if given else field.ends[s, :n]
-        commands = seed_commands[s - SMALLEST_FIELD] if given else field.commands[s, :n]
+        ends = seed_ends[s - SMALLEST_FIELD] if speed else field.ends[s, :n]
+        commands = seed_commands[s - SMALLEST_FIELD] if speed else field.commands[s, :n]
         value, reached = follow_whole(world.episode, ends, commands, states, least)
         if reached > 0 and value < least:
             least, size = value, n

@@ -137,16 +137,16 @@ class BestHarm:
         coupled = optimise_coupled(
             worlds, vehicle, harm_count=outlook.harm_count, horizon_s=outlook.horizon_s, others_mps2=others
         )
-        given = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
-        found, harms = search_profiles(problem, given, budget=self._budget)
-        best = self._stepwise(found)
+        starts = problem.constant(-coupled.deceleration_mps2[:, np.newaxis, np.newaxis])
+        profiles, harms = search_profiles(problem, starts, budget=self._budget)
+        best = self._stepwise(profiles)
         if self._scenario is None or set(self._scenario.learners) - {vehicle}:
             return best, harms[outlook.harm_count]
         policy, steps = make_agent(START, scenario=self._scenario), int(problem.last_step.max())
-        driven = record_commands(policy, worlds, self._scenario, vehicle, steps)
-        of_policy = refine(problem, driven, budget=1)[1]
+        commands_ = record_commands(policy, worlds, self._scenario, vehicle, steps)
+        of_policy = refine(problem, commands_, budget=1)[1]
         better = (of_policy < harms[outlook.harm_count])[:, np.newaxis]
-        best[:, :steps], harm = refine(problem, np.where(better, driven, best[:, :steps]), budget=self._budget)
+        best[:, :steps], harm = refine(problem, np.where(better, commands_, best[:, :steps]), budget=self._budget)
         return best, harm
 
     def _stepwise(self, profiles: Profiles) -> Floats:

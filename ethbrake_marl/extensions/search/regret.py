@@ -133,10 +133,10 @@ def limits_of(evaluation: Evaluation) -> Limits | Unproven:
 def _limits(evaluation: Evaluation) -> Limits | Unproven:
     if evaluation.host:
         return Unproven(f"{evaluation.host} moved these worlds, and what is proven is of the physics here")
-    found = known_limits(evaluation.worlds, evaluation.task)
-    if isinstance(found, Limits) and found.warning:
-        warnings.warn(found.warning, IncompleteTable, stacklevel=4)
-    return found
+    limits = known_limits(evaluation.worlds, evaluation.task)
+    if isinstance(limits, Limits) and limits.warning:
+        warnings.warn(limits.warning, IncompleteTable, stacklevel=4)
+    return limits
 
 
 def regrets_of(evaluation: Evaluation) -> Regrets | None:

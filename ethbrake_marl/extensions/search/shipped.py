@@ -49,13 +49,13 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
     last_step, least = problem.last_step, np.full(problem.n, np.inf)
     profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
     for table in shipped_tables():
-        kept, here = table.profiles(problem.identity, harm_count, last_step)
+        stored, here = table.profiles(problem.identity, harm_count, last_step)
         harm = table.harm(problem.identity, harm_count)
         here &= np.nan_to_num(harm, nan=np.inf) < least
         least[here] = harm[here]
-        profiles, kept = Profiles.padded([profiles, kept], 1)
-        profiles.ends[here] = kept.ends[here]
-        profiles.commands_mps2[here] = kept.commands_mps2[here]
+        profiles, stored = Profiles.padded([profiles, stored], 1)
+        profiles.ends[here] = stored.ends[here]
+        profiles.commands_mps2[here] = stored.commands_mps2[here]
         known |= here
     return profiles, known
 

@@ -105,9 +105,9 @@ class BestHarmTable:
         another list.
         """
         if not (self.rows(identity) >= 0).any():
-            made = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
+            contents = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
             raise InvalidInput(
-                f"table of best known harm ({made}): holds none of these {len(identity)} worlds; give the scenario,"
+                f"table of best known harm ({contents}): holds none of these {len(identity)} worlds; give the scenario,"
                 " seed and vehicles that it was made for"
             )
 
@@ -144,10 +144,10 @@ class BestHarmTable:
             controlled = next(iter(self.best.values())).profiles.commands_mps2.shape[2]
             coasting = Profiles(last_step[:, np.newaxis].copy(), np.zeros((len(rows), 1, controlled)))
             return coasting, np.zeros(len(rows), np.bool_)
-        kept = self.best[harm_count].profiles.take(rows)
-        known = (rows >= 0) & (kept.ends[:, -1] > 0)
-        ends = np.where(known[:, np.newaxis], kept.ends, last_step[:, np.newaxis])
-        return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], kept.commands_mps2, 0.0)), known
+        stored = self.best[harm_count].profiles.take(rows)
+        known = (rows >= 0) & (stored.ends[:, -1] > 0)
+        ends = np.where(known[:, np.newaxis], stored.ends, last_step[:, np.newaxis])
+        return Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], stored.commands_mps2, 0.0)), known
 
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
@@ -178,10 +178,10 @@ class BestHarmTable:
             profiles = Profiles(
                 np.zeros((len(harm), 1), np.int64), np.zeros((len(harm), 1, old.profiles.commands_mps2.shape[2]))
             )
-        kept, new = Profiles.padded([old.profiles, profiles], 1)
-        kept.ends[at] = new.ends[better]
-        kept.commands_mps2[at] = new.commands_mps2[better]
-        return replace(self, best={**self.best, harm_count: BestKnown(new_harm, kept)}), better
+        profiles_, new = Profiles.padded([old.profiles, profiles], 1)
+        profiles_.ends[at] = new.ends[better]
+        profiles_.commands_mps2[at] = new.commands_mps2[better]
+        return replace(self, best={**self.best, harm_count: BestKnown(new_harm, profiles_)}), better
 
 
 def table_bytes(table: BestHarmTable) -> bytes:

@@ -246,7 +246,7 @@ def falsify_command(
             budget, seed, most=keep, on_round=lambda done, total: out.progress(agent, done, total)
         )
         worlds, good = worst.worlds, worst.scores[np.isfinite(worst.scores)]
-        told: dict[str, Any] = {
+        content: dict[str, Any] = {
             "tried": budget,
             "counted": len(good),
             "share_above_zero": worst.share_above,
@@ -260,8 +260,8 @@ def falsify_command(
         left_out = f" ({budget - len(good):,} of them are none of the scenario's)" if len(good) < budget else ""
         summary = (
             f"{chosen.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {task.harm_count} count: worst"
-            f" {told['worst']:.4g}, median {told['median']:.4g}; above zero in {100 * worst.share_above:.1f} % of those"
-            f" tried, {f'the first after {first:,}' if first else 'none'}."
+            f" {content['worst']:.4g}, median {content['median']:.4g}; above zero in {100 * worst.share_above:.1f} % of"
+            f" those tried, {f'the first after {first:,}' if first else 'none'}."
             " The search looks for bad worlds: shares of it say nothing about a list."
         )
         if worlds:
@@ -279,7 +279,7 @@ def falsify_command(
                 ),
                 worlds=worlds,
             )  # fmt: skip
-            told |= named.model_dump(exclude_none=True)
+            content |= named.model_dump(exclude_none=True)
             beside = {"harm": [], "bound": ["Bound"]}.get(measure, ["Reference's harm"])
             columns = ("World", measure.capitalize(), "Harm", *beside, "State")
             rows = []
@@ -292,7 +292,7 @@ def falsify_command(
                 out.write(output, named.text, what="the worlds")
         elif output is not None:
             out.note(f"nothing was found, and {output} not written")
-        out.result({**told, "versions": evaluation.result_versions()}, *shown, summary)
+        out.result({**content, "versions": evaluation.result_versions()}, *shown, summary)
 
 
 def _spelled(**options: Any) -> str:

@@ -72,15 +72,15 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
     run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
     try:
         rows = [row for row in (run.rows() if run.progress.is_file() else []) if row.get(f"eval/{_MEASURED[0]}")]
-        found = [
+        evaluations = [
             {"steps": int(row["steps"])} | {n: float(row[f"eval/{n}"]) for n in names if row.get(f"eval/{n}")}
             for row in rows
         ]
-        if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in found):
+        if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in evaluations):
             raise ValueError("a measure is missing or not finite")
     except (ValueError, LookupError, csv.Error) as error:
         raise InvalidInput(f"{run.progress}: is damaged ({error}); delete its folder to train anew") from None
-    return found
+    return evaluations
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:

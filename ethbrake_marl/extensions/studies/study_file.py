@@ -51,8 +51,8 @@ def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Sce
     Raises ``InvalidInput`` for an unknown name or key, and for a value that is not allowed.
     """
     loaded = load_recipe(recipe)
-    given = read_settings(settings, [loaded])
-    return load_runnable(scenario, given.scenario), given.change(loaded)
+    changes = read_settings(settings, [loaded])
+    return load_runnable(scenario, changes.scenario), changes.change(loaded)
 
 
 def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
