@@ -15,7 +15,6 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario, new_scenario_text
 from ethbrake_marl.scenario.tables import worlds_from_table
 from tests.docs.printed import (
@@ -36,7 +35,6 @@ from tests.docs.printed import (
     printed_blocks,
     results,
     tables_of_figures,
-    where_rows,
 )
 from tests.docs.site import DOCS, load
 from tests.programmes.libraries import harm_of_howto
@@ -65,10 +63,6 @@ def test_everything_shown__names_tests_and_programs_that_are_there() -> None:
         for by in place.by:
             assert not by.startswith("tests/") or (ROOT / by).exists(), by
             assert not by.startswith("make ") or by.split()[1] in targets, by
-
-
-def test_page__shows_where_each_is_compared() -> None:
-    assert "\n".join(where_rows()) + "\n" in (ROOT / "docs" / "tests.md").read_text("utf-8")
 
 
 def test_results__are_linked_where_they_are_and_written_row_by_row() -> None:
@@ -174,7 +168,7 @@ def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: 
     assert missing_figures(table, printed) == missing
 
 
-PROGRAM_PAGES = ("environment", "shipped-policies", pytest.param("../README", marks=pytest.mark.slow))
+PROGRAM_PAGES = ("environment", pytest.param("../README", marks=pytest.mark.slow))
 
 
 PROGRAM = re.compile(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", re.DOTALL)
@@ -242,12 +236,6 @@ def test_notebooks__that_train_are_there() -> None:
 site_pages = load("pages")
 
 
-api = load("api")
-
-
-reference = load("reference")
-
-
 def test_list_of_pages__has_every_page_once_in_five_sections() -> None:
     sections = site_pages.read_sections((DOCS / "README.md").read_text("utf-8"))
     assert list(sections) == ["Start here", "Tutorials", "How-to", "Reference", "Explanation"]
@@ -267,7 +255,7 @@ def test_list_of_pages__has_every_page_once_in_five_sections() -> None:
         ("[a](../../README.md)", "tutorials/first-ten-minutes", None, "[a](../index.md)"),
         ("[a](../README.md#x)", "tutorials/first-ten-minutes", None, "[a](../index.md#x)"),
         ("[a](../train/ppo.yaml)", "learning", None, "[a](../train/ppo.yaml)"),
-        ("[a](../ethbrake_marl/_policies/ppo/card.md)", "learning", None, "[a](shipped-policies.md#ppo)"),
+        ("[a](../ethbrake_marl/_policies/ppo/card.md)", "learning", None, "[a](reference/policies.md#ppo)"),
         ("[a](nowhere.md) [b](https://x.org/y) [c](#here)", "index", ROOT, None),
     ],
 )
@@ -277,44 +265,6 @@ def test_links__of_a_page_lead_to_the_page_on_the_site(
     assert site_pages.relink(link, docname, written_in) == (led or link)
 
 
-def test_public_names__stand_once_each_on_the_pages_by_task(monkeypatch: pytest.MonkeyPatch) -> None:
-    api.check_pages()
-    shown = "".join(api.add_public_names(path.read_text("utf-8")) for path in api.PAGES.glob("*.md"))
-    assert all(f":: ethbrake_marl.{name}\n" in shown for name in eb.__all__ if name != "__version__")
-    links = set(re.findall(r"\]\((api/.*?)\)", (DOCS / "api.md").read_text("utf-8")))
-    assert links == {f"api/{path.name}" for path in api.PAGES.glob("*.md")}
-    monkeypatch.setattr(api.ethbrake_marl, "__all__", [*eb.__all__, "planted"])
-    with pytest.raises(ValueError, match="each public name belongs on one page of docs/api: planted"):
-        api.check_pages()
-
-
-def test_public_name__without_a_docstring_stops_the_build(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(eb, "Policy", type("Planted", (), {}))
-    with pytest.raises(ValueError, match="the public name Policy has no docstring"):
-        api.add_public_names("```{public}\nPolicy\n```")
-
-
-def test_reference__is_made_of_the_code_below_a_short_beginning() -> None:
-    assert {path.stem for path in (DOCS / "reference").glob("*.md")} | {"cli", "shipped-policies"} == {
-        name.removeprefix("reference/") for name in reference.COMPLETED
-    }
-    for name, make in reference.COMPLETED.items():
-        assert len((DOCS / f"{name}.md").read_text("utf-8").split()) < 120
-        made = make()
-        assert made.count("| --- |") >= 1 and "m/s2" not in re.sub("`.*?`", "", made), name
-    commands = reference.COMPLETED["cli"]()
-    assert "\n## train\n" in commands and "| `--other-versions` |" in commands and "\n### study ablate\n" in commands
-    assert "| `mass_t` | mass of each vehicle | (0, 1000] t | required |" in reference.scenario_keys()
-
-
-def test_cards__are_those_of_the_shipped_policies() -> None:
-    names = shipped_policies()
-    assert set(re.findall(r"^## (\S+)$", site_pages.add_cards(""), re.MULTILINE)) == set(names)
-    rows = reference.policies().splitlines()[2:]
-    assert [row.split("`")[1] for row in rows] == list(names)
-    assert [row.split("`")[1] for row in rows if row.endswith("|  |")] == ["universal"]  # the others say why they ship
-
-
 def test_extra__brings_what_the_configuration_loads() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     brought = {re.split(r"[<>=]", line)[0] for line in project["optional-dependencies"]["docs"]}
@@ -322,7 +272,7 @@ def test_extra__brings_what_the_configuration_loads() -> None:
     assert extensions is not None
     named = re.findall(r'"([a-z_]+)[".]', extensions[1])
     loaded = {name.replace("_", "-") for name in named if name != "extension"}
-    assert loaded | {"furo", "ethbrake-marl[notebook]"} == brought
+    assert loaded | {"sphinx", "furo", "ethbrake-marl[notebook]"} == brought
 
 
 QUESTIONS = {

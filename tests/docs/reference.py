@@ -1,10 +1,15 @@
-"""The reference pages: tables made from models, registries and the command line of the package."""
+"""``docs/reference``, made from the package: ``python -m tests.docs.reference`` writes it, a test compares it.
+
+The beginning of each page is written by hand, up to the line ``MADE``.
+"""
 
 from __future__ import annotations
 
 import inspect
+import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,28 +30,14 @@ from ethbrake_marl.scenario.channel import CHANNELS, V2X
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario, scenario_json_schema
 from ethbrake_marl.training.recipe import TrainingRecipe
+from tests.docs import api
+from tests.docs.markdown import link_pages, table, wrap, wrap_page
 
-CARDS = Path(__file__).resolve().parents[2] / "ethbrake_marl" / "_policies"
+ROOT = Path(__file__).resolve().parents[2]
+REFERENCE = ROOT / "docs" / "reference"
+CARDS = ROOT / "ethbrake_marl" / "_policies"
+MADE = "<!-- Made by `python -m tests.docs.reference` from here on; the text above is written by hand. -->"
 ON_EVERY_COMMAND = ("--help",)
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """A Markdown table; units are written for readers outside code."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(_prose(str(each), '|') for each in line)} |" for line in lines) + "\n"
-
-
-def _prose(text: str, escaped: str = "") -> str:
-    """Text on one line, ``escaped`` escaped, and outside code with options and units as a reader expects them."""
-    text = " ".join(text.split())
-    parts = re.split(r"(`[^`]*`)", text.replace(escaped, f"\\{escaped}") if escaped else text)
-    return "".join(part if part.startswith("`") else _for_readers(part) for part in parts)
-
-
-def _for_readers(text: str) -> str:
-    """Options as code, since the site makes a dash of two hyphens, and units with raised digits."""
-    text = re.sub(r"(?<![\w-])(--[a-z][a-z-]*)", r"`\1`", text)
-    return re.sub(r"\bm([2])?/s([26])\b", lambda m: f"m{'²' if m[1] else ''}/s{'²' if m[2] == '2' else '⁶'}", text)
 
 
 def sections(**parts: str) -> str:
@@ -70,7 +61,7 @@ def _commands(group: Any, context: Any, level: int) -> Iterator[str]:
         inside = command.context_class(command, info_name=name, parent=context)
         path = inside.command_path.removeprefix("ethbrake ")
         yield f"{'#' * level} {path}\n"
-        yield "\n\n".join(map(_prose, command.help.split("\n\n"))) + "\n"
+        yield "\n\n".join(map(wrap, command.help.split("\n\n"))) + "\n"
         if hasattr(command, "commands"):
             yield from _commands(command, inside, level + 1)
             continue
@@ -328,19 +319,48 @@ def policies() -> str:
         scenario = f"`{told.scenario['name']}`"
         why = re.search(r"^Not `universal`: (.*?)\n\n", (CARDS / name / "card.md").read_text("utf-8"), re.DOTALL | re.M)
         aim = counts if reward.harm else "the paper's reward"
-        rows.append((f"[`{name}`](#{name})", scenario, aim, told.algorithm, why[1] if why else ""))
+        rows.append((f"[`{name}`](#{name})", scenario, aim, told.algorithm, link_pages(why[1], "../") if why else ""))
     return table(("policy", "trained on", "for", "by", "why not `universal`"), rows)
 
 
-COMPLETED = {  # page -> what stands below what is written there
+def cards() -> str:
+    """The card of every shipped policy, its headings one level lower."""
+    return "\n".join(_card(path) for path in sorted(CARDS.glob("*/card.md")))
+
+
+def _card(path: Path) -> str:
+    def lead(found: re.Match[str]) -> str:
+        target = (path.parent / found[1]).resolve()
+        if target.name == "card.md":
+            return f"](#{target.parent.name})"
+        return f"]({os.path.relpath(target, REFERENCE)}{found[2] or ''})"
+
+    text = re.sub(r"\]\((?!https?:|#)([^)\s#]+)(#[^)\s]*)?\)", lead, path.read_text("utf-8"))
+    return re.sub(r"(?m)^#(?=#* )", "##", wrap_page(link_pages(text, "../")))
+
+
+PAGES: dict[str, Callable[[], str]] = {  # page below docs/reference -> what stands below its beginning
     "cli": command_line,
-    "reference/scenario-keys": scenario_keys,
-    "reference/recipe-keys": recipe_keys,
-    "reference/features": features,
-    "reference/rewards": rewards,
-    "reference/channels": channels,
-    "reference/agents": agents,
-    "reference/measures": measure_table,
-    "reference/scenarios": scenarios,
-    "shipped-policies": policies,
+    "api": api.index,
+    **{f"api/{name}": partial(api.page, name) for name in (*api.GROUPS, "extensions")},
+    "scenario-keys": scenario_keys,
+    "recipe-keys": recipe_keys,
+    "features": features,
+    "rewards": rewards,
+    "channels": channels,
+    "agents": agents,
+    "measures": measure_table,
+    "scenarios": scenarios,
+    "policies": lambda: f"{policies()}\n{cards()}",
 }
+
+
+def whole_page(name: str) -> str:
+    """The page with its beginning, as it must be committed."""
+    beginning = (REFERENCE / f"{name}.md").read_text("utf-8").partition(MADE)[0].rstrip()
+    return f"{beginning}\n\n{MADE}\n\n{PAGES[name]().rstrip()}\n"
+
+
+if __name__ == "__main__":
+    for each in PAGES:
+        (REFERENCE / f"{each}.md").write_text(whole_page(each), "utf-8")
