@@ -60,9 +60,11 @@ def make_changelog(_: str) -> str:
 
 
 def list_folder(text: str, docname: str) -> str:
-    """The page about the other pages of its folder, with these in the navigation."""
-    listed = sorted(path.name for path in (DOCS / docname).parent.glob("*.md") if path.name != "README.md")
-    return f"{relink(text, docname)}\n{_navigation(listed)}"
+    """The page about the other pages of its folder, with these in the navigation in the order of its links."""
+    folder = (DOCS / docname).parent
+    beside = {each.relative_to(folder).as_posix() for each in (*folder.glob("*.md"), *folder.glob("*/README.md"))}
+    linked = dict.fromkeys(path for path, _ in LINK.findall(text) if path in beside)
+    return f"{relink(text, docname)}\n{_navigation([*linked])}"
 
 
 def add_interface(text: str) -> str:
