@@ -198,22 +198,16 @@ def test_howto_train__runs_and_beats_full_braking(tmp_path: Path, monkeypatch: p
 CELL = re.compile(r"^```\{code-cell\} python\n(?::tags: .*\n)?(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
-TRAIN = ("cooperative-learner", "read-a-report", "train-and-shield")
-
-
 NOTEBOOKS = sorted(
     path.stem for path in (DOCS / "tutorials").glob("*.md") if "\nfile_format: mystnb\n" in path.read_text("utf-8")
 )
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.long if name in TRAIN else pytest.mark.slow) for name in NOTEBOOKS]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Path) -> None:
     cells = CELL.findall((DOCS / "tutorials" / f"{name}.md").read_text("utf-8"))
     assert cells
-    if name == "sliders":
-        pytest.importorskip("ipywidgets", reason="no ipywidgets: pip install 'ethbrake-marl[notebook]'")
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(cells)],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
@@ -223,11 +217,6 @@ def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Pat
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-
-
-def test_notebooks__that_train_are_there() -> None:
-    assert set(TRAIN) < set(NOTEBOOKS)
-    assert len(NOTEBOOKS) == 7
 
 
 # ---------------------------------------------------------------- the site

@@ -576,7 +576,7 @@ def test_load_policy__refuses_a_damaged_bundle_and_runs_and_opens_nothing_else(
 
 
 def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
-    page = Path(__file__).resolve().parents[2] / "docs" / "policy-bundles.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "internals" / "bundles.md"
     assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
 
 
