@@ -168,7 +168,7 @@ def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: 
     assert missing_figures(table, printed) == missing
 
 
-PROGRAM_PAGES = ("environment", pytest.param("../README", marks=pytest.mark.slow))
+PROGRAM_PAGES = ("environments", pytest.param("../README", marks=pytest.mark.slow))
 
 
 PROGRAM = re.compile(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", re.DOTALL)
@@ -369,7 +369,7 @@ def test_hooks__run_tools_of_the_environment_and_download_nothing() -> None:
 
 
 MOST_CHARACTERS = 100
-PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[aprt]*/*.md")])
+PAGES = sorted([ROOT / "README.md", *ROOT.glob(".github/*.md"), *DOCS.glob("*.md"), *DOCS.glob("[einrt]*/**/*.md")])
 CODE = re.compile(r"^\s*(```+|~~~+|:::+).*?^\s*\1\s*$", re.DOTALL | re.MULTILINE)
 FREE = re.compile(r"\s*(\||#|<|!\[)|    |\[[\w-]+\]: |\s*([-*] )?\S+$")  # tables, headings, HTML, code, one word
 
