@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from types import FunctionType
 from typing import Any, ForwardRef
 
 from pydantic import BaseModel
@@ -217,7 +218,7 @@ def members(cls: type) -> Iterator[tuple[str, str]]:
                 continue
             seen.add(name)
             value = value.__func__ if isinstance(value, (classmethod, staticmethod)) else value
-            if not (value.__doc__ and isinstance(value, (property, cached_property)) or inspect.isfunction(value)):
+            if not isinstance(value, (property, cached_property, FunctionType)):
                 continue
             text = first_sentence(_marked(inspect.getdoc(getattr(base, name)) or inspect.getdoc(value) or ""))
             if text:

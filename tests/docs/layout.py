@@ -1,4 +1,4 @@
-"""``docs/internals/layout.md``, made from the package: ``python -m tests.docs.layout`` writes it, a test compares it."""
+"""``docs/internals/layout.md``: ``python -m tests.docs.layout`` makes it from the package, a test compares it."""
 
 import ast
 import tomllib
@@ -30,13 +30,13 @@ This page is made from the code: `python -m tests.docs.layout`.
 | Why did the shield replace an action? | `shields/certify.py`, `decide_world`; the proof is in `shields/step.py` |
 | What is a reward term? | `game/`: `step_outcome.py` (formulas), `rewards.py` (weights), `measures.py` (names) |
 | Which agents are there? | `pyproject.toml`, `agents/scripts.py`; [add one](../extend.md#an-agent) |
-| What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (quantities); [scenarios](../scenarios.md) |
+| What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (values); [scenarios](../scenarios.md) |
 | How does a training run? | `training/session.py`, `train`; algorithms in `ppo.py` and `sac.py` |
 | How do I add a column to every evaluation? | [a set of measures](../extend.md#a-set-of-measures) |
 """
 END = """
-`scenarios/` has one YAML file per scenario, `train/` the training recipes; those of an extension are
-in a folder of its name. The wheel contains both. [How the code is tested](tests.md).
+`scenarios/` has one YAML file per scenario, `train/` the training recipes; those of an extension
+are in a folder of its name. The wheel contains both. [How the code is tested](tests.md).
 """
 
 

@@ -293,12 +293,13 @@ def test_search__is_told_the_page_that_answers_a_question_of_somebody_new(questi
     sought = load("sought").SOUGHT
     assert all((DOCS / f"{page}.md").exists() for page in sought)
 
-    def words(page: str, text: str) -> set[str]:
-        title = (DOCS / f"{page}.md").read_text("utf-8").partition("\n")[0]
-        return asked.intersection(re.findall(r"\w+", f"{title} {text}".lower()))
+    def words(text: str) -> int:
+        return len(asked.intersection(re.findall(r"\w+", text.lower())))
 
-    told = {page: len(words(page, text)) for page, text in sought.items()}
-    assert [page for page, count in told.items() if count == len(asked)] == [QUESTIONS[question]]
+    titles = {page: (DOCS / f"{page}.md").read_text("utf-8").partition("\n")[0] for page in sought}
+    told = {page: (words(f"{titles[page]} {text}"), words(text)) for page, text in sought.items()}
+    assert [page for page, count in told.items() if count == max(told.values())] == [QUESTIONS[question]]
+    assert max(told.values())[0] == len(asked)
 
 
 def test_demonstration__plays_the_picture_of_the_first_page_and_says_it_in_words(
