@@ -1,4 +1,4 @@
-"""SUMO as a host, where it is installed (the extra ``sumo``): the table of docs/hosts.md, and what is refused."""
+"""SUMO as a host, if the extra ``sumo`` is installed: the table of docs/extensions/hosts.md, and what is refused."""
 
 import re
 
