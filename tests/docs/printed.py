@@ -179,6 +179,9 @@ TABLES: dict[str, How] = {
     "| work | has | lacks": _by(BY_HAND),
     "| you write | values": _by(BY_HAND),
     "| library | how": _by(BY_HAND),
+    "| agent | what it does | knows": _by(
+        NIGHTLY, "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json"
+    ),
     "| for | recipe | scenario | differs": _by(BY_HAND),
     "| Vehicle 2 minimises": _by(SEARCH),
     "| | equal weights | the other weights": _by(SEARCH),
