@@ -522,7 +522,7 @@ def test_bundle__round_trip_is_exact_and_always_of_the_same_bytes(policy: Policy
     """Also without the critic, as policies ship; a second name of a file, as installers make one, is no sign of it."""
     for name in ("a", "run/policy"):
         policy.save(tmp_path / name)
-    (program,) = re.findall("```python\n(.*?)```", (DOCS / "releasing.md").read_text("utf-8"), re.DOTALL)
+    (program,) = re.findall("```python\n(.*?)```", (DOCS / "internals" / "releasing.md").read_text("utf-8"), re.DOTALL)
     exec(program.replace("runs/mine", str(tmp_path / "a")).replace("mine/policy", str(tmp_path / "shipped")), {})
     os.link(tmp_path / "a" / "weights.safetensors", tmp_path / "elsewhere")
     one, other, shipped = (load_policy(tmp_path / name) for name in ("a", "run", "shipped"))
