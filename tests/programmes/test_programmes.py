@@ -181,7 +181,7 @@ def test_page__says_how_much_the_attack_holds():
 def test_bugs__each_patch_stands_in_the_code_exactly_once() -> None:
     bugs, misfits = faults.planted()
     assert misfits == []
-    assert {bug.folder for bug in bugs} >= {"physics", "engine", "shield", "extensions", "training", "ethbrake_marl"}
+    assert {bug.folder for bug in bugs} >= {"physics", "engine", "shields", "extensions", "training", "ethbrake_marl"}
 
 
 def test_mutants__are_code_of_as_many_lines_and_the_same_for_the_same_seed() -> None:

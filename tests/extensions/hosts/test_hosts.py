@@ -33,7 +33,7 @@ class EngineHost:
         self.worlds, self.impacts = eb.advance(self.worlds, command.wanted_mps2, until_s=command.until_s)
 
 
-PAGE = (DOCS / "hosts.md").read_text("utf-8")
+PAGE = (DOCS / "extensions" / "hosts.md").read_text("utf-8")
 (SHOWN, PRINTED), *_ = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", PAGE, re.DOTALL)
 NAMES: dict = {}
 exec(SHOWN.partition("\n\nscenario = ")[0], NAMES)
