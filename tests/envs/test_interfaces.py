@@ -304,7 +304,7 @@ def test_page__its_examples_run() -> None:
     names: dict[str, object] = {}
     for code in re.findall("```python\n(.*?)```", PAGE, re.DOTALL):
         exec(code.replace("4096", "4").replace("512", "4"), names)
-    assert {"many", "vec", "frame", "smooth"} <= set(names)
+    assert {"many", "frame", "smooth"} <= set(names)
 
 
 @pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)
