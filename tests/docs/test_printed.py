@@ -174,7 +174,7 @@ def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: 
     assert missing_figures(table, printed) == missing
 
 
-PROGRAM_PAGES = ("environment", "shipped-policies", pytest.param("../README", marks=pytest.mark.slow))
+PROGRAM_PAGES = ("environments", "shipped-policies", pytest.param("../README", marks=pytest.mark.slow))
 
 
 PROGRAM = re.compile(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", re.DOTALL)
