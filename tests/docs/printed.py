@@ -143,7 +143,6 @@ BLOCKS: dict[str, How] = {
     "ethbrake train": _by(SUITE, "tests/test_imports.py"),
     "agent,world,impacts,first_impact_harm,total_harm": TUTORIAL,
     "-1.0 26.97": TUTORIAL,
-    "38.88": EXACT,
     "6.07 0": _by(SUITE, "tests/extensions/hosts/test_hosts.py"),
     "Policy('ppo', 27 observations": _by(SUITE, "tests/docs/test_printed.py"),
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
