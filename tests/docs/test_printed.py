@@ -95,7 +95,7 @@ def told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tm
 def _blocks() -> list[Shown]:
     places = [(each, how(BLOCKS, each.begin)) for each in printed_blocks()]
     own = [each for each, place in places if place is not None and place[1] == EXACT and "ethbrake" in each.begin]
-    return [each for each in own if "tutorials" not in each.page]  # of which tests/cli/test_scenarios.py takes care
+    return [each for each in own if "first-ten-minutes" not in each.page]  # see tests/cli/test_scenarios.py
 
 
 @pytest.mark.parametrize("block", _blocks(), ids=lambda block: block.begin[:60])
