@@ -220,7 +220,7 @@ def test_message_contents__trains_each_content_once_and_compares_it_with_the_usu
 
 
 MADE_AGAIN = (DOCS / "reproduction.md").read_text("utf-8")
-COOPERATION = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("cooperation", "v2x", "training-schemes"))
+COOPERATION = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("cooperation", "training-schemes"))
 ABLATION = (DOCS / "ablate-cooperation.md").read_text("utf-8")
 PAPER_PAGES = [(DOCS / f"{name}.md").read_text("utf-8") for name in ("paper-motion", "paper", "paper-figures")]
 PAPER_TEXT = "".join(PAPER_PAGES)
