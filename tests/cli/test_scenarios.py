@@ -20,7 +20,8 @@ from tests.fixtures.commands import Answer, Command, check_refused, rows_of, tol
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = (ROOT / "docs" / "first-ten-minutes.md").read_text("utf-8")
-ADD, OWN_DATA = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("add-a-scenario", "own-vehicle-data"))
+SCENARIOS = (ROOT / "docs" / "scenarios.md").read_text("utf-8")
+ADD, OWN_DATA = SCENARIOS.partition("\n## From Python\n")[0], SCENARIOS.partition("\n## Your own vehicle data\n")[2]
 
 
 SCRIPTS = """

@@ -691,7 +691,7 @@ def test_policy_shipped__is_the_best_that_ships(test: str, harm_count: HarmCount
 def test_policy_shipped__drives_all_learners_of_a_level_of_cooperation(
     level: str, share_of_full_braking: float, collisions: float
 ) -> None:
-    """At least as well as docs/levels.md says, by and large: level 3 collides no more often than level 2."""
+    """At least as well as docs/cooperation.md says, by and large: level 3 collides no more often than level 2."""
     scenario = eb.load_scenario(level)
     name = shipped_name("policy", scenario, "total")
     assert name == ("universal" if level.startswith("cooperation-2") else f"counterfactual-{level}")
