@@ -148,7 +148,6 @@ BLOCKS: dict[str, How] = {
     "ethbrake train --scenario cooperation-3-pair": TRAINED,
     "ethbrake agent export runs/early": TRAINED,
     "Agent,                           First-impact": _by(TRAINING, "make run"),
-    "resume, ppo: 20/20": _by(TRAINING, "make programme NAME=resume"),
     "gap_1_m,gap_2_m,speed_1_mps": _by(BY_HAND),
 }
 
@@ -165,6 +164,7 @@ _TESTS = tuple(
 
 TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
+    "| agent | what it does | knows": _by(NIGHTLY, "ethbrake evaluate --agents ladder --episodes 10000 --json"),
     "| what | first-impact harm | of the best known": TRAINED,
     "| who drives Vehicle 2 | collisions | first-impact harm": _by(
         NIGHTLY,
