@@ -392,7 +392,7 @@ def agent_list(as_json: JsonOption = False) -> None:
             told,
             Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
             "† omniscient: reads what no channel brought. With :believed behind it, it decides on what was received.",
-            "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/baselines.md and docs/shield.md.",
+            "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/evaluate.md and docs/shield.md.",
         )
 
 

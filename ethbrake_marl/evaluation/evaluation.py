@@ -172,7 +172,7 @@ class Evaluation:
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as columns; None stands for a missing value.
 
-        The result maps the name of a column to its values; docs/per-world.md lists the columns. Initial quantities are
+        The result maps the name of a column to its values; docs/evaluate.md lists the columns. Initial quantities are
         named ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``. Each of ``objectives`` (``total``,
         ``social:45``) adds columns with its value for each vehicle.
         """
@@ -218,7 +218,7 @@ class Evaluation:
     def to_frame(self, library: str | None = None) -> Any:
         """Return a table with one row per agent and world: the columns of ``--per-world``, NaN for a missing number.
 
-        docs/per-world.md lists the columns. The result is a pandas ``DataFrame`` if pandas is installed, else a polars
+        docs/evaluate.md lists the columns. The result is a pandas ``DataFrame`` if pandas is installed, else a polars
         ``DataFrame``, else a mapping from column name to array. ``library`` chooses one of them: ``pandas``, ``polars``
         or ``columns``. Raises ``UnknownName`` for another name, and ``InvalidInput`` for a library that is not
         installed.

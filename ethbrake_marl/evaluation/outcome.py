@@ -136,7 +136,7 @@ class Outcome:
         return {f"{name}_{i + 1}": each[:, i] for name, each in told.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """Return the results of each world as columns [n], by the names in docs/per-world.md; None: not measured."""
+        """Return the results of each world as columns [n], by the names in docs/evaluate.md; None: not measured."""
         final, obstacle = self.final, {}
         if (ahead := final.obstacle_ahead).any():  # part of the harm that comes from impacts with the obstacle
             obstacle = {

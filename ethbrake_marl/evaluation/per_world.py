@@ -33,7 +33,7 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world: Parquet if the name ends in ``.parquet``, else CSV.
 
-    docs/per-world.md lists the columns. The row of a left-out world holds only its number and the reason, in ``ended``.
+    docs/evaluate.md lists the columns. The row of a left-out world holds only its number and the reason, in ``ended``.
     The file is written completely or not at all.
 
     Args:

@@ -37,7 +37,7 @@ from tests.docs.printed import (
     tables_of_figures,
 )
 from tests.docs.site import DOCS, load
-from tests.programmes.libraries import harm_of_howto
+from tests.programmes.libraries import harm_of_programs
 
 Run = Callable[..., tuple[str, str]]
 
@@ -188,11 +188,11 @@ def test_programs__of_a_page_run_and_print_what_stands_below_them(
 
 
 @pytest.mark.slow
-def test_howto_train__runs_and_beats_full_braking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_programs_of_train__run_and_beat_full_braking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(
         tmp_path
     )  # MAPPO of BenchMARL, where it is missing here, is run by ``make programme NAME=libraries``
-    assert {"one", "pair"} <= harm_of_howto().keys()
+    assert {"one", "pair"} <= harm_of_programs().keys()
 
 
 CELL = re.compile(r"^```\{code-cell\} python\n(?::tags: .*\n)?(.*?)^```$", re.DOTALL | re.MULTILINE)

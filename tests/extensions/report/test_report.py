@@ -264,7 +264,7 @@ def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(
         "At the horizon (1 s) something still moved; harm after it is not counted. Worlds, of 60: full_brake"
         " 60, coast 60.",
         "‡ Harm does not count this: full_brake still moves at the horizon in 100.0 % of the worlds; coast still moves"
-        " at the horizon in 100.0 % of the worlds (docs/exploits.md).",
+        " at the horizon in 100.0 % of the worlds (docs/train.md).",
     ]
     assert html.index('class="lead"') < html.index('class="remarks"') < html.index('class="beside"')
     assert 'class="remarks"' not in summed_up(paper_random, "full_brake").html
