@@ -167,7 +167,6 @@ _TESTS = tuple(
 
 TABLES: dict[str, How] = {
     "| who drives Vehicle 2 | knows | collisions": _by(NIGHTLY, *_TESTS),
-    "| agent | what it does | knows": _by(NIGHTLY, "ethbrake evaluate --agents ladder --episodes 10000 --json"),
     "| what | first-impact harm | of the best known": TRAINED,
     "| who drives Vehicle 2 | collisions | first-impact harm": _by(
         NIGHTLY,
