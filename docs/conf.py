@@ -14,7 +14,7 @@ author = "ethbrake_marl contributors"
 copyright = f"2026, {author}"
 release = version = __version__
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton", "extension"]
+extensions = ["myst_nb", "sphinx_copybutton", "extension"]
 exclude_patterns = ["_build", "README.md", "extension"]
 highlight_language = "none"
 
@@ -30,10 +30,6 @@ nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
 nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # the site loads nothing; sliders move in Jupyter alone
-
-autodoc_typehints = "none"  # they stand in the signature's line
-autodoc_member_order = "bysource"
-napoleon_numpy_docstring = False
 
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"

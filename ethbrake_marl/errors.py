@@ -285,7 +285,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     if new := new_name(name, names):
         return UnknownName(f"unknown {kind} {name!r}; it is now called {new!r}")
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    own = "; one of your own must be registered or installed first (docs/extending.md)" if may_be_own else ""
+    own = "; one of your own must be registered or installed first (docs/extend.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
 

@@ -1,7 +1,7 @@
 """What would run code that a file brings along is used nowhere in the package but in the places that are named.
 
-`make lint` refuses it: ruff's bans, with the places, stand in pyproject.toml; docs/security.md says why each is none
-of a stranger's files. What ruff has no rule for is looked for here.
+`make lint` refuses it: ruff's bans, with the places, stand in pyproject.toml. docs/internals/bundles.md says why none
+of them runs a stranger's file. What ruff has no rule for is looked for here.
 """
 
 import json

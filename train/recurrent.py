@@ -5,7 +5,7 @@
     ethbrake evaluate --scenario lossy.yaml --agents full_brake,train/recurrent.py:make_agent:runs/gru
 
 What is known of others grows old between two messages, and one observation does not say how it came about; a memory
-may. Plain policy gradients through whole episodes, on arrays of all learners (docs/environment.md). ``--memoryless``
+may. Plain policy gradients through whole episodes, on arrays of all learners (docs/environments.md). ``--memoryless``
 trains the same without a memory, to compare: ages and estimates of what is known seem to say enough. First-impact harm
 on 2,000 worlds of seed 7 after ``--updates 500`` is 23.32 with it and 22.66 without, full braking's 44.83; after 200
 (seeds 0 and 1) 27.01 and 27.07 with it, 25.98 and 25.33 without (one thread, AMD EPYC, 2026-11-24).

@@ -9,18 +9,15 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 
-from extension.api import add_public_names, check_pages
 from extension.demo import add_demonstration
-from extension.pages import add_cards, add_interface, list_folder, make_changelog, make_start, relink
-from extension.reference import COMPLETED
+from extension.pages import add_interface, list_folder, make_changelog, make_start, relink
 from extension.results import add_reproduction, add_tables
 from extension.sought import SOUGHT
 
 MADE = {
     "index": lambda text: add_demonstration(make_start(text)),
     "changelog": make_changelog,
-    "api": add_interface,
-    "shipped-policies": add_cards,
+    "reference/api": add_interface,
     "results/reproduction": add_reproduction,
 }
 
@@ -28,7 +25,7 @@ MADE = {
 def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
     """Complete a page that is made, and lead links that leave docs/ to their page on the site."""
     try:
-        text = source[0] + (f"\n{COMPLETED[docname]()}" if docname in COMPLETED else "")
+        text = source[0]
         folder, _, name = docname.rpartition("/")
         if docname in MADE:
             text = MADE[docname](text)
@@ -36,23 +33,15 @@ def make_page(app: Sphinx, docname: str, source: list[str]) -> None:
             text = list_folder(text, docname)
         else:
             text = relink(add_tables(text, name) if folder == "results" else text, docname)
-        if docname == "api":
-            check_pages()
-        source[0] = add_public_names(text)
+        source[0] = text
     except ValueError as error:
         raise ExtensionError(f"{docname}: {error}") from error
 
 
 def made_again(app: Sphinx, env: Any, added: set[str], changed: set[str], removed: set[str]) -> list[str]:
     """The pages that may have changed although their own file has not."""
-    folders = (page for page in env.found_docs if page.startswith(("api/", "results/")) or page.endswith("/README"))
-    return [*MADE, *COMPLETED, *folders]
-
-
-def keep_colon(app: Sphinx, what: str, name: str, value: object, options: object, lines: list[str]) -> None:
-    """Keep napoleon from taking what stands before a colon in a property's docstring for its type."""
-    if what in ("property", "attribute") and lines:
-        lines[0] = f": {lines[0]}"  # an empty type, which it leaves out
+    folders = (page for page in env.found_docs if page.startswith("results/") or page.endswith("/README"))
+    return [*MADE, *folders]
 
 
 def add_keywords(app: Sphinx, doctree: nodes.document) -> None:
@@ -73,5 +62,4 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.connect("source-read", make_page)
     app.connect("doctree-read", add_keywords)
     app.connect("html-page-context", tell_search)
-    app.connect("autodoc-process-docstring", keep_colon, priority=400)  # napoleon has 500
     return {"parallel_read_safe": True}

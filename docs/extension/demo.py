@@ -33,7 +33,7 @@ TESTS: dict[str, tuple[str, HarmCount]] = {  # scenario, the harm to read
 START = """
 ## Watch it
 
-Choose an emergency of one of the [three tests](#what-it-finds) and up to three drivers of Vehicle 2.
+Choose an emergency of one of the [three tests](game.md#three-tests) and up to three drivers of Vehicle 2.
 Then press Play or move the slider. These are recorded episodes, each an example and no average; they
 play in this page and load nothing.
 """

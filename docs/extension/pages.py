@@ -1,4 +1,4 @@
-"""Pages made from README, CHANGELOG and the cards of the shipped policies, and the list of all pages."""
+"""Pages made from README and CHANGELOG, and the list of all pages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def relink(text: str, docname: str, written_in: Path | None = None) -> str:
             return found[0]
         anchor = found[2] or ""
         if path.is_relative_to(CARDS) and path.name == "card.md":
-            path, anchor = DOCS / "shipped-policies.md", f"#{path.parent.name}"
+            path, anchor = DOCS / "reference" / "policies.md", f"#{path.parent.name}"
         target = DOCS / PAGE_OF.get(path.relative_to(ROOT).as_posix(), path)
         return f"]({os.path.relpath(target, shown_in)}{anchor})"
 
@@ -60,23 +60,17 @@ def make_changelog(_: str) -> str:
 
 
 def list_folder(text: str, docname: str) -> str:
-    """The page about the other pages of its folder, with these in the navigation."""
-    listed = sorted(path.name for path in (DOCS / docname).parent.glob("*.md") if path.name != "README.md")
-    return f"{relink(text, docname)}\n{_navigation(listed)}"
+    """The page about the other pages of its folder, with these in the navigation in the order of its links."""
+    folder = (DOCS / docname).parent
+    beside = {each.relative_to(folder).as_posix() for each in (*folder.glob("*.md"), *folder.glob("*/README.md"))}
+    linked = dict.fromkeys(path for path, _ in LINK.findall(text) if path in beside)
+    return f"{relink(text, docname)}\n{_navigation([*linked])}"
 
 
 def add_interface(text: str) -> str:
     """The page about public names, with their pages in the navigation in the order of its list."""
-    pages = re.findall(r"\]\((api/[a-z]+\.md)\)", text)
-    return f"{relink(text, 'api')}\n{_navigation(pages)}"
-
-
-def add_cards(text: str) -> str:
-    """The page about shipped policies, and then the card of each, its headings one level lower."""
-    cards = [
-        relink(path.read_text("utf-8"), "shipped-policies", path.parent) for path in sorted(CARDS.glob("*/card.md"))
-    ]
-    return "\n".join([relink(text, "shipped-policies"), *(re.sub(r"(?m)^#(?=#* )", "##", card) for card in cards)])
+    pages = dict.fromkeys(re.findall(r"\]\((api/[a-z-]+\.md)#", text))
+    return f"{relink(text, 'reference/api')}\n{_navigation([*pages])}"
 
 
 def _navigation(pages: list[str], caption: str = "") -> str:

@@ -82,10 +82,11 @@ def add_tables(page: str, topic: str) -> str:
 
 
 def add_reproduction(page: str) -> str:
-    """The page about the paper's items, and then all that docs/reproduction.json has of each."""
+    """The page about the paper's items, and then the verdict on each and all that docs/reproduction.json has of it."""
     parts = [page]
     for item in plain(json.loads((RESULTS.parent / "reproduction.json").read_bytes())):
-        parts += [f"({item['name']})=\n## {item['title']}", item["what"], *item["notes"]]
+        verdict = "**{outcome}**: {because}".format(**item["verdict"])
+        parts += [f"({item['name']})=\n## {item['title']}", item["what"], verdict, *item["notes"]]
         for drawn in item["figures"]:
             parts.append(f"![{drawn['title']}. {drawn['text']}](../figures/reproduction-{drawn['stem']}.svg)")
         for table in item["tables"]:

@@ -1,4 +1,4 @@
-"""What a cluster is asked for: processor seconds per million decisions and worlds, the table of docs/scaling.md.
+"""What a cluster is asked for: processor seconds per million decisions and worlds, as in docs/results/scaling.json.
 
     python docs/studies/cost_model.py [--worlds 400]
 

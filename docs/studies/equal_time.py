@@ -1,4 +1,4 @@
-"""Harm against processor time, on the same worlds and the same clock: the table of docs/baselines.md, "Equal time".
+"""Harm against processor time, on the same worlds and the same clock: table `equal-time` of docs/results/baselines.md.
 
     .venv/bin/python docs/studies/equal_time.py [AGENT ...]
 

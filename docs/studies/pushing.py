@@ -1,9 +1,9 @@
-"""What the training blocks of docs/howto-train.md and README reach over five seeds: the table `training-blocks`.
+"""What the training blocks of docs/train.md and README reach over five seeds: the table `training-blocks`.
 
     python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
 
 Each argument is a block. ``-bootstrap`` trains it with ``horizon_is_end=False``, ``-speed`` with the reward term of
-docs/exploits.md that makes a vehicle stop. A training takes a minute or two of one core.
+docs/train.md that makes a vehicle stop. A training takes a minute or two of one core.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The convergence of the paper's fixed-step map to the exact harm as its step shrinks: docs/sampled.md.
+"""The convergence of the paper's fixed-step map to the exact harm as its step shrinks: docs/extensions/reproduction.md.
 
     .venv/bin/python docs/studies/sampling.py docs/figures/sampled-convergence.png
 

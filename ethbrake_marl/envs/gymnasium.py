@@ -86,22 +86,22 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
     """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
 
     Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
-    coasts, +1 full driving capacity. Terminated: all vehicles are at rest and no command would move one. Truncated: the
-    horizon is reached. Infos: see docs/infos.md. ``reset(seed=s)`` starts the stream of worlds of seed s; ``reset()``
-    continues in it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from that
+    coasts, +1 full driving capacity. Terminated: all vehicles are at rest and no command would move one. Truncated:
+    at the horizon. Infos: docs/environments.md. ``reset(seed=s)`` starts the stream of worlds of seed s, ``reset()``
+    goes on in it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from that
     state. Raises ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], and a step without an
     episode.
 
     Args:
         scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
         learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what the learner observes; None: ``observation_for(scenario)``.
         actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
             spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: it is an array with minus the harm of the step that
-            each vehicle bears; a list: with these components (docs/rewards.md).
+            each vehicle bears; a list: with these components (docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -149,7 +149,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         Args:
             seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
             options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
-                docs/episodes.md.
+                docs/environments.md.
 
         """
         self._restart(seed, options)

@@ -134,7 +134,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
     Args:
         scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
-        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/watching.md).
+        render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
         learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: what every vehicle observes, or a mapping from name to observation; None: the scenario's.
@@ -143,7 +143,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
             spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: it is an array with minus the harm of the step that
-            each vehicle bears; a list: with these components (docs/rewards.md).
+            each vehicle bears; a list: with these components (docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -222,7 +222,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         Args:
             seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
             options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
-                docs/episodes.md.
+                docs/environments.md.
 
         """
         self._restart(seed, options)

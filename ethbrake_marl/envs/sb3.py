@@ -62,7 +62,7 @@ def make_sb3_vec_env(
         observation: what the learners observe; None: ``observation_for(scenario)``.
         horizon_is_end: report no truncation in the infos, so that an algorithm does not add an estimated value beyond
             the horizon. Harm is counted up to the horizon only, and an estimate beyond it can grow without limit
-            (docs/exploits.md). False: ``TimeLimit.truncated`` marks episodes that the horizon cut off.
+            (docs/train.md). False: ``TimeLimit.truncated`` marks episodes that the horizon cut off.
         appended: numbers appended to a learner's own observation. ``number``: the learner's index among the learners
             (0 = the foremost); ``state``: the full state of the line (``game.full_state.full_state``), for a central
             critic.

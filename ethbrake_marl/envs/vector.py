@@ -102,7 +102,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
             spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
         reward_vector: None: rewards are [n]. ``vehicles``: they are [n, K], minus the harm of the step that each
-            vehicle bears; a list: with these components (docs/rewards.md).
+            vehicle bears; a list: with these components (docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -156,7 +156,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         Args:
             seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
             options: ``initial_state`` or ``listed_world`` choose the worlds; ``reset_mask`` [n] restricts the reset to
-                the worlds that it marks. See docs/episodes.md.
+                the worlds that it marks. See docs/environments.md.
 
         """
         rows = self._rows_to_reset(options)

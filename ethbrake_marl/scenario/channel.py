@@ -193,7 +193,7 @@ class _TellsSchema:
 
 
 class V2X(FileModel):
-    """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/v2x.md``.
+    """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/cooperation.md``.
 
     In YAML it is written as the preset's name alone, or as a mapping.
     """

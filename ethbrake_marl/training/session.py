@@ -118,7 +118,7 @@ def train(
         scenario: a scenario, its name, or the path of its file. Its roles determine the learners.
         directory: the new folder of the run.
         scheme: overrides the recipe's scheme. By default one learner is ``single``, several are ``shared``.
-        turns: overrides the recipe's turns of independent learners (docs/training-schemes.md).
+        turns: overrides the recipe's turns of independent learners (docs/train.md).
         seed: overrides the recipe's seed.
         steps: overrides the recipe's number of decisions. The last update may exceed it.
         force: replace an earlier run.

@@ -19,8 +19,9 @@ from ethbrake_marl.training.recipe import TrainingRecipe, load_recipe
 from tests.fixtures.commands import Answer, Command, check_refused, rows_of, told_json
 
 ROOT = Path(__file__).resolve().parents[2]
-TUTORIAL = (ROOT / "docs" / "tutorials" / "first-ten-minutes.md").read_text("utf-8")
-ADD, OWN_DATA = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("add-a-scenario", "own-vehicle-data"))
+TUTORIAL = (ROOT / "docs" / "first-ten-minutes.md").read_text("utf-8")
+SCENARIOS = (ROOT / "docs" / "scenarios.md").read_text("utf-8")
+ADD, OWN_DATA = SCENARIOS.partition("\n## From Python\n")[0], SCENARIOS.partition("\n## Your own vehicle data\n")[2]
 
 
 SCRIPTS = """

@@ -1,4 +1,4 @@
-"""``docs/layout.md``, made from the package: ``python -m tests.docs.layout`` writes it, a test compares it."""
+"""``docs/internals/layout.md``: ``python -m tests.docs.layout`` makes it from the package, a test compares it."""
 
 import ast
 import tomllib
@@ -7,36 +7,36 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "ethbrake_marl"
-PAGE = ROOT / "docs" / "layout.md"
+PAGE = ROOT / "docs" / "internals" / "layout.md"
 BEGINNING = """# How the code is laid out
 
-Where does something live? The package is a core and extensions. The core is what the paper needs,
-and what training, scenarios and levels of cooperation need. An extension is a folder that can be
-deleted: it registers itself by entry points (`pyproject.toml`), and no module of the core names
-it. To delete one, delete its folder, its folder in `tests/extensions/`, its lines in
-`pyproject.toml`, and likewise what uses it; then `make venv`. `make core` does so with all of
-them in a copy, and runs the core's tests there.
+Which file does what? The package has a core and extensions. The core is what the paper, training,
+scenarios and levels of cooperation need. An extension is a folder that you can delete: it registers
+itself by entry points (`pyproject.toml`), and no module of the core names it. To delete one, delete
+its folder, its folder in `tests/extensions/`, its lines in `pyproject.toml` and every extension
+that uses it; then run `make venv`. `make core` deletes all of them in a copy and runs the core's
+tests there.
 
-A module imports from its own folder, or from what stands below it. `make lint` checks it.
+A module imports only from its own folder or from folders listed below it; `make lint` checks this.
 This page is made from the code: `python -m tests.docs.layout`.
 
 ## Where to look
 
 | question | file |
 |---|---|
-| How does one step of an episode go? | `engine/engine.py`, `step`; [the game](game.md) |
+| How does one step of an episode go? | `engine/engine.py`, `step`; [the game](../game.md) |
 | What does one impact cost? | `physics/impact.py`, `record_impacts`; summed in `game/harm.py` |
 | Where does a number in a table come from? | `evaluation/`: `measure_sets.py` (columns), `outcome.py`, `rollout.py` |
 | Why did the shield replace an action? | `shields/certify.py`, `decide_world`; the proof is in `shields/step.py` |
 | What is a reward term? | `game/`: `step_outcome.py` (formulas), `rewards.py` (weights), `measures.py` (names) |
-| Which agents are there? | `pyproject.toml`, `agents/scripts.py`; [add one](extending.md#an-agent) |
-| What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (quantities); [scenarios](scenarios.md) |
+| Which agents are there? | `pyproject.toml`, `agents/scripts.py`; [add one](../extend.md#an-agent) |
+| What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (values); [scenarios](../scenarios.md) |
 | How does a training run? | `training/session.py`, `train`; algorithms in `ppo.py` and `sac.py` |
-| How do I add a column to every evaluation? | [a set of measures](extending.md#a-set-of-measures) |
+| How do I add a column to every evaluation? | [a set of measures](../extend.md#a-set-of-measures) |
 """
 END = """
-`scenarios/` holds one YAML file per scenario, `train/` the training recipes; those of an extension
-stand in a folder of its name. Both are also inside the wheel. [How the tests are run](tests.md).
+`scenarios/` has one YAML file per scenario, `train/` the training recipes; those of an extension
+are in a folder of its name. The wheel contains both. [How the code is tested](tests.md).
 """
 
 

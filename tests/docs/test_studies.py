@@ -97,7 +97,7 @@ drawings = load("../drawings")
 
 @pytest.mark.parametrize("name", drawings.DRAWINGS)
 def test_drawing__is_the_one_that_is_shown(name: str) -> None:
-    assert f"](figures/model-{name}.svg)" in (DOCS / "model.md").read_text("utf-8").replace("\n", " ")
+    assert f"](../figures/model-{name}.svg)" in (DOCS / "internals" / "model.md").read_text("utf-8").replace("\n", " ")
     made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
     assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
 
@@ -219,10 +219,14 @@ def test_message_contents__trains_each_content_once_and_compares_it_with_the_usu
 # ---------------------------------------------------------------- pages
 
 
-MADE_AGAIN = (DOCS / "reproduction.md").read_text("utf-8")
-COOPERATION = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("cooperation", "v2x", "training-schemes"))
-ABLATION = (DOCS / "ablate-cooperation.md").read_text("utf-8")
-PAPER_PAGES = [(DOCS / f"{name}.md").read_text("utf-8") for name in ("paper-motion", "paper", "paper-figures")]
+def text_of(*names: str) -> list[str]:
+    return [(DOCS / f"{name}.md").read_text("utf-8") for name in names]
+
+
+(MADE_AGAIN,) = text_of("extensions/reproduction")
+(COOPERATION,), (TRAIN,) = text_of("cooperation"), text_of("train")
+ABLATION = text_of("extensions/cooperation")[0].partition("\n## Ablate")[2].partition("\n## ")[0]
+PAPER_PAGES = text_of("internals/model", "internals/paper", "extensions/reproduction")
 PAPER_TEXT = "".join(PAPER_PAGES)
 SITE = load("results")
 
@@ -251,7 +255,7 @@ def rows(page: str, heading: str, level: str = "\n## ") -> list[list[str]]:
 
 @pytest.mark.parametrize("title", LABELS)
 def test_paper__treats_every_label_and_everything_that_has_a_number_once(title: str) -> None:
-    told = [row for page in PAPER_PAGES for row in rows(page, f"\n## {title}\n") if len(row) == 5]
+    told = [row for page in PAPER_PAGES for row in rows(page, f"\n## {title}") if len(row) == 5]
     second = " ".join(row[1] for row in told)
     assert [label for label in LABELS[title] if f"`{label}`" not in second] == []
     numbers = [number for row in told for number in row[0].split(", ") if number.isalnum()]
@@ -259,11 +263,11 @@ def test_paper__treats_every_label_and_everything_that_has_a_number_once(title: 
 
 
 def test_paper__says_how_the_report_and_the_code_differ_from_it() -> None:
-    sentences = ("one `k_energy` for all pairs", "masses and e they do not", "predict 3.07", "above v_max when pushed")
-    assert "docs/paper.md" in PAPER_NOTE and [each for each in sentences if each not in PAPER_TEXT] == []
+    sentences = ("one `k_energy` for all pairs", "but not masses and e", "predict 3.07", "above v_max when pushed")
+    assert "docs/internals/paper.md" in PAPER_NOTE and [each for each in sentences if each not in PAPER_TEXT] == []
 
 
-# docs/reproduction.md is what its committed data say, and the data are what the worlds give.
+# docs/extensions/reproduction.md is what its committed data say, and the data are what the worlds give.
 
 
 def result_of(content: dict) -> Result:
@@ -310,14 +314,13 @@ def test_paper__full_braking_over_the_total_distance_is_as_committed() -> None:
 
 
 def test_reproduction__is_made_of_the_committed_data_of_every_item_and_gap() -> None:
-    assert pages.docs_page(list(RESULTS.values())) == MADE_AGAIN
+    text = " ".join(MADE_AGAIN.split())
     assert list(RESULTS) == [item.name for item in ITEMS]
     assert [row[0].value for row in RESULTS["gaps"].tables[0].rows] == [gap.name for gap in GAPS]
     for name, result in RESULTS.items():
         assert verdicts.summarise_verdicts(result.comparisons) == result.verdict, name
+        assert f"- **{result.title}: {result.verdict.outcome}" in text, name
     assert [label for item in ITEMS for label in item.labels if f"`{label}`" not in PAPER_TEXT] == []
-    for name in ("README", "paper"):
-        assert "(reproduction.md)" in (DOCS / f"{name}.md").read_text("utf-8"), name
 
 
 def test_reproduction__every_figure_is_there_and_no_other() -> None:
@@ -344,18 +347,18 @@ def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: 
         assert row[1].value == verdicts.PERCENT.show(rate).in_words
 
 
-# docs/cooperation.md and the pages of its dials
+# docs/cooperation.md, and the methods for several learners in docs/train.md
 
 
-def first_cells(heading: str) -> dict[str, list[str]]:
+def first_cells(page: str, heading: str) -> dict[str, list[str]]:
     """The first table of the page below a header line: first cell -> other cells."""
-    found = rows(COOPERATION, heading, "\n\n")
+    found = rows(page, heading, "\n\n")
     return {row[0]: row[1:] for row in found if row[0].startswith("`")}
 
 
 def test_cooperation__its_objectives_and_schemes_are_those_of_the_code() -> None:
-    schemes = {re.findall("`(.*?)`", cell)[0] for cell in first_cells("| scheme | networks |")}
-    objectives = [re.findall("`(.*?)[:`]", cell)[0] for cell in first_cells("| `objective` | for")]
+    schemes = {re.findall("`(.*?)`", cell)[0] for cell in first_cells(TRAIN, "| `scheme` | networks |")}
+    objectives = [re.findall("`(.*?)[:`]", cell)[0] for cell in first_cells(COOPERATION, "| `objective` | for")]
     assert (schemes, objectives) == (set(get_args(Scheme)), list(OBJECTIVES))
 
 
@@ -363,14 +366,15 @@ def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
     blocks = re.findall("```python\n(.*?)```", COOPERATION, re.DOTALL)
-    quick = '("cooperation-ppo").replace(total_steps=1, n_envs=8)'
     for block in blocks:
-        of_block = {} if "result = eb.train(" in block else names
-        exec(block.replace('("cooperation-ppo")', quick).replace("1000", "20"), of_block)
-        assert of_block is names or of_block["harm"].shape == (20,)
-    assert (tmp_path / "runs" / "pair" / "team.json").is_file()
-    assert len(blocks) == 4 and names["columns"]["social:45"].shape == (20, 3)
+        exec(block.replace("1000", "20"), names)
+    assert blocks and names["columns"]["social:45"].shape == (20, 3)
     assert names["columns"].keys() == scored(names["result"].outcome("full_brake").ledger, "first").keys()
+    quick = '("cooperation-ppo").replace(total_steps=1, n_envs=8)'
+    (block,) = (each for each in re.findall("```python\n(.*?)```", TRAIN, re.DOTALL) if "team@runs/team" in each)
+    names = {"eb": eb}
+    exec(block.replace('("cooperation-ppo")', quick).replace("1000", "20"), names)
+    assert names["team_harm"].shape == (20,) and (tmp_path / "runs" / "team" / "team.json").is_file()
 
 
 @pytest.mark.slow

@@ -32,7 +32,8 @@ from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[2]
-EPISODES, INFOS = ((ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("episodes", "infos"))
+PAGE = (ROOT / "docs" / "environments.md").read_text("utf-8")
+INFOS = PAGE.partition("\n## Infos\n")[2].partition("\n- With a `v2x` channel")[0]
 BRAKE = np.full(1, -1.0, np.float32)
 
 
@@ -74,7 +75,7 @@ def test_infos__hold_the_same_keys_in_every_step_and_the_page_names_them() -> No
     assert {(turn[4]["world_seed"], turn[4]["world"]) for turn in told} == {(0, 0)}
     given = environment.reset(seed=5, options={"initial_state": {"gaps_m": 7}})[1]
     assert (given["world_seed"], given["world"]) == (5, -1)
-    rows = re.findall(r"^\| (`.*?) \|", INFOS.split("There is no clock")[0], re.MULTILINE)
+    rows = re.findall(r"^\| (`.*?) \|", INFOS, re.MULTILINE)
     assert {name for row in rows for name in re.findall("`(.*?)`", row)} == set(at_reset)
 
 
@@ -257,7 +258,7 @@ def test_wrappers__which_of_gymnasiums_take_same_step_is_what_the_page_says() ->
     for wrap in (wrappers.NormalizeReward, wrappers.RecordEpisodeStatistics, wrappers.ClipAction):
         wrap(eb.EthBrakeVectorEnv(2, autoreset_mode="SameStep")).reset(seed=1)
     for wrap in (wrappers.NormalizeObservation, wrappers.FlattenObservation):
-        assert f"`{wrap.__name__}`" in EPISODES
+        assert f"`{wrap.__name__}`" in PAGE
         wrapped = wrap(eb.EthBrakeVectorEnv(2))
         wrapped.reset(seed=1)
         assert all(np.isfinite(wrapped.step(action)[0]).all() for action in actions(2, 90, 2))
@@ -299,12 +300,11 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
     assert result.stdout.splitlines() == ["[]", "['numba', 'pydantic']", "EthBrakeEnv", "{} {}"], result.stderr
 
 
-def test_pages__their_examples_run() -> None:
+def test_page__its_examples_run() -> None:
     names: dict[str, object] = {}
-    for page in ("environment", "observations", "rewards", "episodes", "infos", "watching"):
-        for code in re.findall("```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text("utf-8"), re.DOTALL):
-            exec(code.replace("4096", "4").replace("512", "4"), names)
-    assert {"many", "vec", "frame", "smooth"} <= set(names)
+    for code in re.findall("```python\n(.*?)```", PAGE, re.DOTALL):
+        exec(code.replace("4096", "4").replace("512", "4"), names)
+    assert {"many", "frame", "smooth"} <= set(names)
 
 
 @pytest.mark.parametrize("scenario", [PAPER, FIVE], ids=lambda scenario: scenario.name)

@@ -128,7 +128,7 @@ def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
 
 @pytest.mark.long
 def test_cooperation__two_learners_avoid_what_can_be_avoided(tmp_path: Path) -> None:
-    """Contact cannot be avoided in 65 % of these worlds; PPO's pairs collided in every one (docs/levels.md)."""
+    """Contact cannot be avoided in 65 % of these worlds; PPO's pairs collided in every one (docs/cooperation.md)."""
     train("cooperation", PAIR, tmp_path / "run", steps=800_000)
     result = eb.evaluate(PAIR.sample(1000, 7), {"team": load_team(tmp_path / "run", PAIR)}, scenario=PAIR)
     assert result.outcome("team").collided.mean() < 0.70

@@ -525,7 +525,7 @@ def test_bundle__round_trip_is_exact_and_always_of_the_same_bytes(policy: Policy
     """Also without the critic, as policies ship; a second name of a file, as installers make one, is no sign of it."""
     for name in ("a", "run/policy"):
         policy.save(tmp_path / name)
-    (program,) = re.findall("```python\n(.*?)```", (DOCS / "releasing.md").read_text("utf-8"), re.DOTALL)
+    (program,) = re.findall("```python\n(.*?)```", (DOCS / "internals" / "releasing.md").read_text("utf-8"), re.DOTALL)
     exec(program.replace("runs/mine", str(tmp_path / "a")).replace("mine/policy", str(tmp_path / "shipped")), {})
     os.link(tmp_path / "a" / "weights.safetensors", tmp_path / "elsewhere")
     one, other, shipped = (load_policy(tmp_path / name) for name in ("a", "run", "shipped"))
@@ -579,7 +579,7 @@ def test_load_policy__refuses_a_damaged_bundle_and_runs_and_opens_nothing_else(
 
 
 def test_damaged_bundles__are_as_many_as_the_page_says() -> None:
-    page = Path(__file__).resolve().parents[2] / "docs" / "policy-bundles.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "internals" / "bundles.md"
     assert f"{len(SPOILED)} damaged and malicious bundles" in " ".join(page.read_text("utf-8").split())
 
 
@@ -678,7 +678,7 @@ def test_shipped__the_one_for_a_test_is_the_best_that_ships(test: str, harm_coun
 def test_shipped__drives_all_learners_of_a_level_of_cooperation(
     level: str, name: str, share_of_full_braking: float, collisions: float
 ) -> None:
-    """At least as well as the cards say, by and large: level 3 collides no more often than level 2."""
+    """At least as well as docs/cooperation.md says, by and large: level 3 collides no more often than level 2."""
     scenario = eb.load_scenario(level)
     assert eb.load_shipped(name).manifest.learners == tuple(scenario.vehicle_names[i] for i in scenario.learners)
     lineup = make_lineup(["full_brake", name], scenario)

@@ -2,7 +2,7 @@
 
 Blocks must be the same lines, pictures the same pixels; each figure of a table, to its decimals, must be among the
 numbers that its commands tell. What is compared by `make test`, and what by nothing because it takes a training, a long
-search or one machine's speed, is said in tests/docs/printed.py and docs/tests.md.
+search or one machine's speed, is said in tests/docs/printed.py.
 """
 
 import os

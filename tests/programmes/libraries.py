@@ -1,6 +1,6 @@
-"""Other people's libraries: every block of docs/other-libraries.md is run as it stands, and what it trained drives.
+"""Other people's libraries: every block of libraries.md, beside this file, runs as it stands, and its policy drives.
 
-So is docs/howto-train.md, in the environment of BenchMARL.
+So do the programs of docs/train.md and docs/extensions/benchmarl.md, in the environment of BenchMARL.
 
 Each library has an environment of its own below ``.venvs/``, kept for the next run, with this project as it stands.
 What cannot be installed is skipped, and the reason told. A policy is measured on a fixed list of worlds beside full
@@ -28,7 +28,8 @@ import numpy as np
 from tests.docs.site import load
 from tests.programmes import KEPT, ROOT, Cases, Given, NotInstalled, Told, ready_python, watched
 
-PAGE, HOWTO = ROOT / "docs" / "other-libraries.md", ROOT / "docs" / "howto-train.md"
+PAGE = Path(__file__).with_name("libraries.md")
+TRAIN, BENCHMARL = ROOT / "docs" / "train.md", ROOT / "docs" / "extensions" / "benchmarl.md"
 MEASURED = load("results")
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
 OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own evaluation; m2/s2
@@ -182,7 +183,8 @@ LIBRARIES = {  # by the heading of their section
     "CleanRL": Library(("moviepy==2.2.1",), "gymnasium", in_ci=True, finish=of_cleanrl),
     "TorchRL": Library(("torchrl==0.14.1",), in_ci=True, finish=of_torchrl),
     "BenchMARL": Library(
-        ("benchmarl==1.5.2", "torchrl<0.12", "tensordict<0.12", "stable-baselines3==2.9.2"), finish=of_benchmarl
+        ("benchmarl==1.5.2", "torchrl<0.12", "tensordict<0.12", "stable-baselines3==2.9.2", "supersuit==3.11.0"),
+        finish=of_benchmarl,
     ),
     "RLlib": Library(("ray[rllib]==2.60.0",)),
     "skrl": Library(("skrl==2.1.1",), finish=of_skrl),
@@ -237,25 +239,26 @@ def tell(k: int) -> None:
     print(json.dumps([version(library.told), harm, braking, own, f"{seconds:.0f}", verdict]))
 
 
-def harm_of_howto() -> dict[str, dict[str, float]]:
-    """What each training of docs/howto-train.md comes to, beside full braking; without BenchMARL those before it.
+def harm_of_programs() -> dict[str, dict[str, float]]:
+    """Mean harm of each policy that the programs of docs/train.md and docs/extensions/benchmarl.md train.
 
-    A minute is too little for MAPPO to beat full braking, which the page says.
+    Each stands beside full braking. Without BenchMARL only those of docs/train.md run. A minute is too little for MAPPO
+    to beat full braking, which the page says.
     """
     names: dict[str, Any] = {"__name__": "copied"}
-    for code in re.findall("```python\n(.*?)```", HOWTO.read_text("utf-8"), re.DOTALL):
-        if "from benchmarl" in code and find_spec("benchmarl") is None:
-            break
-        exec(compile(code, HOWTO.name, "exec"), names)
+    for page in (TRAIN, BENCHMARL) if find_spec("benchmarl") else (TRAIN,):
+        programs = page.read_text("utf-8").partition("\n## With a recipe\n")[0]
+        for code in re.findall("```python\n(.*?)```", programs, re.DOTALL):
+            exec(compile(code, page.name, "exec"), names)
     for trained, harms in names["harm"].items():
         full, theirs = harms.values()
         assert theirs < full or trained == "mappo", f"{trained}: {theirs:.2f} does not beat full braking, {full:.2f}"
     return names["harm"]
 
 
-def tell_howto() -> None:
-    """Run the how-to in the current folder, and print what each training came to as JSON."""
-    print(json.dumps([f"{name} {harm:.2f}" for harms in harm_of_howto().values() for name, harm in harms.items()]))
+def tell_programs() -> None:
+    """Run the programs in the current folder, and print the harm of each policy as JSON."""
+    print(json.dumps([f"{name} {harm:.2f}" for harms in harm_of_programs().values() for name, harm in harms.items()]))
 
 
 def evaluated_by_itself(model: Any, agent: Any) -> float:
@@ -295,11 +298,14 @@ def cases(given: Given) -> Cases:
         if way.library in taken:
             yield f"{way.library}: {way.title} ({way.ran})", partial(run, way.library, f"tell({k})", given, way)
     if "BenchMARL" in taken:
-        yield f"BenchMARL: docs/{HOWTO.name}", partial(run, "BenchMARL", "tell_howto()", given)
+        yield (
+            "BenchMARL: docs/train.md, docs/extensions/benchmarl.md",
+            partial(run, "BenchMARL", "tell_programs()", given),
+        )
 
 
 def run(library: str, function: str, given: Given, way: Way | None = None) -> Told:
-    """Run one way, or the how-to, in its library's environment."""
+    """Run one way, or the programs, in its library's environment."""
     name = re.sub(r"\W+", "_", library.lower())
     try:
         python = ready_python(name, LIBRARIES[library].requires, LIBRARIES[library].overrides)

@@ -15,7 +15,7 @@ from tests.programmes.audit import Package
 from tests.programmes.cage import Case, judge
 from tests.programmes.faults import PACKAGE, Callers, functions_of
 
-PAGE = ROOT / "docs" / "security.md"
+PAGE = ROOT / "docs" / "internals" / "bundles.md"
 
 
 def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:

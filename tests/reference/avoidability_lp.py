@@ -8,7 +8,8 @@ finds the largest smallest gap ``m``:
     0 <= v[k] <= limit          x_i[k] - x_i+1[k] >= m    for every pair (i, i+1) that holds a controlled vehicle
 
 ``o[k]`` is the part of the step after the vehicle's latency. All other vehicles brake fully from theirs. A controlled
-vehicle with another one in front must stand at the horizon. docs/avoidability.md derives the tolerance.
+vehicle with another one in front must stand at the horizon. docs/internals/proofs/avoidable-contact.md derives
+the tolerance.
 """
 
 import math

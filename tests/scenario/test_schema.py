@@ -357,8 +357,7 @@ def test_file_of_the_user__goes_before_a_shipped_scenario(path: str, empty_folde
 
 
 def test_examples_of_the_pages__are_valid_scenarios() -> None:
-    pages = "".join((DOCS / name).read_text("utf-8") for name in ("scenarios.md", "types-and-mixtures.md"))
-    examples = re.findall(r"^```yaml\n(name:.*?)^```$", pages, re.MULTILINE | re.DOTALL)
+    examples = re.findall(r"^```yaml\n(name:.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     assert [eb.Scenario.from_document(parse_yaml(text)).sample(10, 0).worlds.n for text in examples] == [10, 10]
 
 

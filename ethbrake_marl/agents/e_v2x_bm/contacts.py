@@ -1,6 +1,6 @@
 """First contact of a single pair in closed form, and the decelerations that avoid it.
 
-Symbols, for a pair on its own (docs/proofs/constant-deceleration.md derives every formula):
+Symbols, for a pair on its own (docs/internals/proofs/constant-deceleration.md derives every formula):
 
 =============  ===============================================================
 l, f           leader (front vehicle), follower (rear vehicle)
@@ -56,7 +56,7 @@ def stopping_distance(speed: float, deceleration: float) -> float:
 def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
     """Return the squared closing speed if the pair meets while the follower coasts, else -1. [m2/s2]
 
-    Regimes A (the leader still moves) and A' (it stands) of docs/proofs/constant-deceleration.md.
+    Regimes A (the leader still moves) and A' (it stands) of docs/internals/proofs/constant-deceleration.md.
 
     Args:
         gap: gap at the start, m.
@@ -85,7 +85,7 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
 def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
     """Return the squared closing speed if the pair meets while both brake and move, else -1. [m2/s2]
 
-    Regime B of docs/proofs/constant-deceleration.md.
+    Regime B of docs/internals/proofs/constant-deceleration.md.
 
     Args:
         gap: gap at the start, m.

@@ -2,7 +2,7 @@
 
 The closed form of ``pairwise`` treats the pairs as independent. Here every candidate is simulated to the horizon with
 velocity exchange, second impacts and resting contact, so the predicted harm is the harm that occurs. Of the three
-baselines only this one may bound a shield. docs/baselines.md says how close the search comes to the true minimum.
+baselines only this one may bound a shield. docs/evaluate.md says how close the search comes to the true minimum.
 """
 
 from __future__ import annotations

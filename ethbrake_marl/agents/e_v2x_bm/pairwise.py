@@ -3,7 +3,7 @@
 The neighbours of the controlled vehicle brake at full capacity from their own latencies on. Its front and rear pair are
 treated as independent, so each counts its first contact only and no velocity is exchanged. The predicted harm is
 ``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). It is concave in ``a`` between a few closed-form breakpoints, so its
-minimum is at one of them and no grid is needed. docs/proofs/constant-deceleration.md has the derivation.
+minimum is at one of them and no grid is needed. docs/internals/proofs/constant-deceleration.md has the derivation.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The coupled search in one world, compiled: even grid, finer grid, borders, local minima, one safety step.
 
-``coupled`` says what is searched for; docs/baselines.md gives the reasons for these steps.
+``coupled`` says what is searched for; docs/evaluate.md gives the reasons for these steps.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ A quantity of one vehicle (or pair) with the reported value x lies in [x - h, x 
 the quantity's unit or a share of x. The interval is cut to possible values: no latency, speed or gap below 0, no speed
 above the vehicle's limit. The *members* of a world are the reported world and every corner of the box of all these
 intervals: 2^d corners for d uncertain numbers. Mode ``robust`` proves its bound for the members
-(``docs/shield-intervals.md``).
+(``docs/extensions/certified.md``).
 """
 
 from __future__ import annotations

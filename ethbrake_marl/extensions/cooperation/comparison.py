@@ -24,7 +24,7 @@ from ethbrake_marl.shields.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Return the comparison of all levels as plain data for JSON; docs/ablate-cooperation.md describes it.
+    """Return the comparison of all levels as plain data for JSON; docs/extensions/cooperation.md describes it.
 
     Keys: ``levels`` (results of each level), ``steps`` (each level against the one before), ``channels`` (each level
     with a worse V2X channel against the level that it varies), and ``undertrained`` (a list of one sentence that names

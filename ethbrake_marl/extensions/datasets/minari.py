@@ -214,8 +214,8 @@ def write_dataset(
 ) -> DatasetSummary:
     """Record agents in the same worlds of an evaluation list, as a Parquet file or a Minari dataset.
 
-    An environment that takes the recorded actions repeats the episodes bit for bit. docs/datasets.md describes the
-    content.
+    An environment that takes the recorded actions repeats the episodes bit for bit.
+    docs/extensions/datasets.md describes the content.
 
     Args:
         path: the file (``.parquet``) or the folder (``NAME-v0``) to write.

@@ -51,7 +51,7 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 def decision_columns(recording: Recording) -> Columns:
     """Return a recording as table columns by name, one row per decision, world by world.
 
-    docs/datasets.md lists the columns.
+    docs/extensions/datasets.md lists the columns.
     """
     running = recording.running
     before = recording.told

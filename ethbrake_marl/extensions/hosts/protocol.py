@@ -610,7 +610,9 @@ def _checked_dt(host: Host, scenario: Scenario) -> float:
     """
     missing = [what for what in ("dt", "state", "apply") if not hasattr(host, what)]
     if missing:
-        raise InvalidInput(f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/hosts.md shows one")
+        raise InvalidInput(
+            f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/extensions/hosts.md shows one"
+        )
     dt, step = host.dt, scenario.time_step_s
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not dt > 0.0:
         raise InvalidInput(f"host: dt = {dt!r}: must be a number of seconds above 0, or math.inf")

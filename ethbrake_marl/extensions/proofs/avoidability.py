@@ -5,7 +5,8 @@ with the front vehicle. Contact with the rear vehicle is avoidable exactly if th
 
 Symbols: l the front vehicle (leader), f the controlled vehicle (follower), r the rear vehicle; gap [m], speed v [m/s],
 braking capacity a > 0, driving capacity u >= 0 [m/s2]. Times count from the moment at which the controlled vehicle
-may act; by then the leader brakes. docs/avoidability.md derives every formula. Only + - * / and sqrt are used.
+may act; by then the leader brakes. docs/internals/proofs/avoidable-contact.md derives
+every formula. Only + - * / and sqrt are used.
 """
 
 from __future__ import annotations

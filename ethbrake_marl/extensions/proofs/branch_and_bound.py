@@ -2,7 +2,8 @@
 
 A *meeting* is a first contact of the controlled vehicle with a neighbour: a time and a closing speed. Its harm is the
 squared closing speed and what must follow (``obstacle.after``). A *cell* is a range of times and closing speeds. Cells
-are halved until their bounds are close to the best meeting seen so far. docs/avoidability.md has the proof.
+are halved until their bounds are close to the best meeting seen so far. The proof is in
+docs/internals/proofs/lower-bound.md.
 """
 
 from __future__ import annotations

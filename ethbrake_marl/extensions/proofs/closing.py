@@ -2,7 +2,7 @@
 
 The extreme motions: the leader goes as far ahead as it can (full drive if it is controlled, else full braking), and the
 follower stays as far behind as it can (full braking). If these meet, every motion of the pair meets no later.
-docs/avoidability.md, "Teams", has the proof.
+docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations

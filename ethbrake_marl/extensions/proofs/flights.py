@@ -2,7 +2,7 @@
 
 A *flight* is a time in which the two are apart. ``share`` is the partner's share of both masses. ``press`` is the
 acceleration with which they close under the best command (m/s2); ``reach`` is how much of it a command can hold back.
-``opening`` is the speed with which they separate. docs/avoidability.md has the proofs.
+``opening`` is the speed with which they separate. docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations

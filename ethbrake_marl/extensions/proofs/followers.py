@@ -2,8 +2,8 @@
 
 A first meeting at a given time with closing speed ``closing`` leaves an exactly known state. From then on, no command
 beats the extreme one for the path of the two vehicles' centre of mass, and the controlled vehicle is faster (slower)
-than the centre only until it returns to its partner; ``flights.largest_lead`` bounds by how much. docs/avoidability.md
-has the proofs.
+than the centre only until it returns to its partner; ``flights.largest_lead`` bounds by how much. The
+proofs are in docs/internals/proofs/lower-bound.md.
 
 The meetings of a cell lie between ``early`` and ``late``; the state is taken at ``early``. From ``late`` to ``end`` the
 command of the earlier decision is still in force; it falls short of the extreme command by at least ``lack`` (m/s2).

@@ -2,7 +2,7 @@
 
 The rear vehicle is never behind, nor slower than, its own full braking, but it may arrive earlier. So a meeting is
 described by its time, how much *further* the rear vehicle has come than by full braking, and the closing speed. Cells
-of these are halved until their bounds are close to the best meeting tried. docs/avoidability.md, "Teams", has the
+of these are halved until their bounds are close to the best meeting tried. docs/extensions/proofs.md, "Teams", has the
 proof.
 """
 

@@ -2,7 +2,7 @@
 
 Meetings with the leader are bounded as for one controlled vehicle (``lower_bound.front_first``): a rear vehicle that
 arrives earlier only makes the rest worse. Meetings with the rear vehicle have their own search
-(``free_rear.meetings_behind``). docs/avoidability.md, "Teams", has the proofs.
+(``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A *meeting* is a first contact. Times count from the moment at which the controlled vehicle (f) may act. The front
 vehicle (leader, l) brakes by then; the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are
->= 0. docs/avoidability.md has the proofs.
+>= 0. docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 ``beyond`` is the squared speed with which the leader hits the obstacle; it bounds how far ahead the leader is.
 Positions count from the position of the controlled vehicle at its onset; masses are in units of its mass.
-docs/proofs/lower-bound-obstacle.md has the proofs.
+docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations

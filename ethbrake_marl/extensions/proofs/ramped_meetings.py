@@ -2,7 +2,7 @@
 
 A *meeting* is a first contact of the controlled vehicle. ``sign`` is 1 for meetings with the leader and -1 for meetings
 with the rear vehicle, which are the mirror image: forces times ``sign`` first rise (drive, or brake) and later fall.
-``place`` is a position times ``sign``. docs/proofs/lower-bound-cases.md has the proofs.
+``place`` is a position times ``sign``. docs/internals/proofs/lower-bound-cases.md has the proofs.
 """
 
 from __future__ import annotations

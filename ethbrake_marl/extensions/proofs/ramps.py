@@ -3,7 +3,7 @@
 A *plan* is an array [3, LEGS]: row ENDS holds the end of each leg (s from now, the last one infinite), row FORCES the
 acceleration in force at its start (m/s2), row JERKS its rate of change (m/s3). A vehicle at rest stays until its force
 is above 0; a vehicle at its speed limit keeps that speed until its force is below 0. There is no time step: the gap is
-a sequence of cubics. docs/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
+a sequence of cubics. docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
 from __future__ import annotations

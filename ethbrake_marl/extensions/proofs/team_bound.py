@@ -1,7 +1,7 @@
 """``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
 
 The first three vehicles are bounded together if Vehicle 2 is the first controlled one. If Vehicle 1 is controlled, an
-obstacle ahead takes the place of a first vehicle that nothing moves. docs/avoidability.md, "Teams", has the proofs.
+obstacle ahead takes the place of a first vehicle that nothing moves. Proofs: docs/internals/proofs/team-bound.md.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[
 
     Values: ``early`` (before the front vehicle of the pair brakes), ``A`` (the rear vehicle still coasts), ``A'`` (it
     coasts and the front one stands), ``B`` (both brake), ``C`` (the rear one brakes and the front one stands), ``none``
-    (they never meet). docs/proofs/constant-deceleration.md has the formulas.
+    (they never meet). docs/internals/proofs/constant-deceleration.md has the formulas.
 
     Args:
         worlds: the worlds, [n].

@@ -57,7 +57,7 @@ PAPER_NOTE = (
     " the paper's row (the scenario paper-random-early). The paper's E-V2X-BM harm is close to what the pairwise closed"
     " form predicts at the alert, not to what those commands cause; for the 5,000-world table that holds only at the"
     " speeds of the random test, since at those of the paper's figure of distances it predicts 3.07. Nothing here is"
-    " tuned to these rows. docs/paper.md goes through the paper's equations, figures and tables one by one."
+    " tuned to these rows. docs/internals/paper.md goes through the paper's equations, figures and tables one by one."
 )
 
 _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant that PAPER_NOTE mentions

@@ -31,7 +31,7 @@ def reproduce_command(
         int, typer.Option(help="The most worlds of any list; the paper has 10,000.", min=2, max=PAPER_EPISODES)
     ] = PAPER_EPISODES,
     docs: Annotated[
-        Path | None, typer.Option(metavar="FILE.md", help="Also write the results as Markdown, figures beside it.")
+        Path | None, typer.Option(metavar="FILE.json", help="Also write the results as JSON, figures beside it.")
     ] = None,
     cost: Annotated[
         bool, typer.Option("--cost", help="Print what is left to do and how long it takes, and exit.")

@@ -47,13 +47,13 @@ class Reproduction:
     episodes: int = MOST_EPISODES  # largest number of worlds of a list; the paper has 10,000
     tell: OnProgress = lambda progress: None  # called with the progress
     machine: str = ""  # description of the machine, for the results
-    docs: Path | None = None  # Markdown page of the results to write; None: no such page
+    docs: Path | None = None  # JSON file of the results to write; None: no such file
 
     def __post_init__(self) -> None:
-        """Raise ``InvalidInput`` if the name of the Markdown page does not end in ``.md``, or it cannot be written."""
+        """Raise ``InvalidInput`` if the name of the JSON file does not end in ``.json``, or it cannot be written."""
         if self.docs is not None:
-            if self.docs.suffix != ".md":
-                raise InvalidInput(f"{self.docs}: must end in .md")
+            if self.docs.suffix != ".json":
+                raise InvalidInput(f"{self.docs}: must end in .json")
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:

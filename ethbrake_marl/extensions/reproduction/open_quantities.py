@@ -112,7 +112,7 @@ GAPS = (
     Gap("seeds of the training", "multiple training tests with different random seeds", "0, 1, 2",
         otherwise="trained by --full: ppo-paper..."),
     Gap("ends of the cosine, number of decisions", "table:params: cosine, no numbers", "3e-4 to 3e-5; in the recipes",
-        otherwise="not measured: one training each takes minutes; docs/learning.md compares recipes"),
+        otherwise="not measured: one training each takes minutes; docs/train.md compares recipes"),
 )  # fmt: skip
 
 _SPECS = (FULL_BRAKE, PAIRWISE, COUPLED, PPO)

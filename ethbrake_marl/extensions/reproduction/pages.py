@@ -1,17 +1,15 @@
-"""Pages of a reproduction: one self-contained HTML file, and a Markdown page with figures beside it."""
+"""Page of a reproduction: one self-contained HTML file. The results as JSON, with figures beside it."""
 
 from __future__ import annotations
 
 import json
 import re
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
 from markupsafe import Markup
 
-from ethbrake_marl.errors import plain_text
 from ethbrake_marl.extensions.report.page import Page, Part, Section, shown
 from ethbrake_marl.extensions.reproduction.folder import LIMIT_BYTES, Result
 from ethbrake_marl.extensions.reproduction.items import ITEMS
@@ -116,12 +114,11 @@ def _outcome(word: str) -> Markup:
     return Markup('<span class="outcome {}">{}</span>').format(word.replace(" ", "-"), word)
 
 
-FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the figures of docs/reproduction.md
+FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the figures of docs/reproduction.json
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the Markdown page to ``file``, the results as ``.json`` beside it, and the figures into a folder
-    ``figures``.
+    """Write the results to ``file`` as JSON, and the figures into a folder ``figures`` beside it.
 
     Existing files are replaced. ``folder`` holds the figures of the results.
     """
@@ -132,43 +129,4 @@ def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
             data = read_plain(folder / result.name / f"{drawn.stem}.svg", LIMIT_BYTES)
             write_output(figures / f"{PREFIX}{drawn.stem}.svg", data, force=True)
     content = json.dumps([each.in_words() for each in results], indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    write_output(file.with_suffix(".json"), content.encode(), force=True)
-    write_output(file, docs_page(results).encode(), force=True)
-
-
-def docs_page(results: Sequence[Result]) -> str:
-    """Return the Markdown page of these results, with the verdict on each item. The ``.json`` file has all the rest."""
-    lead, command, count, few = _account(results)
-    blocks = [
-        f"# {_TITLE}",
-        "What comes out where the paper's experiments are made again, and where it cannot?",
-        _wrapped(lead),
-        _wrapped(f"Made by `{command} --output runs/reproduction --docs docs/reproduction.md` ({_escaped(count)})."),
-        _wrapped(
-            "That command writes this page, its figures and `reproduction.json`; nothing is written by hand. `ethbrake"
-            " reproduce` makes them again without training. [All that was measured](results/reproduction.md) has every"
-            " comparison, table, figure and parameter of each item; [the paper, line by line](paper.md) has every"
-            " equation."
-        ),
-        *map(_wrapped, few),
-    ]
-    for result in results:
-        labels = f" ({', '.join(map(_escaped, result.labels))})" if result.labels else ""
-        blocks += [
-            f"## {_escaped(result.title)}: {result.verdict.outcome}",
-            _wrapped(f"{_escaped(result.what)}{labels}"),
-            _wrapped(_escaped(result.verdict.because[:1].upper() + result.verdict.because[1:])),
-        ]
-    return "\n\n".join(blocks) + "\n"
-
-
-def _wrapped(text: str) -> str:
-    """Return a paragraph wrapped to lines of 99 characters, of which none starts a list or a heading."""
-    lines = textwrap.wrap(text, 99, break_long_words=False, break_on_hyphens=False)
-    return "\n".join(re.sub(r"^(?=[-+#>] )", r"\\", line) for line in lines)
-
-
-def _escaped(text: str) -> str:
-    """Return ``text`` with the special characters of Markdown escaped."""
-    plain = plain_text(text, keep="\u00a0").replace("<", "&lt;")
-    return re.sub(r"([\\|*_`])", r"\\\1", plain).replace("](", "]\\(")
+    write_output(file, content.encode(), force=True)

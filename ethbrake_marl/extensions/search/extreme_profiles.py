@@ -3,7 +3,7 @@
 They drive, brake until they meet the leader, and drive again; or the mirror image with the rear vehicle. The proof of
 the lower bound shows that the least harm has this form: the vehicle drives fully for a while, then brakes fully until
 it meets the leader; or it brakes, then drives until the rear vehicle meets it. After the meeting it does the opposite
-(docs/avoidability.md). A random search seldom finds such a narrow optimum.
+(docs/extensions/search.md). A random search seldom finds such a narrow optimum.
 """
 
 from __future__ import annotations

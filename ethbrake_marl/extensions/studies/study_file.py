@@ -28,19 +28,19 @@ class StudyFile(FileModel):
     _document: Document = PrivateAttr(Document("the file", {}, {}))  # source document, for messages
 
     @classmethod
-    def read_as(cls, path: str | Path, page: str, needed: str) -> Self:
+    def read_as(cls, path: str | Path, needed: str) -> Self:
         """Read and check a YAML file of this class.
 
         Args:
             path: the file.
-            page: name of the page of docs/ that shows an example, for messages.
             needed: what the file must contain, for messages: ``with a grid or a list of jobs``.
 
         Raises ``InvalidInput`` with file, line, key, value and what would be right.
 
         """
         document = read_yaml(path)
-        study = read_model(document, cls, Wording(cls, f"it is needed; docs/{page}.md shows an example"), needed)
+        wording = Wording(cls, "it is needed; docs/extensions/studies.md shows an example")
+        study = read_model(document, cls, wording, needed)
         study._document = document
         return study
 

@@ -235,7 +235,7 @@ class SweepPlan:
         Raises ``InvalidInput`` with file, line and job for invalid content: an unknown scenario or recipe, an unknown
         setting, parts that do not fit together, or two jobs with the same hash.
         """
-        file = SweepFile.read_as(path, "scaling", "with a grid or a list of jobs")
+        file = SweepFile.read_as(path, "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:
             raise InvalidInput(f"{path}: asks for {count_of(file.size(), 'job')}; must be from 1 to {MOST_JOBS:,}")
         rows: list[Row] = []

@@ -315,7 +315,7 @@ class TuningPlan:
         Raises ``InvalidInput`` with file and line for: an unknown scenario or recipe, a key that the recipe does not
         have or that may not be searched, a value that the recipe does not allow, and values that do not go together.
         """
-        file = TuningFile.read_as(path, "tuning", "with scenario, recipe and search")
+        file = TuningFile.read_as(path, "with scenario, recipe and search")
         at = file._document.refusing_at
         with at(("recipe",)):
             recipe = load_recipe(file.recipe)

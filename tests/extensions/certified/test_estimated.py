@@ -35,7 +35,7 @@ def test_robust__at_the_corners_no_world_is_above_the_first_bound(name: str, way
 
 
 def test_robust__between_the_corners_some_worlds_are_above_though_trusted_and_none_inside_the_box() -> None:
-    """The counterexample of docs/extensions/certified.md: coasting, in the first world of seed 5006."""
+    """The counterexample of docs/extensions/certified.md: proposals to coast, in the first world of seed 5006."""
     harm, bound = {}, {}
     for robust in ("members", "interior"):
         settings = {"robust": "interior"} if robust == "interior" else {}

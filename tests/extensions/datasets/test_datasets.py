@@ -33,7 +33,7 @@ PAIR = eb.load_scenario("cooperation-3-pair")
 LINKED = eb.load_scenario("cooperation-3-congested")
 
 
-DOCS = Path(__file__).resolve().parents[3] / "docs" / "datasets.md"
+DOCS = Path(__file__).resolve().parents[3] / "docs" / "extensions" / "datasets.md"
 
 
 BRAKING = {"full_brake": BRAKE}

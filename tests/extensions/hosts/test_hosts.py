@@ -33,7 +33,7 @@ class EngineHost:
         self.worlds, self.impacts = eb.advance(self.worlds, command.wanted_mps2, until_s=command.until_s)
 
 
-PAGE = (DOCS / "hosts.md").read_text("utf-8")
+PAGE = (DOCS / "extensions" / "hosts.md").read_text("utf-8")
 (SHOWN, PRINTED), *_ = re.findall(r"```python\n(.*?)```\n\n```\n(.*?)```", PAGE, re.DOTALL)
 NAMES: dict = {}
 exec(SHOWN.partition("\n\nscenario = ")[0], NAMES)
@@ -489,7 +489,7 @@ def test_host__that_is_a_little_off_is_driven_to_the_end(make, dt):
 @pytest.mark.parametrize(
     ("host", "message"),
     [
-        (object(), "host object: has no dt and no state and no apply; docs/hosts.md shows one"),
+        (object(), "host object: has no dt and no state and no apply; docs/extensions/hosts.md shows one"),
         (Bench(PAPER.sample(20, 7).worlds, 0.03), "host: dt = 0.03 s: decisions every 0.1 s must be whole steps"),
         (Bench(PAPER.sample(20, 7).worlds, 0.2), "host: dt = 0.2 s: decisions every 0.1 s must be whole steps"),
         (Bench(PAPER.sample(20, 7).worlds, math.nan), "host: dt = nan: must be a number of seconds above 0"),

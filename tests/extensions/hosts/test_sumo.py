@@ -1,4 +1,4 @@
-"""SUMO as a host, where it is installed (the extra ``sumo``): the table of docs/hosts.md, and what is refused."""
+"""SUMO as a host, if the extra ``sumo`` is installed: the table of docs/extensions/hosts.md, and what is refused."""
 
 import re
 
@@ -11,7 +11,7 @@ from ethbrake_marl.extensions.hosts.protocol import drive_host
 from ethbrake_marl.extensions.hosts.sumo import SumoHost, find_host
 from tests.docs.site import DOCS
 
-PAGE = (DOCS / "hosts.md").read_text("utf-8")
+PAGE = (DOCS / "extensions" / "hosts.md").read_text("utf-8")
 PAPER = eb.load_scenario("paper-random")
 
 

@@ -171,4 +171,4 @@ def test_page__shows_the_harm_of_rows_and_of_fits(tmp_path: Path) -> None:
         result = eb.evaluate(scenario=tmp_path / f"{draw}.yaml", agents="full_brake,e_v2x_bm", episodes=10_000, seed=7)
         harms = (f"{each.first_impact_harm.mean():.2f} |" for each in result.outcomes.values())
         shown.append(" ".join([f"| `{draw}` |", *harms]))
-    assert "\n".join(shown) in (DOCS / "recorded.md").read_text("utf-8")
+    assert "\n".join(shown) in (DOCS / "extensions" / "recorded.md").read_text("utf-8")

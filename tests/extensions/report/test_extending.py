@@ -41,7 +41,7 @@ def test_measure__stands_in_the_page_of_an_evaluation(empty_folder: Path) -> Non
 
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
-PAGE = "".join((DOCS / f"{name}.md").read_text("utf-8") for name in ("extending", "own-policy"))
+PAGE = (DOCS / "extend.md").read_text("utf-8")
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -52,7 +52,7 @@ def test_page__its_code_runs_from_the_top_down(
     monkeypatch.setattr(app, "registered_commands", [*app.registered_commands])
     code = "\n".join(re.findall("```python\n(.*?)```", PAGE, re.DOTALL))
     names: dict[str, object] = {"__name__": "my_file"}
-    exec(compile(code, "extending.md", "exec"), names)
+    exec(compile(code, "extend.md", "exec"), names)
     assert names["status"] == 0
     assert run_command(["scenario", "parts"]) == 0
     told = capsys.readouterr().out

@@ -21,7 +21,7 @@ from ethbrake_marl.extensions.reproduction.folder import Drawn, Item, Made, Repr
 from ethbrake_marl.extensions.reproduction.items import ITEMS, read_results
 from ethbrake_marl.extensions.reproduction.making import choose_items, make_items, open_folder
 from ethbrake_marl.extensions.reproduction.open_quantities import GAPS
-from ethbrake_marl.extensions.reproduction.pages import docs_page, render_page, write_docs
+from ethbrake_marl.extensions.reproduction.pages import render_page, write_docs
 from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES, READINGS, lineup
 from ethbrake_marl.extensions.reproduction.tables import (
     NOBODY,
@@ -210,10 +210,9 @@ def settings(tmp_path: Path) -> Reproduction:
 def test_page__whatever_a_result_says_is_text_and_no_name_leads_elsewhere(settings: Reproduction) -> None:
     own = replace(settings, folder=settings.folder.parent / "<b>out</b>'\"; {{ 7 * 7 }}\u202e")
     (result,), _ = make_items(own, [planted("gaps", lambda s: made(HOSTILE))])
-    page, docs = (own.folder / "index.html").read_text("utf-8"), docs_page([result])
-    assert "<script" not in page + docs and "&lt;script&gt;" in page and "\u202e" not in page + docs
+    page = (own.folder / "index.html").read_text("utf-8")
+    assert "<script" not in page and "&lt;script&gt;" in page and "\u202e" not in page
     assert own.folder.name not in page and "data-episodes" not in page
-    assert all(line.count(" | ") <= 2 for line in docs.splitlines() if line.startswith("| "))
     hostile = replace(result, name="javascript:alert(1)", data=["//x", '" onclick="'])
     shown = Page(render_page(own.folder, [hostile]))
     links = [attributes["href"] for tag, attributes in shown.tags if tag == "a"]
@@ -271,10 +270,9 @@ def test_reproduce__writes_figures_data_results_docs_and_one_page(settings: Repr
     page = (settings.folder / "index.html").read_text("utf-8")
     assert page.count("<svg") == 1 and "var(--series-0)" in page and "<img" not in page and "<script" not in page
     assert re.search(r"https?://", re.sub(r'xmlns(:\w+)?="[^"]*"', "", page)) is None
-    file = tmp_path / "page.md"
+    file = tmp_path / "all.json"
     write_docs(file, settings.folder, results)
-    assert json.loads((tmp_path / "page.json").read_text("utf-8")) == [each.in_words() for each in results]
-    assert file.read_text("utf-8") == docs_page(read_results(settings.folder))
+    assert json.loads(file.read_text("utf-8")) == [each.in_words() for each in results]
     assert (tmp_path / "figures" / "reproduction-a-figure.svg").is_file()
 
 
@@ -286,7 +284,7 @@ def test_pages__tell_everything_that_a_result_holds(settings: Reproduction) -> N
     content = {name: value for name, value in asdict(result).items() if name != "episodes"}
     earlier = Page(render_page(own.folder, [checked_result(content, "result.json", "gaps")]))
     page = Page((own.folder / "index.html").read_text("utf-8"))
-    texts = "\n\n".join([page.text, earlier.text, docs_page([result])])
+    texts = "\n\n".join([page.text, earlier.text])
     check_snapshot(SNAPSHOTS / "reproduction.txt", texts.replace(result.made_utc[:10], "(today)"))
     assert page.open == []
     links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]

@@ -42,7 +42,7 @@ def plan(text: str = "", **changes: object) -> TuningPlan:
 
 TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 3: search = {}: must not be empty": lambda: plan(search={}),
-    "t.yaml: search: missing; it is needed; docs/tuning.md shows an example": lambda: plan(
+    "t.yaml: search: missing; it is needed; docs/extensions/studies.md shows an example": lambda: plan(
         "scenario: paper-random\nrecipe: ppo\n"
     ),
     "t.yaml, line 4: search, at learning_rate.strat=0.0001: recipe 'ppo': learning_rate.strat: unknown": lambda: plan(
@@ -58,8 +58,8 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 5: search.gamma.high = .nan: must be a finite number": lambda: plan(
         search={"gamma": {"low": 0.5, "high": float("nan")}}
     ),
-    "t.yaml, line 4: search.gamma.high: missing; it is needed; docs/tuning.md shows an example": lambda: plan(
-        search={"gamma": {"low": 0.5}}
+    "t.yaml, line 4: search.gamma.high: missing; it is needed; docs/extensions/studies.md shows an example": lambda: (
+        plan(search={"gamma": {"low": 0.5}})
     ),
     "t.yaml, line 7: search.gamma.steps: unknown key": lambda: plan(
         search={"gamma": {"low": 0.5, "high": 0.9, "steps": 3}}
@@ -183,7 +183,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "s.yaml: asks for 10,001 jobs; must be from 1 to 10,000": lambda: sweep(
         {"grid": {**GRID, "seed": {"count": 10_000}}, "jobs": [GRID]}
     ),
-    "s.yaml, line 1: grid.scenario: missing; it is needed; docs/scaling.md shows an example": lambda: sweep(
+    "s.yaml, line 1: grid.scenario: missing; it is needed; docs/extensions/studies.md shows an example": lambda: sweep(
         {"grid": {"recipe": "ppo"}}
     ),
     "s.yaml, line 4: grid.sede: unknown key; did you mean seed?": lambda: sweep({"grid": {**GRID, "sede": [1]}}),

@@ -72,7 +72,7 @@ def test_grid__is_every_combination_seed_by_seed(write_sweep):
 def test_example__of_the_page_is_in_order():
     plan = SweepPlan.read(DOCS / "sweep-example.yaml")
     assert len(plan.rows) == 42 and {row.first.recipe.total_steps for row in plan.rows} == {200_000}
-    assert (DOCS / "sweep-example.yaml").read_text("utf-8") in (DOCS / "scaling.md").read_text("utf-8")
+    assert (DOCS / "sweep-example.yaml").read_text("utf-8") in (DOCS / "extensions" / "studies.md").read_text("utf-8")
 
 
 def test_table__has_a_row_for_every_job_in_the_order_of_the_file(finished_sweep):
@@ -288,7 +288,7 @@ def test_schema__marks_what_the_reader_refuses_and_that_alone(
     content = {key: value for key, value in {**read_yaml(example).content, **change}.items() if value != "-"}
     assert marked(schema(), content) == ({place} - {None})
     with nullcontext() if place is None else pytest.raises(InvalidInput):
-        read(write_yaml(tmp_path / "mine.yaml", content), "scaling", "")
+        read(write_yaml(tmp_path / "mine.yaml", content), "")
 
 
 # ---------------------------------------------------------------- tuning
@@ -332,7 +332,7 @@ def test_shipped_space__is_in_order_holds_its_recipe_and_is_the_one_of_the_page(
     file = DOCS / "tuning-quick.yaml"
     plan = TuningPlan.read(file)
     assert plan.own_values() is not None and plan.file.recipe in eb.TrainingRecipe.shipped()
-    assert file.read_text("utf-8") in (DOCS / "tuning.md").read_text("utf-8")
+    assert file.read_text("utf-8") in (DOCS / "extensions" / "studies.md").read_text("utf-8")
 
 
 TRIALS_TABLE = "trials.csv"
