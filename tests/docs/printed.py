@@ -177,7 +177,6 @@ TABLES: dict[str, How] = {
     "| agent in a host | here | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
     "| you write | values": _by(BY_HAND),
-    "| library | how": _by(BY_HAND),
     "| agent | what it does | knows": _by(
         NIGHTLY, "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json"
     ),
