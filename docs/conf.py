@@ -15,15 +15,15 @@ copyright = f"2026, {author}"
 release = version = __version__
 
 extensions = ["myst_nb", "sphinx_copybutton", "extension"]
-exclude_patterns = ["_build", "README.md", "extension"]
+exclude_patterns = ["_build", "**.ipynb_checkpoints", "README.md", "extension"]
 highlight_language = "none"
 
 # Links to headings are those of GitHub, so that pages read the same there.
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
 
-# Notebooks are Markdown files with code cells, each run in an empty folder. Their outputs are kept from build to build
-# until a cell changes; `make clean` forgets them.
+# Notebooks are committed with their outputs, and run again here, each in an empty folder. Outputs are kept from build to
+# build until a cell changes; `make clean` forgets them.
 nb_execution_mode = "cache"
 nb_execution_timeout = -1  # however busy the machine is
 nb_execution_raise_on_error = True

@@ -103,7 +103,7 @@ if TYPE_CHECKING:
     # Errors
     from ethbrake_marl.errors import EthBrakeError as EthBrakeError, MissingExtra as MissingExtra
 
-__version__ = "0.4.0.dev0"
+__version__ = "0.5.0"
 
 
 _HOMES = names_behind(__file__)

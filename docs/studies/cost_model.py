@@ -21,7 +21,7 @@ from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.session import train
 
 SCENARIO = "paper-random"
-UPDATES = {"ppo": 5, "counterfactual": 4, "quick": 4}  # of which the first does not count
+UPDATES = {"ppo": 5, "vine": 4, "quick": 4}  # of which the first does not count
 AGENTS = {"full_brake": 200, "e_v2x_bm": 50, "ppo": 50, "universal": 10, "ppo+step": 1}
 LARGER = 2  # a list of so many times the worlds is timed too: the difference is the cost of a world
 

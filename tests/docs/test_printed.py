@@ -195,19 +195,24 @@ def test_programs_of_train__run_and_beat_full_braking(tmp_path: Path, monkeypatc
     assert {"one", "pair"} <= harm_of_programs().keys()
 
 
-CELL = re.compile(r"^```\{code-cell\} python\n(?::tags: .*\n)?(.*?)^```$", re.DOTALL | re.MULTILINE)
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 
-NOTEBOOKS = sorted(
-    path.stem for path in (DOCS / "tutorials").glob("*.md") if "\nfile_format: mystnb\n" in path.read_text("utf-8")
-)
+def code_cells(notebook: Path) -> list[dict[str, Any]]:
+    return [cell for cell in json.loads(notebook.read_text("utf-8"))["cells"] if cell["cell_type"] == "code"]
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook__is_committed_with_its_outputs(notebook: Path) -> None:
+    cells = code_cells(notebook)
+    assert any(cell["outputs"] for cell in cells)
+    assert [cell for cell in cells if any(each["output_type"] == "error" for each in cell["outputs"])] == []
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", NOTEBOOKS)
-def test_notebook__runs_from_its_first_cell_to_its_last(name: str, tmp_path: Path) -> None:
-    cells = CELL.findall((DOCS / "tutorials" / f"{name}.md").read_text("utf-8"))
-    assert cells
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook__runs_from_its_first_cell_to_its_last(notebook: Path, tmp_path: Path) -> None:
+    cells = ["".join(cell["source"]) for cell in code_cells(notebook)]
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(cells)],
         env={**os.environ, "OMP_NUM_THREADS": "1"},
@@ -231,7 +236,10 @@ def test_list_of_pages__has_every_page_once() -> None:
     listed = [page for each in sections.values() for page in each]
     for page in (page for page in listed.copy() if page.endswith("/README.md")):
         listed += _inside(page)
-    there = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md") if "_build" not in path.parts}
+    files = [*DOCS.rglob("*.md"), *DOCS.rglob("*.ipynb")]
+    there = {
+        path.relative_to(DOCS).as_posix() for path in files if not {"_build", ".ipynb_checkpoints"} & set(path.parts)
+    }
     assert len(listed) == len(set(listed))
     assert set(listed) == {page for page in there if "/api/" not in page} - {"README.md", "index.md"}
 
