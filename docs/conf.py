@@ -22,8 +22,8 @@ highlight_language = "none"
 myst_heading_anchors = 4
 myst_enable_extensions = ["dollarmath"]
 
-# Notebooks are committed with their outputs, and run again here, each in an empty folder. Outputs are kept from build to
-# build until a cell changes; `make clean` forgets them.
+# Notebooks are committed with their outputs, and run again here, each in an empty folder. Outputs are kept from build
+# to build until a cell changes; `make clean` forgets them.
 nb_execution_mode = "cache"
 nb_execution_timeout = -1  # however busy the machine is
 nb_execution_raise_on_error = True
