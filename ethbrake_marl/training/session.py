@@ -27,7 +27,7 @@ from ethbrake_marl.training.models import Learner, make_environment, make_model
 from ethbrake_marl.training.random_state import own_random_state
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.training.run_folder import RunDirectory, RunStatus
-from ethbrake_marl.training.training import Training, recorded_identities, recorded_training
+from ethbrake_marl.training.training import Training, recorded_training
 
 Ended = Literal["finished", "interrupted"]
 
@@ -312,7 +312,7 @@ def _newest_checkpoint(
     state, damaged = newest_usable(run.checkpoints)
     if state is None:
         return None, damaged
-    if state.numbers.get("training") not in recorded_identities(run, training):
+    if state.numbers.get("training") != training.identity:
         name = run.checkpoint(state.steps).name
         raise InvalidInput(
             f"{run.config}: was changed after the checkpoint {name} of this training; restore it, or"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.agents.registry import AGENTS
-from ethbrake_marl.errors import RENAMED, InvalidInput, new_name
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation
@@ -18,7 +18,7 @@ from ethbrake_marl.game.observed import common_observation, observations_of
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
-from ethbrake_marl.training.recipe import ALGORITHMS, WORDS, Scheme, TrainingRecipe, load_recipe
+from ethbrake_marl.training.recipe import WORDS, Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.team import TeamFile, bundle_of
 
@@ -132,46 +132,13 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
     if "library" in config:
         raise InvalidInput(f"{run.path}: was trained by {config['library']}, which cannot be resumed; train again")
     try:
-        recipe = TrainingRecipe.of(with_new_names(config["recipe"]))
+        recipe = TrainingRecipe.of(config["recipe"])
         scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
     except KeyError as error:
         raise InvalidInput(f"{run.config}: is not the configuration of a training: {error} is missing") from None
     except InvalidInput as error:
         raise InvalidInput(f"{run.config}: {error}") from None
     return Training.of(recipe, scenario)
-
-
-def with_new_names(recipe: Any) -> Any:
-    """Return the recipe in a run's ``config.json`` with the new names of its algorithm and keys (``errors.RENAMED``).
-
-    A recipe is returned unchanged unless an earlier version wrote it, which its algorithm's name shows.
-    """
-    if isinstance(recipe, dict) and new_name(recipe.get("algorithm"), ALGORITHMS):
-        return _with_new_names(recipe)
-    return recipe
-
-
-def _with_new_names(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {RENAMED.get(key, key): _with_new_names(each) for key, each in value.items()}
-    if isinstance(value, list):
-        return [_with_new_names(each) for each in value]
-    if isinstance(value, str):  # a name, or an agent such as counterfactual@PATH
-        name, at, path = value.partition("@")
-        folder, _, shipped = path.partition("/")
-        if folder == "shipped":  # ppo@shipped and policy@shipped/ppo are now ppo
-            name, at, path = shipped or name, "", ""
-        return f"{RENAMED.get(name, name)}{at}{path}"
-    return value
-
-
-def recorded_identities(run: RunDirectory, training: Training) -> set[str]:
-    """Return the identities that the checkpoints of a run may name.
-
-    These are the identity of ``training``, the run's training, and its identity before keys of its recipe were renamed.
-    """
-    written = {key: value for key, value in read_object(run.config)["recipe"].items() if key not in WORDS}
-    return {training.identity, Training.identity_of({**training.content(), "recipe": written})}
 
 
 def check_same_training(run: RunDirectory, training: Training) -> None:
