@@ -369,11 +369,6 @@ class Profiles(NamedTuple):
             for part in parts
         ]
 
-    def grown(self, n: int) -> Profiles:
-        """Return a copy with ``n`` rows, at least as many as now; the contents of the added rows are meaningless."""
-        more = n - len(self.ends)
-        return Profiles(np.pad(self.ends, ((0, more), (0, 0))), np.pad(self.commands_mps2, ((0, more), (0, 0), (0, 0))))
-
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
