@@ -236,7 +236,7 @@ class Installed(TyperCommand):
     def __init__(self, entry: str) -> None:
         givers = [giver(point) for point in points(COMMANDS.group)[entry]]
         packages = f"package{'s' if len(givers) > 1 else ''} {' and '.join(givers)}"
-        super().__init__(entry.rpartition(".")[2], help=f"Of the installed {packages}.", rich_markup_mode=None)
+        super().__init__(entry.rpartition(".")[2], help=f"From the installed {packages}.", rich_markup_mode=None)
         self.entry, self.is_ours = entry, givers == [OURS]
 
     def command(self) -> Any:

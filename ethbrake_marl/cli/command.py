@@ -43,7 +43,7 @@ AgentsOption = Annotated[
     str, typer.Option(metavar="A,B,...", help="Agents, separated by commas; `ethbrake agent list` shows all.")
 ]
 
-SeedOption = Annotated[int, typer.Option(help="Seed of the list.")]
+SeedOption = Annotated[int, typer.Option(help="Seed of the evaluation list.")]
 
 JobsOption = Annotated[int | None, typer.Option(help="Processes at once; changes no result.", min=1, max=64)]
 

@@ -78,8 +78,10 @@ def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False)
 def evaluate_command(
     scenario: ScenarioOption = "paper-random",
     agents: AgentsOption = "full_brake,e_v2x_bm,e_v2x_bm:pairwise",
-    episodes: Annotated[int | None, typer.Option(help="Worlds of the list.", show_default="10000")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the list.", show_default="7")] = None,
+    episodes: Annotated[
+        int | None, typer.Option(help="Number of worlds in the evaluation list.", show_default="10000")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the evaluation list.", show_default="7")] = None,
     settings: SettingsOption = None,
     output: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Also write the results to this folder: results.json.")
@@ -340,7 +342,7 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
 def shield_command(
     agents: AgentsOption = "ppo,full_brake,constant:3",
     scenario: ScenarioOption = "paper-random",
-    episodes: Annotated[int, typer.Option(help="Worlds of the list.")] = 2_000,
+    episodes: Annotated[int, typer.Option(help="Number of worlds in the evaluation list.")] = 2_000,
     settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:

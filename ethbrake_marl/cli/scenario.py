@@ -329,7 +329,10 @@ def scenario_sample(
     scenario: NameArgument,
     episodes: Annotated[
         int | None,
-        typer.Option(help="Worlds of the list.", show_default=f"{TABLE_WORLDS}, of a picture {PICTURE_WORLDS}"),
+        typer.Option(
+            help="Number of worlds in the evaluation list.",
+            show_default=f"{TABLE_WORLDS}, for a picture {PICTURE_WORLDS}",
+        ),
     ] = None,
     seed: SeedOption = 7,
     settings: SettingsOption = None,

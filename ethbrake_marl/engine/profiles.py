@@ -35,9 +35,10 @@ class SearchWorld(NamedTuple):
 
 @compiled
 def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
-    """Copy the first ``n`` rows of ``rows`` [>= n, c] to those of ``to_rows``, element by element.
+    """Copy the first ``n`` rows of ``rows`` to the first ``n`` rows of ``to_rows``, element by element.
 
-    An assignment of slices would take ten times longer to compile, because of its error message.
+    Both arrays have at least ``n`` rows and the same columns. An assignment of slices would take ten times longer to
+    compile, because of its error message.
     """
     for k in range(n):
         for c in range(rows.shape[1]):

@@ -113,7 +113,7 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
             self.rewards[agent] = self._no_reward()
 
     def _no_reward(self) -> Any:
-        """Return a reward of zero: a number, or where rewards are vectors a new array [K]."""
+        """Return a reward of zero: the number 0 or, if rewards are vectors, a new array [K] of zeros."""
         components = self.env.unwrapped.engine.components
         return np.zeros(len(components)) if components else 0
 

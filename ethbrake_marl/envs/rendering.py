@@ -151,7 +151,7 @@ def vehicle_colour(i: int) -> str:
 def follow(view: View, front_m: Floats) -> View:
     """Return the view moved forward and widened as far as needed to contain the whole line.
 
-    ``front_m`` [N] are the drawn positions of the front bumpers, m.
+    ``front_m`` [N] are the positions at which the front bumpers appear in the picture, m.
     """
     on = max(float(front_m[0]) + AHEAD_M - view.right_m, 0.0)
     left = min(view.left_m + on, float(front_m[-1]) - BODY_M - BEHIND_M)

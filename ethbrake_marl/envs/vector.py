@@ -55,11 +55,11 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 
     def __init__(self, env: gymnasium.Env[Observations, NDArray[Any]]) -> None:
         if not isinstance(getattr(env, "unwrapped", None), EthBrakeEnv):
-            raise InvalidInput(f"CostEnv: {env!r:.80} tells no cost; must be an EthBrakeEnv, or a wrapper of one")
+            raise InvalidInput(f"CostEnv: {env!r:.80} reports no cost; must be an EthBrakeEnv, or a wrapper of one")
         within = env
         while isinstance(within, gymnasium.Wrapper):
             if isinstance(within, CostEnv):
-                raise InvalidInput(f"CostEnv: {env!r:.80} has one inside; leave one out")
+                raise InvalidInput(f"CostEnv: {env!r:.80} already contains a CostEnv; use only one")
             within = within.env
         super().__init__(env)
 

@@ -230,7 +230,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Format the invalid value for the message; empty if the whole file is meant.
+    """Return the invalid value as text for the message, or an empty text if the whole file is invalid.
 
     A float instead of a whole number keeps its decimal point.
     """

@@ -498,7 +498,7 @@ def real_numbers(value: ArrayLike) -> Floats:
     """Return ``value`` as float64, without a copy if it already is.
 
     Raises ``ValueError``, with the reason as its text, for anything that is not a number, even if numpy would convert
-    it: truth values, masked entries, texts, tensors that need gradients or are on another device.
+    it: booleans, masked entries, texts, tensors that need gradients or are on another device.
     """
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
         return np.asarray(value, np.float64)
@@ -517,7 +517,7 @@ def real_numbers(value: ArrayLike) -> Floats:
             return real_numbers(list(array))
         entry = array.item() if array.dtype.hasobject else None
         if array.dtype.kind == "b" or isinstance(entry, bool | np.bool_):
-            raise ValueError("is a truth value")
+            raise ValueError("is a boolean")
         if array.dtype.kind in "fiu" or hasattr(entry, "__float__"):
             return array.astype(np.float64)
     except (TypeError, RuntimeError, OverflowError):

@@ -166,7 +166,7 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
 
     def close(self) -> None:
-        """Remove the guard from the engine. ``memory`` and ``shield`` keep their last values."""
+        """Remove this shield from the environment. ``memory`` and ``shield`` keep their last values."""
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)

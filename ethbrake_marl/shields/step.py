@@ -276,8 +276,8 @@ class StepShield:
         latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
         if members > 1 and not latest < horizon_s:
             raise InvalidInput(
-                f"{self.possible_are}: vehicle_{vehicles[0] + 1} may decide first at {latest:g} s; must be before the"
-                f" horizon, {horizon_s:g} s"
+                f"{self.possible_are}: the first decision of vehicle_{vehicles[0] + 1} may be as late as {latest:g} s;"
+                f" must be before the horizon, {horizon_s:g} s"
             )
         try:
             others = fixed_commands(self._others, possible, "shield", vehicle=None)

@@ -145,7 +145,7 @@ BAD: list[tuple[Any, str]] = [
     (3.0, r"[03]\.0; with actions=9"),
     (np.float32(-1.0), r"-1\.0; with"),
     (np.nan, "nan; with"),
-    (True, "is a truth value; with"),
+    (True, "is a boolean; with"),
     ("full", "is not a number; with"),
     (np.ma.masked, "is masked; with"),
     (torch.tensor(1.0, requires_grad=True), r"needs gradients; .*; with"),

@@ -13,10 +13,10 @@ from ethbrake_marl.scenario.tables import worlds_from_table
 
 Make = Callable[[float], Any]
 BAD: dict[str, tuple[Make, str]] = {
-    "truth": (bool, "is a truth value"),
-    "numpy truth": (np.bool_, "is a truth value"),
-    "truths": (lambda x: np.array(bool(x)), "is a truth value"),
-    "tensor of a truth": (lambda x: torch.tensor(bool(x)), "is a truth value"),
+    "truth": (bool, "is a boolean"),
+    "numpy truth": (np.bool_, "is a boolean"),
+    "truths": (lambda x: np.array(bool(x)), "is a boolean"),
+    "tensor of a truth": (lambda x: torch.tensor(bool(x)), "is a boolean"),
     "masked": (lambda x: np.ma.masked, "is masked"),
     "masked array": (lambda x: np.ma.array(x, mask=True), "is masked"),
     "gradient": (lambda x: torch.tensor(x, requires_grad=True), r"needs gradients; pass its \.detach\(\)"),
@@ -149,10 +149,10 @@ def test_row__beside_one_that_is_reset_must_be_a_number() -> None:
 )
 def test_advance__refuses_commands_and_times_that_are_no_numbers(wrong: Any) -> None:
     worlds = eb.load_scenario("paper-random").sample(1, 0).worlds
-    with pytest.raises(InvalidInput, match=r"^command_mps2 = (?s:.*)(is masked|is a truth value|needs gradients)"):
+    with pytest.raises(InvalidInput, match=r"^command_mps2 = (?s:.*)(is masked|is a boolean|needs gradients)"):
         eb.advance(worlds, wrong, 0.1)
     for time in ({"duration_s": True}, {"until_s": True}):
-        with pytest.raises(InvalidInput, match=r"^(duration|until)_s = True: is a truth value"):
+        with pytest.raises(InvalidInput, match=r"^(duration|until)_s = True: is a boolean"):
             eb.advance(worlds, 0.0, **time)
 
 

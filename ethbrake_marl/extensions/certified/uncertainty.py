@@ -212,7 +212,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
         name, width = match["name"], float(match["width"])
         if name in QUANTITIES and match["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
             raise InvalidInput(
-                f"uncertainty: {entry!r}: gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)"
+                f"uncertainty: {entry!r}: gaps_m is limited by .pair_1, any other quantity by .vehicle_1"
             )
         place = None if match["number"] is None else int(match["number"]) - 1
         intervals.append(Interval(name, width / 100.0 if match["share"] else width, bool(match["share"]), place))

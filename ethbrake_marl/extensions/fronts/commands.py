@@ -35,7 +35,7 @@ def front_command(
     ] = None,
     steps: Annotated[int, typer.Option(help="Steps along an edge of the grid of weights.", min=1, max=50)] = 5,
     episodes: Annotated[int, typer.Option(help="Number of worlds.", min=2)] = 500,
-    seed: Annotated[int, typer.Option(help="Seed of the list of worlds.", min=0)] = 7,
+    seed: Annotated[int, typer.Option(help="Seed of the evaluation list.", min=0)] = 7,
     budget: Annotated[int, typer.Option(help="Candidates per world and set of weights.", min=1)] = 3000,
     settings: SettingsOption = None,
     jobs: JobsOption = 1,

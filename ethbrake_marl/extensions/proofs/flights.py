@@ -72,7 +72,7 @@ def best_flight(share: float, press: float, reach: float, opening: float) -> flo
 def lead(
     share: float, press: float, reach: float, opening: float, shortest: float, longest: float, lost: float
 ) -> float:
-    """Return the largest ``flight_lead`` (m/s) of flights from ``shortest`` to ``longest`` (s).
+    """Return the largest ``flight_lead`` (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
     A *flight* is a time in which the two vehicles are apart. The maximum is over all opening speeds up to ``opening``:
     a smaller one may lead further if flights are cut short.

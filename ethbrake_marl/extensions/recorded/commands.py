@@ -15,22 +15,22 @@ from ethbrake_marl.registry import Part
 
 def from_data_command(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings, searched with all below; or one file.")
+        Path,
+        typer.Argument(metavar="FOLDER", help="Folder of the recordings (subfolders are searched, too), or one file."),
     ],
     format: Annotated[
         Literal["highd", "exid", "ngsim", "openacc", "table"],
         typer.Option(help="Format of the recordings; table: CSV or Parquet whose columns you name."),
     ],
-    output: Annotated[
-        Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows stand in the .csv beside.")
-    ],
+    output: Annotated[Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows go to a .csv beside it.")],
     columns: Annotated[
         str,
         typer.Option(
             metavar="ROLE=COLUMN,...",
-            help="Of table: time=T,vehicle=V,lane=L,front=X,length=B,speed=S,units=m|ft|km/h. time is in s (T/1000: in"
-            " ms, T/25: frames at 25 Hz); front is where the front bumper is, and must grow along travel: turn its sign"
-            " for the other direction. With m, speed is in m/s; with ft, in ft/s; with km/h, lengths are in m.",
+            help="For --format table: time=T,vehicle=V,lane=L,front=X,length=B,speed=S,units=m|ft|km/h. time is in s"
+            " (T/1000: in ms, T/25: frames at 25 Hz); front is the position of the front bumper and must grow in the"
+            " direction of travel: change its sign for the other direction. With m, speed is in m/s; with ft, in ft/s;"
+            " with km/h, lengths are in m.",
         ),
     ] = "",
     based_on: Annotated[
@@ -40,7 +40,9 @@ def from_data_command(
             help="Scenario for what is not recorded, and for the number of vehicles: realistic-pair for two.",
         ),
     ] = "realistic-motorway",
-    every: Annotated[float, typer.Option(help="Seconds between two moments that become rows.")] = 1.0,
+    every: Annotated[
+        float, typer.Option(help="Seconds between the moments at which rows are taken from the recordings.")
+    ] = 1.0,
     draw: Annotated[
         Literal["rows", "normal", "lognormal", "quantiles"],
         typer.Option(help="Draw whole rows, or each quantity from a fit to it."),

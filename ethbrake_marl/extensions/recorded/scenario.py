@@ -51,7 +51,7 @@ def scenario_from_data(
     strict: bool = False,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> FromData:
-    """Make a scenario from a folder of recordings, searched with all folders below it.
+    """Make a scenario from the recordings in a folder and in all its subfolders.
 
     At regular times, queues of vehicles are cut from the front into chains of as many vehicles as ``based_on`` has; a
     vehicle belongs to at most one chain. Each chain is a row of speeds and gaps. If there are more rows than a table
@@ -61,14 +61,15 @@ def scenario_from_data(
         name: name of the scenario.
         folder: folder with the files, or one file.
         format: format of the files.
-        columns: of ``table``: which column is what, as ``format_of`` takes it.
+        columns: for the format ``table``: what each column means, in the form that ``format_of`` takes.
         based_on: scenario for everything that is not recorded, and for the number of vehicles.
-        every_s: time between two moments that become rows (s).
+        every_s: time between the moments at which rows are taken from the recordings (s).
         draw: how the scenario draws worlds: whole ``rows``, or each quantity from a fit to the rows.
         strict: refuse the folder if one of its files is refused.
         progress: called with the name of a file, the KiB read of it, and its size in KiB.
 
-    Raises ``InvalidInput`` with file, line and column if no file can be used; its notes are about further files.
+    Raises ``InvalidInput`` with file, line and column if no file can be used; its notes describe the other refused
+    files.
 
     """
     entry, base = format_of(format, columns), load_scenario(based_on)
@@ -78,7 +79,7 @@ def scenario_from_data(
     if not 0.0 < every_s < math.inf:
         raise InvalidInput(f"every = {every_s:g} s: must be above 0")
     if base.members or base.table is not None:
-        raise InvalidInput(f"based_on = {based_on!r}: must be a scenario without mixture and table")
+        raise InvalidInput(f"based_on = {based_on!r}: must be a scenario that has neither a mixture nor a table")
     vehicles = base.vehicles
     rows = read_rows(folder, entry, every_s, vehicles, progress)
     if rows.refused and (strict or not rows.seen):

@@ -174,8 +174,8 @@ def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
     ivs = {k: f"ivs{k - 1}" for k in cars if f"ivs{k - 1}" in at and k - 1 in cars}
     if not ivs:
         raise InvalidInput(
-            f"{piece.file}: no car follows another: {', '.join(piece.columns[1:])}; for one k at least, Speed k,"
-            " Speed k+1 and IVS k must be there"
+            f"{piece.file}: no car follows another in the columns {', '.join(piece.columns[1:])}; must have the"
+            " columns Speed k, Speed k+1 and IVS k for at least one k"
         )
     right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
     for k in cars:

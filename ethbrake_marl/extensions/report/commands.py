@@ -24,7 +24,7 @@ def watch_command(
     output: Annotated[Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.svg", help="The film to write.")],
     agents: AgentsOption = "e_v2x_bm",
     scenario: ScenarioOption = "paper-random",
-    world: Annotated[int, typer.Option(help="Number of the world in the list.", min=0)] = 0,
+    world: Annotated[int, typer.Option(help="Number of the world in the evaluation list.", min=0)] = 0,
     seed: SeedOption = 7,
     settings: SettingsOption = None,
     force: ForceOption = False,

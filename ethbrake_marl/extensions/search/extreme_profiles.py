@@ -71,8 +71,8 @@ def _fill_extremes(
         states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
         has_front: [n] True if a vehicle is ahead.
         has_rear: [n] True if a vehicle is behind.
-        ends: [n, KEPT, K] receives the steps at which the phases end.
-        commands: [n, KEPT, K, 1] receives the commands of the phases, m/s2.
+        ends: output array [n, KEPT, K]: the steps at which the phases end.
+        commands: output array [n, KEPT, K, 1]: the commands of the phases, m/s2.
 
     """
     no_random = np.zeros(states.shape[0], np.uint64)
@@ -148,8 +148,8 @@ def fill_extreme(
         meeting: time of the second change, s.
         early: number of steps by which the second change comes earlier.
         share: weight of the first command in the step of the second change, 0 to 1.
-        ends: [5] receives the steps at which the phases end.
-        commands: [5, 1] receives the commands, m/s2.
+        ends: output array [5]: the steps at which the phases end.
+        commands: output array [5, 1]: the commands of the phases, m/s2.
 
     """
     low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]

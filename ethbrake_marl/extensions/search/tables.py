@@ -1,4 +1,4 @@
-"""Tables of best known harm: small files in which worlds are looked up by their content, not by their list number."""
+"""Tables of best known harm: small files that find a world by its content, not by its number in a list."""
 
 from __future__ import annotations
 

@@ -195,10 +195,10 @@ def falsify_command(
         str | None,
         typer.Option(metavar="NAME|PATH", help="Scenario whose ranges are searched.", show_default="paper-random"),
     ] = None,
-    budget: Annotated[int | None, typer.Option(help="Worlds to try.", min=1, show_default="4000")] = None,
+    budget: Annotated[int | None, typer.Option(help="Number of worlds to try.", min=1, show_default="4000")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the search.", min=0, show_default="0")] = None,
     keep: Annotated[
-        int | None, typer.Option(help="Worlds to keep, at most.", min=1, max=1000, show_default="20")
+        int | None, typer.Option(help="Largest number of worlds to keep.", min=1, max=1000, show_default="20")
     ] = None,
     settings: SettingsOption = None,
     output: Annotated[

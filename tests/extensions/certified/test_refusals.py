@@ -48,7 +48,7 @@ UNCERTAINTIES: dict[str, Callable[[], object]] = {
     "uncertainty: 'latency_s.vehicle_0=0.1': must be quantity=half-width": lambda: parse_uncertainty(
         "latency_s.vehicle_0=0.1"
     ),
-    "uncertainty: 'latency_s.pair_1=0.1': gaps_m is of pairs (.pair_1), all else of vehicles (.vehicle_1)": lambda: (
+    "uncertainty: 'latency_s.pair_1=0.1': gaps_m is limited by .pair_1, any other quantity by .vehicle_1": lambda: (
         parse_uncertainty("latency_s.pair_1=0.1")
     ),
     "uncertainty: latency_s=0.1 and latency_s=0.2 speak of the same quantity; give each once": lambda: (
@@ -187,7 +187,8 @@ def test_estimated_worlds__that_leave_too_much_open_are_refused() -> None:
 
 def test_uncertain_latency__ends_before_the_horizon() -> None:
     with refused(
-        "uncertainty: latency_s=1000: vehicle_2 may decide first at 1000.5 s; must be before the horizon, 8 s"
+        "uncertainty: latency_s=1000: the first decision of vehicle_2 may be as late as 1000.5 s; must be before the"
+        " horizon, 8 s"
     ):
         begun(PAPER, WORLDS, RobustShield, uncertainty=parse_uncertainty("latency_s=1000"))
 

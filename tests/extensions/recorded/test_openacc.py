@@ -67,7 +67,9 @@ def test_car_without_speed__has_no_link(tmp_path: Path) -> None:
 
 
 def test_no_link__is_said_with_the_columns(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"no car follows another: Speed1, Speed3, IVS1; .*Speed k\+1 and IVS k"):
+    with pytest.raises(
+        InvalidInput, match=r"no car follows another in the columns Speed1, Speed3, IVS1; .*Speed k\+1 and IVS k"
+    ):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed3,IVS1", "20,20,15"), "openacc")
     with pytest.raises(InvalidInput, match="has no column IVS<number>, as files of OpenACC have"):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,Lat1", "20,20,15"), "openacc")
