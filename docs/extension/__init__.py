@@ -58,6 +58,7 @@ def tell_search(app: Sphinx, pagename: str, template: str, context: dict[str, An
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect to Sphinx."""
+    app.add_config_value("sought", SOUGHT, "env")  # pages are read again when it changes
     app.connect("env-get-outdated", made_again)
     app.connect("source-read", make_page)
     app.connect("doctree-read", add_keywords)

@@ -3,12 +3,12 @@
 SOUGHT = {
     "installing": "install pip requirements setup gpu without torch docker container",
     "first-ten-minutes": "start tutorial example quick",
-    "game": "what is harm ethical definition meaning first-impact total count",
-    "environments": "make create pettingzoo gymnasium wrapper parallel aec api observation features reward custom"
-    " shaping reset seed info dictionary render video gif watch",
+    "game": "what is harm units ethical definition meaning first-impact total count",
+    "environments": "make create pettingzoo gymnasium wrapper parallel aec api observation features add my own"
+    " reward custom shaping reset seed info dictionary render video gif watch",
     "scenarios": "new own custom add a scenario yaml vehicle data measured csv import cars mixture types",
     "train": "train ppo sac mappo sb3 multi-agent multi agent recipe resume rllib torchrl tianshou cleanrl"
-    " known exploits",
+    " known exploits a team several vehicles",
     "evaluate": "evaluation compare agents statistics confidence interval baselines e-v2x-bm e v2x bm",
     "shield": "shield my own policy safety wrap guarantee",
     "cooperation": "cooperation levels level v2x latency delay messages communication channel loss knows",

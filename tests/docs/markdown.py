@@ -29,8 +29,8 @@ def _for_readers(text: str) -> str:
 
 
 def wrap(text: str, later: str = "") -> str:
-    """A paragraph on lines of at most 100 characters, none of which begins like a list or a heading."""
-    text = re.sub(r" (?=([-+*#>]|\d+[.)]) )", "\x00", prose(text))
+    """A paragraph on lines of at most 100 characters, none of which begins like a list, a heading or a comment (%)."""
+    text = re.sub(r" (?=([-+*#>]|\d+[.)]) |%)", "\x00", prose(text))
     first, rest = (text[:2], text[2:]) if later else ("", text)
     lines = textwrap.wrap(
         rest, WIDTH, initial_indent=first, subsequent_indent=later, break_long_words=False, break_on_hyphens=False
