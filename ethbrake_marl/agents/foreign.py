@@ -285,11 +285,11 @@ def _check_action_space(policy: Any, name: str, actions: int | None) -> None:
     fits = (low, high) == ([-1.0], [1.0]) if actions is None else (count, least) == (actions, 0)
     if space is None or fits:
         return
-    right = "[-1, 1]" if actions is None else f"an index from 0 to {actions - 1} (actions={actions})"
+    right = "a number in [-1, 1]" if actions is None else f"an index from 0 to {actions - 1} (actions={actions})"
     advice = "write a function around it that says what they mean"
     if least == 0:
         advice = f"say actions={count} if they are evenly spaced from -1 to 1, or {advice}"
-    raise InvalidInput(f"agent {name!r}: the policy gives actions in {space}, here they mean {right}; {advice}")
+    raise InvalidInput(f"agent {name!r}: the policy gives actions in {space}; must be {right}; {advice}")
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:

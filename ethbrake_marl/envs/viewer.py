@@ -73,7 +73,7 @@ class Viewer:
         ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of frames since the last call. ``ansi``: a
         text. ``human``: None, because every step is shown in the window anyway.
         """
-        motions = self._motions(f"render: made with render_mode=None; give one of {', '.join(self.modes)}")
+        motions = self._motions(f"render: render_mode must be one of {', '.join(self.modes)}")
         if self.mode == "human":
             return None
         if self.mode == "rgb_array_list":  # one frame for the beginning and for each step not in an earlier list
@@ -89,7 +89,7 @@ class Viewer:
         Raises ``InvalidInput`` before the first reset, with render_mode=None, and for an ``fps`` below 1.
         """
         check_whole_number("step_frames: fps", fps, 1)
-        motion = self._motions("step_frames: made with render_mode=None; give 'rgb_array'")[-1]
+        motion = self._motions("step_frames: render_mode must be 'rgb_array'")[-1]
         start, until = float(motion.start.time_s[0]), float(motion.until_s[0])
         times: Floats = np.linspace(start, until, max(round((until - start) * fps), 1) + 1)[1:]  # includes the end
         return [scene.frame() for scene in motion.scenes(self._engine, 0, times)]
@@ -101,5 +101,5 @@ class Viewer:
 
     def _motions(self, refusal: str) -> Memory:
         if self._trace is None:
-            raise InvalidInput(f"{refusal} when it is made")
+            raise InvalidInput(f"{refusal} when the environment is made; here it is None")
         return self._trace.motions(self._engine)

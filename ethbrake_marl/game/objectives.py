@@ -261,7 +261,7 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
         if not np.isfinite(harms).all():
             world = int(np.argmin(np.isfinite(harms)))
             raise InvalidInput(
-                f"objective {name!r}: is {harms[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
+                f"objective {name!r}: gave {harms[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
             )
         return harms.astype(np.float64)
 

@@ -217,7 +217,8 @@ class Extra(NamedTuple):
             for piece in messages.lacks(neighbour):
                 raise InvalidInput(
                     f"feature {self.entry.feature.name!r}: vehicle_{neighbour + 1} does not tell its {piece} (v2x:"
-                    " tells), and the feature does not say what it reads: register_feature(..., reads=['place'])"
+                    " tells), and the feature may read it; list what it reads, as in register_feature(...,"
+                    " reads=['place'])"
                 )
             return np.ones(worlds.n, np.bool_)
         known = messages.known_pieces(vehicle, worlds.time_s)[:, neighbour]

@@ -77,7 +77,10 @@ class NetworkSpec(FileModel):
             if self.choices is None or member.among:
                 raise ValueError("among: is for output choice, and its policies choose among no others")
             if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
-                raise ValueError(f"among[{m}]: observes or acts in another size; must be the same in all")
+                raise ValueError(
+                    f"among[{m}]: observation_size and action_size are {member.observation_size} and"
+                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as beside among"
+                )
         return self
 
     @property

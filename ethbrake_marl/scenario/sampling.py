@@ -229,7 +229,10 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
             vehicles.braking_capacity_mps2[:, i], vehicles.driving_capacity_mps2[:, i]
         )
         if scripted is None:
-            raise InvalidInput(f"scenario {scenario.name!r}: early_impacts reject: {script!r} depends on the state")
+            raise InvalidInput(
+                f"scenario {scenario.name!r}: early_impacts: reject needs scripts that do not depend on the state;"
+                f" {script!r} of vehicle_{i + 1} does"
+            )
         command[:, i] = scripted
     first_action_s = worlds.first_decision_s(scenario.learners)
     _, impacts = advance(scenario.play_pieces(worlds), command, until_s=first_action_s)

@@ -86,11 +86,11 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 
     Args:
         world: the M possible worlds of one world (``Members``).
-        m: number of the one to advance.
+        m: number of the possible world to advance.
         state: [S] its state now.
         step: number of the present decision.
         action: [K] actions of the shielded vehicles.
-        after: [S] receives the new state.
+        after: [S] array that is filled with the new state.
 
     Returns ``GOES_ON``, another code for the end of the episode, or a negative code if the physics failed.
 
@@ -118,10 +118,10 @@ def take_steps(
         ended: [M] whether their episodes have ended; these keep their states.
         step: number of the present decision.
         action: [K] actions of the shielded vehicles.
-        after: [M, S] receives the new states.
-        over: [M] receives whether the episodes have ended then.
+        after: [M, S] array that is filled with the new states.
+        over: [M] array that is filled with whether the episodes have ended then.
 
-    Returns in how many of them the episode continues, or -1 if the physics failed.
+    Returns the number of possible worlds whose episode continues, or -1 if the physics failed.
 
     """
     going = 0

@@ -41,16 +41,16 @@ class Proposer(NamedTuple):
 def rolled_out(
     worlds: Worlds, policies: Mapping[int, Agent], scenario: Scenario, vehicle: int | tuple[int, ...], width: int
 ) -> Floats:
-    """Return the actions of policies that drive unshielded from the alert to the end of the episodes.
+    """Return the actions of policies that drive without a shield from the alert to the end of the episodes.
 
     Args:
         worlds: n worlds at the alert.
         policies: index of each shielded vehicle -> its policy.
         scenario: the scenario, whose scripts drive the other vehicles.
-        vehicle: index of the shielded vehicle, or a tuple of indices, which chooses the shape of the result.
+        vehicle: index of the only shielded vehicle, or a tuple of K indices. It decides only the shape of the result.
         width: number of decisions to return.
 
-    Returns [n, width] for one index, [n, width, K] for a tuple. After the end of an episode, the action is full
+    Returns [n, width] for an index, [n, width, K] for a tuple. After the end of an episode, the action is full
     braking.
 
     """
@@ -64,15 +64,15 @@ def rolled_out(
 def certify_by_policy(
     decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Return the decision with every rejected proposal accepted that a rollout (simulation) of the policy certifies.
+    """Return the decision, but accept each rejected proposal that a rollout (simulation) of the policy can certify.
 
     Args:
         decision: the decision without rollouts.
         running: the n episodes at this decision.
         proposed: [n] or [n, K] proposed actions.
         budget: [n] largest accepted harm, m2/s2.
-        held: [n, L] or [n, L, K] plans that the shield held before the decision: one action for each decision.
-        proposer: the policies.
+        held: [n, L] or [n, L, K] plans that the shield had before this decision, with one action for each decision.
+        proposer: the proposing policies, with their memories and the worlds at this decision.
 
     """
     rejected = (decision.reason == NO_CERTIFICATE).reshape(running.n, -1).any(axis=1)
@@ -101,8 +101,8 @@ def certify_rollouts(
         proposed: [n] or [n, K] proposed actions of the whole batch.
         rows: [m] worlds in which to decide again.
         budget: [n] largest accepted harm, m2/s2.
-        held: [n, L] or [n, L, K] plans (one action for each decision) that the shield now holds in the whole batch.
-        proposer: the policies.
+        held: [n, L] or [n, L, K] plans that the shield has now, with one action for each decision; whole batch.
+        proposer: the proposing policies, with their memories and the worlds at this decision.
 
     Returns a decision for the m worlds of ``rows`` only.
 

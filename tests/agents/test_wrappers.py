@@ -317,7 +317,7 @@ def test_who_knows_better__drives_by_it_all_the_same():
 )
 def test_action_space__is_checked_with_clip_too(space, clip):
     policy = Spaced(space)
-    with pytest.raises(InvalidInput, match=r"gives actions in .*, here they mean"):
+    with pytest.raises(InvalidInput, match=r"gives actions in .*; must be"):
         eb.policy_agent(policy, clip=clip)
     assert eb.policy_agent(policy, clip=clip, ignore_wrappers=True).name == "Spaced"
 

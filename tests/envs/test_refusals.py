@@ -48,7 +48,7 @@ MADE: dict[str, Callable[[], object]] = {
     "must be 'human', 'rgb_array', 'rgb_array_list', 'ansi', or None": lambda: parallel_env(render_mode="depth"),
     "render_mode = 'depth': must be 'rgb_array', 'ansi', or None": lambda: eb.EthBrakeVectorEnv(render_mode="depth"),
     "render_mode = 'ansi': must be 'rgb_array', or None": lambda: eb.make_sb3_vec_env(PAPER, 3, render_mode="ansi"),
-    "render: made with render_mode=None; give one of human, rgb_array, rgb_array_list": lambda: parallel_env().render(),
+    "render: render_mode must be one of human, rgb_array, rgb_array_list": lambda: parallel_env().render(),
     "render: no episode was started; call reset first": lambda: parallel_env(render_mode="rgb_array").render(),
     "step_frames: fps = 0: must be a whole number, at least 1": lambda: started(
         eb.EthBrakeEnv(render_mode="rgb_array")

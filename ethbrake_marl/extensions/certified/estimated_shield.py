@@ -176,7 +176,8 @@ class EstimatedShield:
         shield, vehicle = self.shield, self.vehicle
         if worlds.n > len(self._heard):
             raise InvalidInput(
-                f"shield: estimated: act on {count_of(worlds.n, 'world')}, but begin was not called for each"
+                f"shield: estimated: asked to decide in {count_of(worlds.n, 'world')}, but begin was called for"
+                f" {len(self._heard)}; call begin for each world first"
             )
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
         past = worlds.vehicles.latency_s[:, vehicle] <= worlds.time_s

@@ -385,9 +385,10 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 def settle(touch: Floats, e: float, length: float) -> None:
     """Reset the state of a contact if the pair certainly moves as one by the end of the present piece.
 
-    The closing acceleration lies between b- and b+. A *flight* (the time between two impacts) that begins with
-    separating speed s takes at most 2 s / b- and closes with at most s sqrt(b+ / b-). So after 2 s / (b- (1 - e sqrt(b+
-    / b-))) the two move as one, unless one of them stands or moves backwards.
+    Suppose that the closing acceleration lies between ``b-`` and ``b+``. A *flight* (the time between two impacts) that
+    begins with separating speed s lasts at most ``2 s / b-`` and ends with a closing speed of at most
+    ``s sqrt(b+ / b-)``. The next flight begins with e times that speed, so the durations add up to at most
+    ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After that time the two move as one, unless one stands or moves backwards.
 
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
@@ -406,10 +407,10 @@ def settle(touch: Floats, e: float, length: float) -> None:
 
 @compiled(apart=True)
 def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
-    """Return whether the gap of pair ``p`` is too uncertain to follow a further impact in this piece.
+    """Return whether the gap of pair ``p`` is too uncertain for a further impact to be followed in this piece.
 
-    That is so if the uncertainty of the gap exceeds the distance that the pair can close in the piece. The pair is then
-    treated as in contact from the start of the piece.
+    The gap is too uncertain if its uncertainty exceeds the largest distance by which it can shrink during this time
+    interval. The pair is then treated as in contact from the start of the interval.
 
     Args:
         path: worlds of the box that had the same impacts so far.

@@ -179,16 +179,16 @@ class Uncertainty:
                 if name in POSITIVE and not (low > 0.0).all():
                     k = int(np.argmin(low))
                     raise InvalidInput(
-                        f"uncertainty: {interval}: {values[k]:g}{_of(name, place)} in world {k} may be as low as"
-                        f" {low[k]:g}; it must stay above 0"
+                        f"uncertainty: {interval}: the value {values[k]:g}{_of(name, place)} in world {k} may"
+                        f" be as low as {low[k]:g}; it must stay above 0"
                     )
                 most = worlds.vehicles.speed_limit_mps[:, place] if name == "speeds_mps" else np.inf
                 high, rule = np.minimum(high, most), QUANTITY.declared[name]
                 if not (high <= rule.high).all():
                     k = int(np.argmax(high))
                     raise InvalidInput(
-                        f"uncertainty: {interval}: {values[k]:g}{_of(name, place)} in world {k} may be as high as"
-                        f" {high[k]:g}; must be {rule.interval}"
+                        f"uncertainty: {interval}: the value {values[k]:g}{_of(name, place)} in world {k} may"
+                        f" be as high as {high[k]:g}; must be {rule.interval}"
                     )
                 sides.append((name, place, np.maximum(low, 0.0), high))
         return sides

@@ -1,8 +1,8 @@
 """Joint optimum of every level: the least known harm that its learners can achieve together, world by world.
 
-It depends on the worlds, on the learners and on the scripts of the others; it does not depend on information or
-objectives. Levels that differ only in these share one search problem, which is searched once. A result of one level
-also counts for every other level whose learners can do the same.
+It depends on the worlds, on the learners and on the scripts of the others. It does not depend on what anyone knows or
+on the objectives, so levels that differ only in information or objectives share one search. A result of one level also
+counts for every other level whose learners can do the same.
 """
 
 from __future__ import annotations
@@ -216,7 +216,7 @@ class Measured:
 
 
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
-    """Let the trained policies of all levels drive the same worlds, and search the joint optimum of each level.
+    """Let the trained policies of all levels drive the same worlds, and search for the joint optimum of each level.
 
     Parts of a search that exist already are reused. Where a policy does better than the search, its harm becomes the
     best known harm of that world.

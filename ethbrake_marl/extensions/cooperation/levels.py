@@ -1,7 +1,8 @@
 """The levels and the plan of an ablation.
 
-All levels have the same lines of vehicles. They differ in who learns, who has which information, and whose harm counts.
-The levels of a sweep are one level with several numbers of one key, of whatever the key is.
+An ablation compares *levels*: scenarios with the same vehicles, gaps and speeds. They differ in who learns, who has
+which information, whose harm counts, and whether an obstacle stands ahead. A sweep takes one level and sets one key of
+its scenario, whichever it is, to several numbers; each number makes a level.
 """
 
 from __future__ import annotations

@@ -197,7 +197,7 @@ class Preferring(NamedTuple):
         return cls(fixed, *made)
 
     def weighted(self, worlds: Worlds) -> Worlds:
-        """Return the worlds with the weights of this scenario."""
+        """Return the worlds with their ``harm_weight`` replaced by that of this scenario."""
         weight = np.broadcast_to(np.array(self.scenario.harm_weight, np.float64), worlds.speeds_mps.shape).copy()
         return replace(worlds, vehicles=replace(worlds.vehicles, harm_weight=weight))
 

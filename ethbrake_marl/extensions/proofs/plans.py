@@ -131,12 +131,13 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
 def walk(
     gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
 ) -> tuple[float, float, float]:
-    """Follow two vehicles until ``until``. Return their smallest gap, and time and squared closing speed of their
-    contact.
+    """Return the smallest gap of two vehicles (m), the time of their first contact (s), and their squared closing speed
+    then (m2/s2).
 
-    Units are m, s and m2/s2. The time is infinite and the speed 0 if they do not meet. The two pass through each other,
-    so a negative smallest gap is the depth of the overlap. If the gap reaches 0 and opens again, that is no contact; if
-    it would become an overlap, it is a contact with closing speed 0. Needs speeds >= 0.
+    If they do not touch, the time is infinite and the closing speed 0. The motion is computed as if they could pass
+    through each other, so a negative smallest gap is the depth of their overlap. A gap that reaches 0 and opens again
+    is no contact; a gap that reaches 0 and would become negative is a contact, even with closing speed 0. Both speeds
+    must be at least 0.
 
     Args:
         gap: gap now, m.
@@ -144,7 +145,7 @@ def walk(
         front: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of its motion.
         v_rear: speed of the rear vehicle, m/s.
         rear: [2, PIECES] the same for the rear vehicle.
-        until: end of the motion, s.
+        until: time at which the motion ends, s.
 
     """
     lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0

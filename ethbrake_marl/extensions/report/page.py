@@ -1,8 +1,8 @@
-"""HTML pages: one file that loads nothing, can be opened from disk, and shows every input as text.
+"""HTML pages. Each page is a single file that loads no other file and can be opened from disk.
 
 A page is a title, a short lead, and sections. A section holds strings, which become paragraphs, and parts: tables,
-figures, the episode player. Strings are never markup: they are escaped, and control and direction characters are
-written as in Python.
+figures, the episode player. Strings are never read as HTML: they are escaped, and control characters and characters
+that change the writing direction are shown as Python escapes.
 """
 
 from __future__ import annotations

@@ -60,10 +60,10 @@ UNCERTAINTIES: dict[str, Callable[[], object]] = {
     "uncertainty: mass_t.vehicle_4=0.1: the line has only 3 of these": lambda: parse_uncertainty(
         "mass_t.vehicle_4=0.1"
     ).members(WORLD),
-    "uncertainty: mass_t=1: 1 of vehicle_1 in world 0 may be as low as 0; it must stay above 0": lambda: (
+    "uncertainty: mass_t=1: the value 1 of vehicle_1 in world 0 may be as low as 0; it must stay above 0": lambda: (
         parse_uncertainty("mass_t=1").members(WORLD)
     ),
-    "gaps_m=1e+308: 10 of vehicle_1 to vehicle_2 in world 0 may be as high as 1e+308; must be finite": lambda: (
+    "=1e+308: the value 10 of vehicle_1 to vehicle_2 in world 0 may be as high as 1e+308; must be finite": lambda: (
         parse_uncertainty("gaps_m=1e308").members(WORLD)
     ),
     "11 uncertain numbers in each world make 2048 corners; at most 1024 can be certified: name vehicles": lambda: (
