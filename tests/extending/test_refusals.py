@@ -219,7 +219,7 @@ def test_measure_by_step__gives_a_finite_number_per_vehicle(given: Any, message:
     ("given", "message"),
     [
         (1.0, "gave float64 of shape (); must be numbers of shape (1,), one per world"),
-        (lambda harm: np.full(len(harm.whole), np.nan), "is nan for vehicle_1 in world 0; must be finite"),
+        (lambda harm: np.full(len(harm.whole), np.nan), "gave nan for vehicle_1 in world 0; must be finite"),
         (lambda harm: harm.borne.fill(0.0), "of vehicle_1: ValueError: assignment destination is read-only"),
     ],
     ids=["shape", "nan", "writes"],

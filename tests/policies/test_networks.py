@@ -172,7 +172,7 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
         ({"among": (spec,)}, "its policies choose among no others"),
         (
             {"among": (squashed.model_copy(update={"observation_size": 26}),)},
-            r"among\[0\]: observes or acts in another",
+            r"among\[0\]: observation_size and action_size are",
         ),
     ):
         with pytest.raises(ValueError, match=why):

@@ -151,8 +151,8 @@ AROUND: dict[str, Callable[[], object]] = {
         None, BRAKE
     ),
     "ShieldedEnv: goes around gymnasium.make('EthBrake-v0')": lambda: ShieldedEnv(gymnasium.make("CartPole-v1")),
-    "policy = 'ppo': must be an agent or a policy (eb.load_policy), which says what it observes": lambda: HybridShield(
-        parallel_env(), "ppo"
+    "policy = 'ppo': must be an agent or a policy (eb.load_policy); wrap a function by eb.policy_agent": lambda: (
+        HybridShield(parallel_env(), "ppo")
     ),
     "HybridShield: agents = 5: must be a list of names": lambda: HybridShield(parallel_env(), BRAKE, agents=5),
     "HybridShield: shields every learner, ('vehicle_2',), and nobody else; got ('vehicle_1',). What": lambda: (

@@ -67,7 +67,7 @@ def test_film__as_svg_moves_every_vehicle_as_its_scenes_say() -> None:
 def test_film__of_the_readme_is_that_of_its_command(tmp_path: Path) -> None:
     made = tmp_path / "made.svg"
     text = " ".join(README.read_text("utf-8").split())
-    command = re.search(r"`ethbrake (watch .*?) --output docs/figures/emergency.svg`", text)[1]
+    command = re.search(r"`ethbrake (watch .*?) --output emergency.svg`", text)[1]
     assert run_command([*command.split(), "--output", str(made)]) == 0
     texts = [file.read_text("utf-8") for file in (made, README.parent / "docs" / "figures" / "emergency.svg")]
     number = re.compile(r"-?\d+\.\d+")
