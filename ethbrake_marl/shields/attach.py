@@ -28,7 +28,8 @@ def proposing_agent(policy: object, where: str) -> Agent:
         if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
             return LearnedAgent(policy)  # type: ignore[arg-type]  # it is callable, and says what it observes
     raise InvalidInput(
-        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy); wrap a function by eb.policy_agent"
+        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy); wrap a function by"
+        " eb.policy_agent"
     )
 
 
