@@ -533,7 +533,7 @@ class Engine:
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the parts of the last step; usually there is one, but a script that decides within it begins a new part.
+        """Yield the parts of the last step: usually one part, but a script that decides within the step begins another.
 
         Right after a reset, the parts lead from the alert to the first step. Each part is a tuple: the worlds at the
         start of the part, the commands that the vehicles followed [n, N] m/s2, and the time at the end of the part [n]
@@ -668,7 +668,7 @@ class Engine:
         than the state.
         """
         if self.reward.shaping > 0.0:
-            raise InvalidInput(f"branches: the reward has shaping = {self.reward.shaping:g}; shaping must be 0 here")
+            raise InvalidInput(f"branches: the reward has shaping = {self.reward.shaping:g}; it must be 0 for branches")
         n = len(state.motion)
         roster = Roster(n, self.seed, None)
         roster.warns = False

@@ -145,7 +145,7 @@ class ProfileProblem(NamedTuple):
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
 
     def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the value that a search minimises, for one profile per world: dictionary count of harm -> [n] m2/s2.
+        """Return the value that a search minimises, for one profile per world: count of harm -> value, [n] m2/s2.
 
         The value is the harm of the line, the weighted sum of the harms that its vehicles bear, or the largest of these
         weighted harms. Raises the same errors as ``follow``.
@@ -162,7 +162,7 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the harm that each vehicle bears under one profile per world: dictionary count of harm -> [n, N] m2/s2.
+        """Return the harm that each vehicle bears under one profile per world: count of harm -> harm, [n, N] m2/s2.
 
         There is no column for an obstacle. The harm equals the harm in the engine to the last bit. Raises the same
         errors as ``follow``.

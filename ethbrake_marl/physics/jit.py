@@ -246,7 +246,7 @@ def load_kernel(name: str) -> bytes | None:
 
 
 def keep_kernel(name: str, content: bytes) -> None:
-    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if that fails, for example on a full disk."""
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails, as on a full disk."""
     folder = cache_folder()
     try:
         handle, part = tempfile.mkstemp(dir=folder, prefix=".")

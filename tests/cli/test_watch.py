@@ -278,7 +278,7 @@ def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
 
 def check_extra(ethbrake: Command, package: str, extra: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    missing = f"needs the package {package}, which is not installed: {sys.executable} -m pip install"
+    missing = f"needs the package {package}, which is not installed; install it with: {sys.executable} -m pip install"
     check_refused(ethbrake(*line.split()), f"{missing} 'ethbrake-marl[{extra}]'\n")
     assert list(Path().iterdir()) == []
 

@@ -63,7 +63,7 @@ OBSERVATIONS: dict[str, Callable[[], object]] = {
     "observation: front = 65; must be a whole number in 0..64": lambda: ObservationSpec(65, 0),
     "observation: front = -1; must be a whole number in 0..64": lambda: ObservationSpec(front=-1),
     "observation: obstacle = 1; must be True or False": lambda: ObservationSpec(obstacle=1),
-    "observe: vehicle index 4; must be in 0..2": lambda: observe(
+    "observe: vehicle = 4: must be a vehicle index": lambda: observe(
         load_scenario("paper-random").sample(1, 7).worlds, 4, ObservationSpec()
     ),
     "observation: contact features need the time between two decisions; give it as time_step_s": lambda: observe(
@@ -155,12 +155,14 @@ def test_objective__is_refused(message: str) -> None:
 
 
 ENGINE: dict[str, Callable[[], object]] = {
-    "engine: deciders (3,) must be from 0 to 2": lambda: Engine(PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)),
-    "engine snapshot: state is (6, 20); (7, 20) is needed": lambda: make_engine(PAPER, 7).restore(
+    "engine: deciders = (3,): must be vehicle indices": lambda: Engine(
+        PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)
+    ),
+    "engine snapshot: the array state has the shape (6, 20); the shape (7, 20) is": lambda: make_engine(PAPER, 7).restore(
         make_engine(PAPER, 6).snapshot()
     ),
-    "renew: rows [1, 9]; must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
-    "observe: vehicle index 'vehicle_2'; must be in 0..2": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
+    "renew: rows = [1, 9]: must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
+    "observe: vehicle = 'vehicle_2': must be a vehicle index": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
     "since: these are not the same worlds; ask before a row is renewed": lambda: make_engine(PAPER, 6).ledger.since(
         make_engine(PAPER, 1).ledger
     ),
@@ -199,7 +201,7 @@ def test_episode__starts_at_the_alert_without_an_impact() -> None:
 
 def test_branch__has_an_end_and_no_shaping() -> None:
     shaped = make_engine(PAPER, 2, reward={"harm": 1.0, "shaping": 0.1})
-    with refused("branches: reward: shaping = 0.1: must be 0; a branch has an end"):
+    with refused("branches: the reward has shaping = 0.1; it must be 0 for branches"):
         shaped.branch(shaped.moment())
 
 

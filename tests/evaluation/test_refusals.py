@@ -70,7 +70,7 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "scenario 'paper-random': its learners are vehicle_2, vehicle_3, but only vehicle_2 is controlled": lambda: (
         eb.evaluate(WORLDS, BRAKE, scenario=PAPER.with_learners([1, 2]), vehicle=1)
     ),
-    "reset: 3 worlds of 3 vehicles are given; 3 of 4 vehicles needed": lambda: eb.evaluate(
+    "reset: got 3 worlds of 3 vehicles; 3 worlds of 4 vehicles must be passed": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=FOUR
     ),
     "evaluate: worlds: there are none; at least one is needed": lambda: eb.evaluate(

@@ -232,11 +232,11 @@ AGENTS: dict[str, Callable[[], object]] = {
     "scenario 'mixture-delays': is a mixture, and a vehicle that is not known could be of any": lambda: make_agent(
         "e_v2x_bm:estimated", scenario=eb.load_scenario("mixture-delays")
     ),
-    ":estimated: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: evaluated(
+    ":estimated: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and the result": lambda: evaluated(
         make_agent("full_brake+step:estimated", scenario=SLOW), SLOW
     ),
-    ":estimated: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
-        evaluated(make_agent("full_brake+step:estimated", scenario=PIECES), PIECES)
+    ":estimated: a vehicle of world 0 brakes in pieces (profile), and the result would not be exact": lambda: evaluated(
+        make_agent("full_brake+step:estimated", scenario=PIECES), PIECES
     ),
     "shield: robust interior: vehicle_1 is controlled by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
         make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES

@@ -68,10 +68,10 @@ PROOFS: dict[str, Callable[[], object]] = {
     "team_bound: vehicle_1 follows 'coast'; must be 'full_brake'": lambda: team_bound(
         TEAM, (1, 2), scripts={0: "coast"}
     ),
-    "avoidability: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: (
+    "avoidability: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and the result": lambda: (
         avoidability(PAPER.replace(brake_rate_mps3=9).sample(2, 7).worlds)
     ),
-    "avoidability: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
+    "avoidability: a vehicle of world 0 brakes in pieces (profile), and the result would not be exact": lambda: (
         avoidability(PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}).sample(2, 7).worlds)
     ),
 }
@@ -90,14 +90,14 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "scenario 'paper-random': needs one controlled vehicle; controlled are: vehicle_1": lambda: (
         Task(PAPER, (0, 1)).vehicle
     ),
-    "vehicles (): at least one is needed, each once, from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
+    "vehicles = (): must be one or more vehicle indices from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
     "budget = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=0),
     "threads = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=10, threads=0),
     "counts (): must be first, total, or both": lambda: best_harm(PAPER, WORLDS, budget=10, counts=()),
     "profiles: command -7.1 m/s2 is beyond a vehicle's capacity": lambda: problem().follow(
         problem().constant(np.array([[[-7.1]]]))
     ),
-    "profiles: phases must end in order, the last one at the last step": lambda: problem().follow(
+    "profiles: phases must end in order, and the last phase must end at the last step": lambda: problem().follow(
         Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1)))
     ),
     "t.npz: there is no such table of best known harm": lambda: BestHarmTable.load(Path("t.npz")),
