@@ -85,8 +85,8 @@ def count_of(n: int, thing: str) -> str:
 def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
-    ``path``: the user's file. The line is then the last line of this file in the traceback. If ``path`` is None, it is
-    the innermost line of the traceback. An error of this package is described by its message alone.
+    ``path``: the user's file. The line is then the last line of this file in the traceback. If ``path`` is None, the
+    line is the innermost line of the traceback. An error of this package is described by its message alone.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -173,7 +173,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed. Does not import it."""
+    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; import nothing."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -253,7 +253,7 @@ class Unfamiliar(UserWarning):
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
     """Context manager: change the row numbers in a ``PhysicsError`` or ``AgentFailed`` that is raised in the block.
 
-    Use it for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
+    Use this for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
     """
     try:
         yield
@@ -281,7 +281,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
         kind: what the name stands for, for example ``scenario``.
         name: the unknown name.
         known: the known names.
-        may_be_own: true if users can register names of this kind. The message then adds that they must register first.
+        may_be_own: true if users can register names of this kind. The message then says that a name must be
+            registered first.
 
     """
     names = sorted(known)

@@ -1,4 +1,4 @@
-"""Environment module in PettingZoo's style: ``parallel_env()`` makes a parallel environment, ``env()`` an AEC one."""
+"""Environment module in PettingZoo's style: ``parallel_env()``, and ``env()`` for the AEC interface."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of the compiled kernels: in the user's cache folder, or temporary if that is not writable."""
+    """Return the folder of the compiled kernels: the user's cache, or a temporary folder if that is not writable."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "ethbrake_marl"

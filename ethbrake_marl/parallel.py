@@ -46,8 +46,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
     Args:
         calls: tuples (function, argument, ...) with module-level functions. A tuple is taken from the iterable shortly
             before its call starts.
-        jobs: number of calls that run at once. None: one call, or with Ray one call per core. Without Ray and with one
-            call at a time, the calls run in this process.
+        jobs: number of calls that run at once. None: one call without Ray, one call per core with Ray. Without Ray and
+            with one call at a time, the calls run in this process.
         ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. None: joblib without Ray.
 
     Raises the error of a call that fails; ``WorkerLost`` if a worker process is killed (Ray repeats the call instead);

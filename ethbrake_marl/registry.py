@@ -82,8 +82,8 @@ class Registry(Mapping[str, T]):
     """Mapping name -> part for all parts of one kind. A part is loaded when its name is first looked up.
 
     Testing for a name and iterating over the names do not load any part. Looking up a name raises ``UnknownName`` if no
-    part has it, ``InvalidInput`` if its part cannot be loaded or two distributions define it, and ``MissingExtra`` if a
-    package of an extra is missing.
+    part has this name, ``InvalidInput`` if its part cannot be loaded or two distributions define it, and
+    ``MissingExtra`` if a package of an extra is missing.
 
     Args:
         kind: what the parts are called in messages, for example ``agent``.
@@ -124,7 +124,7 @@ class Registry(Mapping[str, T]):
     def load(self, name: str) -> list[str]:
         """Load the part called ``name`` if it is not loaded yet, and return the names of all parts that it defines.
 
-        An entry point usually defines one part. If its value is a dictionary, it defines several parts. Raises
+        An entry point usually defines one part; a dictionary as its value defines several parts. Raises
         ``UnknownName`` if no part has this name, and ``InvalidInput`` or ``MissingExtra`` if the part cannot be loaded.
         """
         candidates = points(self.group).get(name, [])

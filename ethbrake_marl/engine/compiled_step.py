@@ -76,7 +76,7 @@ class Step(NamedTuple):
 
     @property
     def ended(self) -> Bools:
-        """Whether this step ended the episode, for either reason, [n]."""
+        """Whether this step terminated or truncated the episode, [n]."""
         return self.terminated | self.truncated
 
     @property

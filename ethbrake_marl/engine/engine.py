@@ -402,7 +402,7 @@ class Engine:
     def _ask_scripts(self) -> dict[int, Memory]:
         """Ask the scripts with a memory whose vehicles decide at every step; return vehicle index -> new memory.
 
-        Their commands are written to ``state.wanted``.
+        The commands of these scripts are written to ``state.wanted``.
         """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
@@ -440,7 +440,7 @@ class Engine:
     def _drive_own_grid(self, columns: Floats) -> Way:
         """Move the worlds to the last decision that a script makes within the step; return this part of the step.
 
-        Such scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
+        These scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
         learners' actions.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
@@ -567,7 +567,7 @@ class Engine:
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add an observer of the episodes. ``memory`` is its memory until the next episode begins."""
+        """Add an observer of the episodes. ``memory`` is the observer's memory until the next episode begins."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
@@ -704,7 +704,7 @@ class Engine:
 
     @property
     def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2. It is not a copy."""
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2. The array is not a copy."""
         return self._now.state.wanted
 
     @property

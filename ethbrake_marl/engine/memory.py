@@ -51,7 +51,7 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
     if part is None:
         return memory
     if memory is None or (isinstance(part, Mapping) and not part.keys() <= memory.keys()):
-        raise InvalidInput("agent: begin returned a memory with other entries than in the episodes before")
+        raise InvalidInput("agent: begin returned a memory with other entries than in earlier episodes")
     if isinstance(part, Mapping):
         return {key: renew_memory(of, rows, part.get(key)) for key, of in memory.items()}
     if isinstance(part, tuple | list):
@@ -64,9 +64,9 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
 def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
     """Return ``memory`` if it is valid; otherwise raise ``InvalidInput``.
 
-    Every array must have ``n`` rows. Arrays of objects are also refused, because a copy still holds the same objects.
-    Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` names the memory in the
-    message.
+    Every array must have ``n`` rows. Arrays of objects are also refused, because a copy still contains the same
+    objects. Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` names the memory in
+    the message.
     """
 
     def check(array: Any) -> Any:
@@ -165,7 +165,7 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
         if is_ours(script):
             return begin(alert, vehicle, scripts)
         if len(inspect.signature(script.act).parameters) == 2:
-            raise InvalidInput(f"{_who(script, vehicle)}: begin exists, but act takes no memory; {_SHAPES}")
+            raise InvalidInput(f"{_who(script, vehicle)}: the agent has begin, but act takes no memory; {_SHAPES}")
         with _as_it_was(script, vehicle):
             return checked_memory(
                 begin(alert.read_only(), vehicle, scripts), alert.n, f"{_who(script, vehicle)}: memory"
@@ -219,7 +219,8 @@ def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
         is_cached = name not in before and isinstance(getattr(type(script), name, None), cached_property)
         if not is_cached and (name not in before or getattr(script, name, None) is not before[name]):
             raise InvalidInput(
-                f"{_who(script, vehicle)}: it changed its attribute {name!r}, which all episodes share; {_SHAPES}"
+                f"{_who(script, vehicle)}: the agent changed its attribute {name!r}, which all episodes share;"
+                f" {_SHAPES}"
             )
 
 

@@ -74,7 +74,7 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """Return the problem of the worlds with the indices ``rows`` only."""
+        """Return the problem restricted to the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
@@ -110,7 +110,8 @@ class ProfileProblem(NamedTuple):
     def even_grid(self, number: int) -> Floats:
         """Return ``number`` evenly spaced commands of each vehicle, [n, number, C] m/s2.
 
-        They include the vehicle's smallest and largest command. Rounding cannot lead beyond the largest command.
+        The commands include the vehicle's smallest and largest command. Rounding cannot lead beyond the largest
+        command.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
@@ -137,8 +138,8 @@ class ProfileProblem(NamedTuple):
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
         """Return the first-impact harm and the total harm of one profile per world, [n] m2/s2 each.
 
-        Both equal the harm in the engine to the last bit. Raises ``InvalidInput`` for profiles that do not fit the
-        problem or exceed a capacity, and ``PhysicsError``, which lists the worlds in which a check of the physics
+        Both harms equal the harms in the engine to the last bit. Raises ``InvalidInput`` for profiles that do not fit
+        the problem or exceed a capacity, and ``PhysicsError``, which lists the worlds in which a check of the physics
         failed.
         """
         first, total = self.follow_pairs(profiles)

@@ -76,7 +76,7 @@ class Roster:
     def renew(self, rows: Ints, first: int) -> None:
         """Record that new worlds run in the rows with the indices ``rows``.
 
-        They are the worlds ``first``, ``first + 1``, ... of the stream.
+        The new worlds are the worlds ``first``, ``first + 1``, ... of the stream.
         """
         self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
@@ -107,7 +107,7 @@ class Stream:
 
     Args:
         scenario: the scenario from which worlds are drawn.
-        deciders: indices of the vehicles (0 = front); the first decision is when the first of them may act.
+        deciders: indices of the vehicles (0 = front); the first decision is when the first decider may act.
         scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
         seed: seed of the stream.
 

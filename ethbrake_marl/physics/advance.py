@@ -213,7 +213,8 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
     k = int(np.argmin(in_time & in_range.all(axis=1)))
     if not in_time[k]:
         raise InvalidInput(
-            f"advance: world {k} cannot be advanced to {until[k]:g} s; its time is already {worlds.time_s[k]:g} s"
+            f"advance: world {k} is at {worlds.time_s[k]:g} s; its end time {until[k]:g} s must be finite and not"
+            " earlier"
         )
     i = int(np.argmin(in_range[k]))
     raise InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[k, i]:g}, {high[k, i]:g}] m/s2")

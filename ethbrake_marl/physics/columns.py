@@ -127,7 +127,7 @@ class Packed(NamedTuple):
 
     @property
     def builds_up(self) -> bool:
-        """Whether the brakes of some vehicle build up, that is, at a finite rate."""
+        """Whether the brakes of some vehicle build up at a finite rate."""
         column = self.column
         return bool(np.isfinite(self.params[:, column.brake_rate : column.harm_weight]).any())
 

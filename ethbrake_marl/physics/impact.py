@@ -73,9 +73,9 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
     The impact is plastic (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. ``pool`` groups
-    the vehicles into blocks with one common speed before the bounce. The mean of the remaining rounding error corrects
-    this speed, so the momentum error is at most 4 eps times ``sum(m |v|)`` for any masses. The speed of a vehicle that
-    is not struck stays the same to the last bit.
+    the vehicles into blocks with one common speed before the bounce. This speed is corrected by the mean of the
+    remaining rounding error, so the momentum error is at most 4 eps times ``sum(m |v|)`` for any masses. The speed of a
+    vehicle that is not struck stays the same to the last bit.
 
     The corrected speeds are ordered only up to rounding. In a plastic impact each speed is therefore limited to the
     speed of the vehicle in front. Without this limit, two blocks could exchange a rounding error forever.

@@ -288,8 +288,8 @@ def _alone(name: str) -> Iterator[None]:
 def digest_of_sources(source: Path) -> str:
     """Return a hash of all files that the kernels in the file ``source`` may be compiled from; empty if not known.
 
-    The hash is not known for code outside a file (in an interactive shell). Nor is it known for a file that was edited
-    after this process started, because the process may have imported the older version. A file with a date in the
+    The hash is not known for code outside a file (in an interactive shell), and for a file that was edited after this
+    process started, because the process may have imported the older version. A file with a date in the
     future counts as edited, and a warning is given.
     """
     digest = hashlib.sha256()

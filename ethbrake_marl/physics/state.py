@@ -78,7 +78,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Return the vehicles of the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
+        """Return a copy of the vehicles in the worlds selected by ``rows`` (indices or a mask [n])."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -240,7 +240,7 @@ class Worlds:
         return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
 
     def take(self, rows: ArrayLike) -> Worlds:
-        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
+        """Return a copy of the worlds selected by ``rows`` (indices or a mask [n])."""
         index = np.asarray(rows)
         return self._each(lambda column: np.ascontiguousarray(column[index]))
 
@@ -497,7 +497,7 @@ def sum_rows(values: Floats) -> Floats:
 
 
 def real_numbers(value: ArrayLike) -> Floats:
-    """Return ``value`` as float64, without a copy if it already is.
+    """Return ``value`` as float64, without a copy if it is a float64 array already.
 
     Raises ``ValueError``, with the reason as its text, for a value that is not numeric. This includes values that numpy
     would convert: booleans, masked entries, texts, and tensors that need gradients or are on another device.
@@ -532,7 +532,7 @@ def checked_numbers(name: str, value: ArrayLike) -> Floats:
     try:
         return real_numbers(value)
     except ValueError as error:
-        raise InvalidInput(f"{name} = {value!r}: {error}; must be a number or an array of numbers") from None
+        raise InvalidInput(f"{name}: {value!r} {error}; a number or an array of numbers is needed") from None
 
 
 def make_worlds(
@@ -577,7 +577,7 @@ def make_worlds(
     """
     speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
     if speeds.ndim != 2 or speeds.shape[1] < 2:
-        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; a line needs at least 2 vehicles, as [n, N]")
+        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; must be [n, N] with at least 2 vehicles")
     gaps = checked_numbers("gaps_m", gaps_m)
     n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
     N = speeds.shape[1]

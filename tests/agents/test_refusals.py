@@ -156,16 +156,20 @@ def test_agent_of_a_user__is_refused(message: str) -> None:
 
 
 FAILED: dict[str, Callable[[], object]] = {
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape (12, 1); one number per world": lambda: evaluated(
-        Own(lambda worlds: np.zeros((worlds.n, 1)))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape (12, 1); one number per world": lambda: (
+        evaluated(Own(lambda worlds: np.zeros((worlds.n, 1))))
     ),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape ()": lambda: evaluated(Own(lambda worlds: 1.0)),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave object of shape ()": lambda: evaluated(Own(lambda worlds: None)),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave <U1 of shape (12,); one number per world is needed": lambda: (
-        evaluated(Own(lambda worlds: ["x"] * worlds.n))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape ()": lambda: evaluated(
+        Own(lambda worlds: 1.0)
     ),
-    "agent 'own', world 7, vehicle_2 at 0.50 s: gave float64 of shape (7,); one number per world": lambda: evaluated(
-        Own(lambda worlds: np.zeros(7))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned object of shape ()": lambda: evaluated(
+        Own(lambda worlds: None)
+    ),
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned <U1 of shape (12,); one": lambda: evaluated(
+        Own(lambda worlds: ["x"] * worlds.n)
+    ),
+    "agent 'own', world 7, vehicle_2 at 0.50 s: act returned float64 of shape (7,); one number per world": lambda: (
+        evaluated(Own(lambda worlds: np.zeros(7)))
     ),
     "agent 'own', world 4, vehicle_2 at 0.50 s: command nan m/s2; must be in [-7, 7]": lambda: evaluated(
         Own(lambda worlds: np.where(np.arange(worlds.n) == 4, np.nan, 0.0))
@@ -329,7 +333,7 @@ def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() ->
         def begin(self, worlds: Any) -> None:
             return None
 
-    with refused("agent 'own' of vehicle_2: begin exists, but act takes no memory; an agent with memory has"):
+    with refused("agent 'own' of vehicle_2: the agent has begin, but act takes no memory; an agent with memory has"):
         evaluated(Begins(len))
 
 

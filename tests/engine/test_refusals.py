@@ -158,9 +158,9 @@ ENGINE: dict[str, Callable[[], object]] = {
     "engine: deciders = (3,): must be vehicle indices": lambda: Engine(
         PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)
     ),
-    "engine snapshot: the array state has the shape (6, 20); the shape (7, 20) is": lambda: make_engine(PAPER, 7).restore(
-        make_engine(PAPER, 6).snapshot()
-    ),
+    "engine snapshot: the array state has the shape (6, 20); the shape (7, 20) is": lambda: make_engine(
+        PAPER, 7
+    ).restore(make_engine(PAPER, 6).snapshot()),
     "renew: rows = [1, 9]: must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
     "observe: vehicle = 'vehicle_2': must be a vehicle index": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
     "since: these are not the same worlds; ask before a row is renewed": lambda: make_engine(PAPER, 6).ledger.since(
@@ -207,8 +207,8 @@ def test_branch__has_an_end_and_no_shaping() -> None:
 
 def test_snapshot__of_another_engine_is_refused() -> None:
     kept = make_engine(PAPER, 6).snapshot()
-    with refused("engine snapshot: params is (6, 25); (6, 37) is needed"):
+    with refused("engine snapshot: the array params has the shape (6, 25); the shape (6, 37) is needed"):
         make_engine(load_scenario("cooperation-2-blocked"), 6).restore(kept)
     del kept["params"]
-    with refused("engine snapshot: params is nothing; (6, 25) is needed"):
+    with refused("engine snapshot: the array params is missing; the shape (6, 25) is needed"):
         make_engine(PAPER, 6).restore(kept)

@@ -149,10 +149,10 @@ def test_row__beside_one_that_is_reset_must_be_a_number() -> None:
 )
 def test_advance__refuses_commands_and_times_that_are_no_numbers(wrong: Any) -> None:
     worlds = eb.load_scenario("paper-random").sample(1, 0).worlds
-    with pytest.raises(InvalidInput, match=r"^command_mps2 = (?s:.*)(is masked|is a boolean|needs gradients)"):
+    with pytest.raises(InvalidInput, match=r"^command_mps2: (?s:.*)(is masked|is a boolean|needs gradients)"):
         eb.advance(worlds, wrong, 0.1)
     for time in ({"duration_s": True}, {"until_s": True}):
-        with pytest.raises(InvalidInput, match=r"^(duration|until)_s = True: is a boolean"):
+        with pytest.raises(InvalidInput, match=r"^(duration|until)_s: True is a boolean"):
             eb.advance(worlds, 0.0, **time)
 
 

@@ -33,7 +33,7 @@ WORLDS: dict[str, Callable[[], object]] = {
     "obstacle_gap_m[0] = -0.5: must be finite and in [0, inf]": lambda: line([5.0], [9.0, 9.0], obstacle_gap_m=-0.5),
     "obstacle_gap_m[0] = inf: must be finite and in [0, inf]": lambda: line([5.0], [9.0, 9.0], obstacle_gap_m=inf),
     "mass_t: shape (2,); must be (1, 3)": lambda: line([5.0, 6.0], [9.0, 9.0, 9.0], mass_t=[1.0, 2.0]),
-    "speeds_mps: shape (1, 1); a line needs at least 2 vehicles, as [n, N]": lambda: line([5.0, 6.0], [10.0]),
+    "speeds_mps: shape (1, 1); must be [n, N] with at least 2 vehicles": lambda: line([5.0, 6.0], [10.0]),
     "speeds_mps: shape (2, 3); must be (3, 3)": lambda: line(np.ones((3, 2)), np.zeros((2, 3))),
     "brake_rate_mps3[0, 1] = 0: must be in (0, inf]": lambda: line([5.0], [9.0, 9.0], brake_rate_mps3=[9.0, 0.0]),
     "release_rate_mps3[0, 0] = nan: must be in (0, inf]": lambda: line([5.0], [9.0, 9.0], release_rate_mps3=nan),
@@ -53,11 +53,9 @@ ADVANCES: dict[str, Callable[[], object]] = {
     ),
     "command_mps2[0, 0] = nan: must be in [-10, 10] m/s2": lambda: advance(PAIR, [nan, 0.0], 1.0),
     "command_mps2: shape (3,); must be (1, 2)": lambda: advance(PAIR, [0.0, 0.0, 0.0], 1.0),
-    "advance: world 0 cannot be advanced to -1 s; its time is already 0 s": lambda: advance(PAIR, 0.0, -1.0),
-    "advance: world 1 cannot be advanced to -1 s; its time is already 0 s": lambda: advance(
-        FOUR, 0.0, until_s=[1.0, -1.0, 1.0, 1.0]
-    ),
-    "advance: world 0 cannot be advanced to inf s": lambda: advance(PAIR, 0.0, until_s=inf),
+    "advance: world 0 is at 0 s; its end time -1 s must be": lambda: advance(PAIR, 0.0, -1.0),
+    "advance: world 1 is at 0 s; its end time -1 s must be": lambda: advance(FOUR, 0.0, until_s=[1.0, -1.0, 1.0, 1.0]),
+    "advance: world 0 is at 0 s; its end time inf s must be": lambda: advance(PAIR, 0.0, until_s=inf),
     "advance: pass either duration_s or until_s": lambda: advance(PAIR, 0.0),
     "threads = 0: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=0),
     "threads = True: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=True),
