@@ -86,8 +86,8 @@ class Packed(NamedTuple):
     def of(cls, worlds: Worlds) -> Packed:
         """Pack ``worlds`` at the start of their episode, with harm 0.
 
-        Columns of the obstacle, and of news by link (the time from which each vehicle may act on information about each
-        other one), exist only if some world needs them.
+        Columns of the obstacle exist only if some world needs them, and so do columns of news by link (the time from
+        which each vehicle may act on information about each other vehicle).
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))

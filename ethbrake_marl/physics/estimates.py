@@ -11,11 +11,11 @@ from ethbrake_marl.physics.messages import (
     CHANNEL,
     LINK,
     PLACE,
+    PLACES_AT,
     SPEED,
     has_contents,
     knows_piece,
     link_at,
-    place_at,
 )
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
@@ -49,7 +49,7 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
             continue
         messages, time = params[k, head:], state[k, column.time]
         says = has_contents(messages, N)
-        place[observer], fresh[observer] = messages[place_at(N) + observer], True
+        place[observer], fresh[observer] = messages[PLACES_AT + observer], True
         for way in (-1, 1):
             last = place[observer]
             j = observer + way

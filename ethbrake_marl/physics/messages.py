@@ -74,6 +74,8 @@ class _Channel(NamedTuple):
 
 CHANNEL = _Channel()
 
+PLACES_AT = CHANNEL.WIDTH  # first column of the places of the vehicles (m along the road)
+
 
 class _Link(NamedTuple):
     """Column numbers of a link, which is the connection from one sending vehicle to one receiving vehicle."""
@@ -97,15 +99,6 @@ RING_HEAD = 2
 POST_M = 1e6  # gap to a dummy obstacle out of reach; the change of this gap is the distance that Vehicle 1 travels
 
 _ON_GRID = 1e-9
-
-
-@compiled
-def place_at(vehicles: int) -> int:
-    """Return the column at which the places of the vehicles begin, counted from the first column of the messages.
-
-    A place is a position along the road (m). ``vehicles``: number N of vehicles.
-    """
-    return CHANNEL.WIDTH
 
 
 @compiled
@@ -333,7 +326,7 @@ class Messages(NamedTuple):
 
         All worlds must have columns of messages.
         """
-        own, obstacle = self.columns[:, place_at(self.vehicles) + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
+        own, obstacle = self.columns[:, PLACES_AT + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
         newest = self.links[:, vehicle]
         at_s, place, speed, command, hit = (newest[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
         return Told(at_s, place, speed, command, hit, own, obstacle)
@@ -462,7 +455,7 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
 
     """
     N, obstacle, gap, force = column.vehicles, column.obstacle, column.gap, column.command
-    messages, place = params[column.messages :], place_at(N)
+    messages, place = params[column.messages :], PLACES_AT
     messages[place] = 0.0
     messages[CHANNEL.OBSTACLE_PLACE] = state[obstacle] if state.shape[0] > obstacle else math.inf
     for p in range(N - 1):
@@ -535,7 +528,7 @@ def _move(
         table[ROW.HIT, p + 1] = state[gap + N - 1 + p]
     if advance_table(table, params[column.restitution], end - time, time, 0, no_rows, 0)[1] != FLAG.DONE:
         return False
-    place = column.messages + place_at(N)
+    place = column.messages + PLACES_AT
     params[place] += ahead - table[ROW.GAP, 0]
     state[column.time] = end
     for i in range(N):
@@ -563,7 +556,7 @@ def _sample(state: Floats, messages: Floats, column: Columns) -> None:
     messages[at] = state[column.time]
     messages[at + 1] = state[obstacle + 1] if state.shape[0] > obstacle else 0.0
     for i in range(N):
-        messages[at + RING_HEAD + i] = messages[place_at(N) + i]
+        messages[at + RING_HEAD + i] = messages[PLACES_AT + i]
         messages[at + RING_HEAD + N + i] = state[column.speed + i]
         messages[at + RING_HEAD + 2 * N + i] = state[column.command + i]
         if width > RING_HEAD + 3 * N:

@@ -63,7 +63,7 @@ OBSERVATIONS: dict[str, Callable[[], object]] = {
     "observation: front = 65; must be a whole number in 0..64": lambda: ObservationSpec(65, 0),
     "observation: front = -1; must be a whole number in 0..64": lambda: ObservationSpec(front=-1),
     "observation: obstacle = 1; must be True or False": lambda: ObservationSpec(obstacle=1),
-    "observe: vehicle = 4: must be a vehicle index": lambda: observe(
+    "observe: vehicle index 4; must be in 0..2": lambda: observe(
         load_scenario("paper-random").sample(1, 7).worlds, 4, ObservationSpec()
     ),
     "observation: contact features need the time between two decisions; give it as time_step_s": lambda: observe(
