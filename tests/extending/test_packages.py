@@ -230,7 +230,7 @@ def test_name__that_two_packages_give_is_told_with_both(install: Install, capsys
     both = "several installed packages, hills and valleys; uninstall all but one"
     with pytest.raises(InvalidInput, match=f"agent 'gentle' is defined by {both}"):
         eb.make_agent("gentle")
-    with pytest.raises(InvalidInput, match="agent 'coast' is defined by several .*, ethbrake-marl and valleys"):
+    with pytest.raises(InvalidInput, match=r"agent 'coast' is defined by several .*, ethbrake-marl and valleys"):
         eb.make_agent("coast")
     assert eb.make_agent("full_brake").name == "full_brake"
     assert run_command(["--help"]) == 0 and "From the installed packages hills and valleys." in capsys.readouterr().out
