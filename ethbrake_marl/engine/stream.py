@@ -26,8 +26,8 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 class Start(NamedTuple):
     """Worlds of new episodes, advanced from the alert to their first decision."""
 
-    origin: Worlds  # worlds at the alert, t = 0; these n worlds and possibly others
-    first: int  # row in ``origin`` of the first of these worlds; the others follow it
+    origin: Worlds  # worlds at the alert, t = 0: the n worlds and possibly further worlds
+    first: int  # row in ``origin`` of the first of the n worlds; the other worlds follow it
     packed: Packed  # the n worlds at the first decision
     clock: Floats  # [n, CLOCK_WIDTH] times and steps of the episodes, see ``compiled_step``
     wanted: Floats  # [n, N] commands of the scripts whose command never changes, 0 for all other vehicles (m/s2)

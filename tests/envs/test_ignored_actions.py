@@ -99,7 +99,7 @@ def test_warning__does_not_come_for_actions_that_are_left_out(actions: dict[str,
 def test_warning__of_a_step_that_is_refused_comes_with_it_and_not_again() -> None:
     env = eb.parallel_env()
     env.reset(seed=0)
-    with pytest.warns(IgnoredAction), pytest.raises(InvalidInput, match="the action of the learner vehicle_2 is"):
+    with pytest.warns(IgnoredAction), pytest.raises(InvalidInput, match="no action for the learner vehicle_2"):
         env.step({"vehicle_1": COAST})
     env.step(dict.fromkeys(env.agents, COAST))
 

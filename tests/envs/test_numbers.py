@@ -91,7 +91,7 @@ def test_metres__that_are_no_number_are_refused(bad: str) -> None:
         state = {"gaps_m": gaps, "speeds_mps": 20}
         with pytest.raises(InvalidInput, match=rf"^initial_state: gaps_m = (?s:.*){message}"):
             env.reset(options={"initial_state": state})
-        with pytest.raises(InvalidInput, match=rf"^gaps_m = (?s:.*){message}"):
+        with pytest.raises(InvalidInput, match=rf"^gaps_m: (?s:.*){message}"):
             eb.make_worlds(gaps, [20.0, 20.0, 20.0], **settings, latency_s=0, restitution=0)
         if getattr(gaps, "grad_fn", None):
             continue  # Stable-Baselines3 copies options, which such a tensor does not allow

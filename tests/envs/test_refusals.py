@@ -99,7 +99,7 @@ def test_environment__is_not_made_or_asked_so(message: str) -> None:
 
 
 STEPS: dict[str, Callable[[], object]] = {
-    "step: the action of the learner vehicle_2 is missing": lambda: started(parallel_env(FIVE, learners=PAIR)).step(
+    "step: no action for the learner vehicle_2": lambda: started(parallel_env(FIVE, learners=PAIR)).step(
         {"vehicle_3": [0.0]}
     ),
     "action of vehicle_3: nan; must be in [-1, 1], from full braking to full driving": lambda: started(

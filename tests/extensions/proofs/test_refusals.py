@@ -84,7 +84,7 @@ def test_proof__is_refused_where_nothing_exact_is_known(message: str) -> None:
 
 
 SEARCHES: dict[str, Callable[[], object]] = {
-    "horizon_s 0.4: must be after the first decision at 0.5 s": lambda: profile_problem(WORLDS, [1], horizon_s=0.4),
+    "horizon_s = 0.4: must be after the first decision at 0.5 s": lambda: profile_problem(WORLDS, [1], horizon_s=0.4),
     "task: vehicles (3,): must be indices from 0 to 2, each once": lambda: Task(PAPER, (3,)),
     "task: vehicles (0, 0): must be indices from 0 to 2, each once": lambda: Task(PAPER, (0, 0)),
     "scenario 'paper-random': needs one controlled vehicle; controlled are: vehicle_1": lambda: (
