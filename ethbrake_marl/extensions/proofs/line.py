@@ -1,4 +1,4 @@
-"""One world as the proofs represent it, and the motion of its two neighbours without contact."""
+"""Columns of a world in the proofs, and the undisturbed motion of its front and rear vehicle."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Line(NamedTuple):
-    """Index of each column of a world array, at the moment when the controlled vehicle (follower, F) may act.
+    """Index of each column of a world array. The values hold at the moment when the controlled vehicle may act.
 
-    L is the front vehicle (leader), R the rear vehicle. V are speeds (m/s), A braking and U driving capacities (m/s2).
+    L marks the front vehicle (leader), F the controlled vehicle (follower), R the rear vehicle. V is a speed (m/s), A a
+    braking capacity and U a driving capacity (m/s2).
     """
 
     GAP_L: int = 0  # gap to the front vehicle, m
@@ -60,9 +61,9 @@ AHEAD_M = 1e-9  # tolerance: a smaller overlap is no meeting with the other vehi
 
 @compiled
 def leader(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) of the front vehicle at ``time`` (s) if nobody touches it.
+    """Return speed (m/s) and distance (m) of the front vehicle at ``time`` (s) if no other vehicle pushes it.
 
-    ``at`` is one world, an array with the columns of ``LINE``.
+    ``at`` is the state of one world, [LINE.WIDTH].
     """
     speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
     return speed, way
@@ -70,9 +71,9 @@ def leader(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def follower(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) of the rear vehicle at ``time`` (s) if nobody touches it.
+    """Return speed (m/s) and distance (m) of the rear vehicle at ``time`` (s) if no other vehicle pushes it.
 
-    ``at`` is one world, an array with the columns of ``LINE``.
+    ``at`` is the state of one world, [LINE.WIDTH].
     """
     speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
     return speed, way
