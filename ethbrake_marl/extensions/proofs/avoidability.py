@@ -25,11 +25,12 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND, solo_motion, stopping_distances
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-ROUNDING_M = 1e-12  # a smaller overlap is a rounding error of gap 0, not an impact
+ROUNDING_M = 1e-12  # a smaller overlap is a rounding error at gap 0, not an impact
 
-SQUEEZE_M = 1e-9  # with less room than this between both neighbours, contact counts as unavoidable
+SQUEEZE_M = 1e-9  # if less room than this remains between both neighbours, contact counts as unavoidable
 
-TOUCHING_M = 1e-5  # the same limit where contact with the front vehicle is forced, which may change the way by as much
+# The same limit if even full braking brings the vehicle to the front vehicle; that touch may move it by this much.
+TOUCHING_M = 1e-5
 
 AVOIDABLE, EARLY, FRONT, REAR = 0, 1, 2, 3
 
@@ -422,8 +423,8 @@ def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | Non
         scripts: script name of each other vehicle, by index; None: all other vehicles brake fully.
 
     """
-    # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring the vehicle
-    # there, and a push is an impact already.
+    # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring Vehicle 1
+    # there, and a push begins with an impact.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
     own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
     v = worlds.vehicles
@@ -433,21 +434,29 @@ def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | Non
         worlds.obstacle_gap_m,
         "obstacle_gap_m",
         None,
-        "beyond full braking of vehicle_1",
+        "greater than the stopping distance of vehicle_1",
     )
     if vehicle == 0 and np.isfinite(worlds.obstacle_gap_m).any():
-        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (obstacle_gap_m): not decided")
+        raise InvalidInput(
+            "avoidability: vehicle_1 is controlled with an obstacle ahead (obstacle_gap_m); must be without obstacle"
+        )
     if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
         raise InvalidInput(
-            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided for vehicle_2 of 3 and for"
-            " either vehicle of 2"
+            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles is controlled; must be vehicle_2 of 3 vehicles"
+            " or either one of 2 vehicles"
         )
     for index, script in (scripts or {}).items():
         if index != vehicle and script != "full_brake":
-            raise InvalidInput(f"avoidability: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+            raise InvalidInput(f"avoidability: vehicle_{index + 1} follows the script {script!r}; must be 'full_brake'")
     if vehicle == 1:
         latency = np.maximum(worlds.vehicles.latency_s, worlds.time_s[:, None])
-        _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
+        _refuse(
+            latency[:, 0] > latency[:, 1],
+            worlds.vehicles.latency_s[:, 0],
+            "latency_s",
+            0,
+            "at most the latency of vehicle_2",
+        )
     for i in range(worlds.N):
         _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
 

@@ -263,7 +263,7 @@ def after_ramped(
     share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
     rest = 1.0 - share * (1.0 + at[LINE.RESTITUTION])
     if kind == RAMPED_FRONT and (rest < 0.0 or at[LINE.OBSTACLE] < math.inf):
-        return 0.0  # the controlled vehicle may be thrown back
+        return 0.0  # no bound: the controlled vehicle may be thrown back
     rest, span = max(rest, 0.0), late - early
     high, rise, _, _ = range_of(sign, at)
     force = high
@@ -354,25 +354,25 @@ def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats)
 
 EPS = 2.0**-52  # the spacing of doubles at 1
 
-# Bounds are lowered by this many eps of the largest squared speeds of a world: a segment of motion or a round of
-# impacts changes a squared closing speed by at most 8 eps of these, and an episode has up to 500 of them.
+# Bounds are lowered by this many EPS times the largest squared speed of a world. A segment of motion or a round of
+# impacts changes a squared closing speed by at most 8 EPS of this, and an episode has at most 500 of them.
 BOUND_EPS = 2.0**12
 
-LEAST_TIME_STEP_S = 1e-3  # least time between decisions, because shorter steps need more work
+LEAST_TIME_STEP_S = 1e-3  # shortest time between decisions; shorter steps would take too long
 
-LEAST_PART = 100  # least number of worlds per thread; fewer are not worth a thread
+LEAST_PART = 100  # smallest number of worlds for which another thread is started
 
 
 @dataclass(frozen=True, slots=True)
 class LowerBound:
     """Proven lower bounds on the harm of each world; every array is [n], in m2/s2."""
 
-    harm: Floats  # lower bound on the total harm: no command profile does less
+    harm: Floats  # lower bound on the harm: no command does less
     early: Floats  # harm before the controlled vehicle may act
-    front_pair: Floats  # bound of the front pair alone, from that moment on
-    rear_pair: Floats  # bound of the rear pair alone, from that moment on
-    combined: Floats  # bound of both pairs together; 0 if nothing is proven
-    # verdict on contact, on which the combined bound rests; None if brakes build up in any world
+    front_pair: Floats  # bound on the harm of the front pair alone, after the early harm
+    rear_pair: Floats  # bound on the harm of the rear pair alone, after the early harm
+    combined: Floats  # bound on the harm of both pairs together; 0 if nothing is proven
+    # verdict on avoidable contact, which the combined bound uses; None if brakes build up in any world
     contact: Avoidability | None
 
     @property
@@ -404,7 +404,9 @@ def at_onset_of(
     """
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
-        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
+        raise InvalidInput(
+            f"{where}: horizon_s = {horizon_s!r}: must be finite and at least {start.max():g}, when the vehicle acts"
+        )
     now, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
     early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
     forward = now.speeds_mps >= 0.0
@@ -424,10 +426,10 @@ def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: obj
     """
     check_harm_count(harm_count)
     if not _is_number(horizon_s):
-        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be a number of seconds")
+        raise InvalidInput(f"{where}: horizon_s = {horizon_s!r}: must be a number of seconds")
     if time_step_s is not None and not (_is_number(time_step_s) and LEAST_TIME_STEP_S <= time_step_s < np.inf):  # type: ignore[operator]  # a number
         raise InvalidInput(
-            f"{where}: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or None"
+            f"{where}: time_step_s = {time_step_s!r}: must be at least {LEAST_TIME_STEP_S:g} seconds, or None"
         )
 
 

@@ -36,7 +36,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
 _MIDDLE, _REAR = 1, 2
 
-_UNMOVED_T = 1e30  # mass of an obstacle: its share of two masses is 1
+_UNMOVED_T = 1e30  # mass of an obstacle, t; the other mass is negligible
 
 
 def _combined_bound_of_line(
@@ -104,11 +104,11 @@ def _combined_bound_of_line(
 class TeamBound:
     """Proven lower bounds on the harm of each world, in m2/s2; ``pairs`` is [n, P], every other array [n]."""
 
-    harm: Floats  # lower bound on the total harm, whatever the controlled vehicles do
+    harm: Floats  # lower bound on the harm, whatever the controlled vehicles do
     early: Floats  # harm before any controlled vehicle may act
-    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
-    pairs: Floats  # [n, P] bound of each pair alone, from that moment on
-    combined: Floats  # bound of the first two pairs together (see ``team_bound``); 0 if nothing is proven
+    obstacle: Floats  # bound on the harm of Vehicle 1 and the obstacle ahead, after the early harm
+    pairs: Floats  # [n, P] bound on the harm of each pair alone, after the early harm
+    combined: Floats  # bound on the harm of the first two pairs together (see ``team_bound``); 0 if nothing is proven
 
     @property
     def impact_proven(self) -> Bools:
@@ -154,18 +154,18 @@ def team_bound(
 
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
-    # sort the controlled vehicles, and refuse what the bound does not cover
+    # refuse vehicles that the bound does not cover
     if not isinstance(vehicles, Iterable):
-        raise InvalidInput(f"team_bound: vehicles {vehicles!r}: must be a list of vehicles, for instance (1, 2)")
+        raise InvalidInput(f"team_bound: vehicles = {vehicles!r}: must be a list of indices, for instance (1, 2)")
     team = tuple(vehicles)
     for vehicle in team:
-        check_whole_number("team_bound: a vehicle", vehicle, 0, worlds.N - 1)
+        check_whole_number("team_bound: an entry of vehicles", vehicle, 0, worlds.N - 1)
     if not team or len(set(team)) != len(team):
-        raise InvalidInput(f"team_bound: vehicles {team}: at least one is needed, each once")
+        raise InvalidInput(f"team_bound: vehicles = {team}: must have at least one vehicle and no vehicle twice")
     for index, script in (scripts or {}).items():
-        check_whole_number("team_bound: a vehicle of scripts", index, 0, worlds.N - 1)
+        check_whole_number("team_bound: a key of scripts", index, 0, worlds.N - 1)
         if index not in team and script != "full_brake":
-            raise InvalidInput(f"team_bound: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+            raise InvalidInput(f"team_bound: vehicle_{index + 1} follows the script {script!r}; must be 'full_brake'")
     chosen = np.array(sorted(team), np.int64)
     worlds.refuse_build_up("team_bound")
     now, start, early, counts = at_onset_of("team_bound", worlds, chosen, harm_count, horizon_s)
@@ -206,7 +206,7 @@ def team_bound(
         behind = replace(line.vehicles, braking_capacity_mps2=braking, mass_t=mass)
         line = replace(
             line, vehicles=behind, obstacle_gap_m=np.ones(line.n)
-        )  # finite: disables the centre-of-mass bounds
+        )  # a finite obstacle_gap_m switches off the bounds by the centre of mass
         onsets, counted = np.column_stack([np.zeros(line.n), onset]), np.column_stack([ahead, counts])
         both = np.stack([obstacle, pairs[:, 0]], axis=1)
         combined = _combined_bound_of_line(line, onsets, counted, chosen + 1, until, both, time_step_s)
