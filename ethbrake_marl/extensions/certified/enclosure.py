@@ -1,7 +1,8 @@
-"""Upper bound on the harm of a plan over a box of worlds, by branch and bound.
+"""Compute an upper bound on the harm of a plan over a box of worlds, by branch and bound.
 
-A *plan* holds one action for each decision up to the horizon. The box is halved again and again where its bound is
-largest. ``Q`` numbers describe a box, ``K`` of them are uncertain, ``L`` is the length of a plan.
+A *plan* has one action for each decision up to the horizon. The search halves the part of the box with the largest
+bound, again and again. Letters for shapes: ``Q`` numbers describe a world, ``K`` of them are uncertain, ``L`` is the
+length of a plan.
 """
 
 from __future__ import annotations
@@ -64,13 +65,13 @@ class Known(NamedTuple):
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """Return the affine form [K + 2] (centre, slopes, remainder) of one number of a box.
+    """Return one number of a box as an affine form [K + 2] (centre, slopes, remainder).
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         which: index of the number in the box.
-        free: [K] indices of the uncertain numbers, each with a slope of its own.
+        free: [K] indices of the uncertain numbers; each has its own slope.
 
     """
     out = np.zeros(free.shape[0] + 2)
@@ -88,16 +89,16 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
     """Return the cell of a box, and the time from the alert to the first piece (s) as an affine form [W].
 
-    A *cell* is the box as affine forms, with the commands cut into pieces (time intervals of constant command). Time
-    counts from the first decision, because that decision falls at a different time in each world if the shielded
-    vehicle's latency is uncertain. The first piece starts before it by the shortest time that any world needs from the
-    alert to the first decision.
+    A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command).
+    Times count from the first decision. (If the shielded vehicle's latency is uncertain, the first decision falls at a
+    different time in each world.) The time of the first piece before the first decision is the shortest time that any
+    world needs from the alert to the first decision.
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         free: [K] indices of the uncertain numbers.
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
 
     """
@@ -148,15 +149,15 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
 @compiled(apart=True)
 def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
-    """Compute ``cell.forces`` of vehicle ``i``, in place, for the time before the first piece and for every piece.
+    """Compute ``cell.forces`` of vehicle ``i`` in place, for every piece and for the time before the first piece.
 
-    The force is 0 at the alert. A *piece* is a time interval of constant command.
+    The acceleration is 0 at the alert. A *piece* is a time interval of constant command.
 
     Args:
         cell: the box of worlds; only its ``forces`` change.
         i: index of the vehicle.
-        late: affine form [W] (centre, slopes, remainder) of the time from the alert to the first piece, s.
-        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+        late: time from the alert to the first piece as an affine form [W] (centre, slopes, remainder), s.
+        rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
 
     """
     forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
@@ -201,23 +202,24 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """Move a force towards its target during a time, and add its effect on speed and distance.
+    """Move an acceleration towards its target for some time, and add its effect on speed and distance.
 
-    For a difference d to ``wanted`` at the start and e at the end, and a time m during which the force changes, the
-    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by ``m t (d
-    + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
+    Let d be the difference to ``wanted`` at the start, e the difference at the end, and m the time in which the
+    acceleration changes. Compared with the acceleration ``wanted`` for the whole duration t, the speed changes by ``m
+    (d + e) / 2`` more, and the distance by ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` more. Returns True if the
+    acceleration has reached ``wanted`` at the end in every world.
 
     Args:
-        force: affine form [W] (centre, slopes, remainder) of the acceleration at the start, m/s2; becomes the
+        force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; becomes the
             acceleration at the end.
-        wanted: affine form [W] of the acceleration that the command asks for, m/s2.
-        duration: affine form [W] of the time for which the command acts, s.
+        wanted: acceleration of the command as an affine form [W], m/s2.
+        duration: time for which the command acts as an affine form [W], s.
         longest: upper limit of ``duration``, s.
-        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
-        rise: affine form [W] of the change of speed, m/s; increased in place.
-        gain: affine form [W] of the distance beyond the starting speed times the time, m; increased in place.
-        swing: [2] receives the largest deviation of the acceleration from its mean where it falls (0) and rises (1),
-            m/s2.
+        rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
+        rise: change of speed as an affine form [W], m/s; increased in place.
+        gain: distance beyond initial speed times duration as an affine form [W], m; increased in place.
+        swing: [2] receives the largest deviation of the acceleration from its mean, m/s2: index 0 for a falling, index
+            1 for a rising acceleration.
 
     """
     start, there = difference(force, wanted), True
@@ -249,11 +251,11 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Advance the speeds and gaps of a cell, in place, from the alert to the first piece (time interval of constant
+    """Advance the speeds and gaps of a cell in place, from the alert to the first piece (time interval of constant
     command).
 
-    Returns False if something may disturb the motion until then: a contact, a stop, the speed limit, or a command that
-    takes effect on the way. ``late`` [W] is the time from the alert to the first piece, s.
+    Returns False if something may disturb the motion in this time: a contact, a stop, the speed limit, or a command
+    that takes effect. ``late`` [W] is the time from the alert to the first piece, s.
     """
     if high(late) <= 1e-12:
         return True
@@ -285,11 +287,11 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether it is certain.
+    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether this acceleration is certain.
 
     The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. It is
-    not certain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W]
-    is the time from the alert to the first piece (time interval of constant command), s.
+    uncertain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W] is
+    the time from the alert to the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -307,12 +309,13 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Return the J pieces (time intervals of constant command): their limits [J + 1], and the action in each, [J].
+    """Return the limits of the J pieces (time intervals of constant command), [J + 1], and the action in each piece,
+    [J].
 
     The limits are in s after the first decision.
 
     Args:
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
         earliest: earliest possible time of the first decision, s.
         plan: [L] action of the shielded vehicle at each decision.
@@ -350,18 +353,18 @@ def bound_of(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
     most: float,
 ) -> float:  # fmt: skip
-    """Return an upper bound on the harm of a plan over one box, m2/s2.
+    """Return an upper bound (m2/s2) on the harm of a plan over one box.
 
-    A result above ``most`` is no bound; it only says that the harm may exceed ``most``.
+    A result above ``most`` is not a bound: the harm may then be larger than the result.
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         free: [K] indices of the uncertain numbers.
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
-        stack: memory for the sets of worlds that are followed separately.
-        motion: memory for the motion of each vehicle.
+        stack: working memory for the paths (sets of worlds with the same impacts).
+        motion: working memory for the motion of each vehicle.
         out: [K + 2] receives the affine form of the harm that reaches the bound.
         most: harm above which the search stops, m2/s2.
 
@@ -388,20 +391,20 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Return an upper bound on the harm of a plan over a box (m2/s2), and the number of parts of the box that were
-    examined.
+    """Return an upper bound (m2/s2) on the harm of a plan over a box, and how many parts of the box were examined.
 
-    The part with the largest bound is halved until the bound is at most ``enough`` or ``cells`` parts were examined.
+    The part with the largest bound is halved until the bound is at most ``enough``, or ``cells`` parts were examined.
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         free: [K] indices of the uncertain numbers.
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
-        enough: bound that needs no refinement, m2/s2.
+        enough: bound that is small enough to stop, m2/s2.
         cells: largest number of parts to examine.
-        only_enough: True: stop in a part once its harm is above ``enough``; a result above ``enough`` is then no bound.
+        only_enough: True: stop in a part as soon as its harm is above ``enough``; a result above ``enough`` is then not
+            a bound.
 
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
@@ -444,7 +447,9 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """The boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. ``Q = 8 N - 1`` numbers."""
+    """Boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. A world has ``Q = 8 N - 1``
+    numbers.
+    """
 
     # [n, Q] least values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
     # vehicle, then the gaps
@@ -462,8 +467,8 @@ class Boxes(NamedTuple):
     def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
         """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
-        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle whose script is not
-        to brake fully, to coast, or to hold one deceleration.
+        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle with a script other
+        than full braking, coasting or one constant deceleration.
 
         Args:
             robust: ``corners`` (never raises) or ``interior``.
@@ -497,7 +502,7 @@ class Boxes(NamedTuple):
 
         Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a braking profile in
         pieces, brakes that began to build up before the alert, or another vehicle whose command differs within the box.
-        ``check_possible`` covers what does not depend on the worlds.
+        ``check_possible`` checks the settings that do not depend on the worlds.
 
         Args:
             possible: [n * M] worlds, M consecutive ones for each box: the reported world and the corners of its box.
@@ -548,8 +553,8 @@ class Boxes(NamedTuple):
 
         Args:
             old: boxes of all episodes before; None at the first start.
-            rows: [m] indices of the new episodes; this object holds their boxes. If they cover all episodes, ``old`` is
-                unused.
+            rows: [m] indices of the new episodes, whose boxes this object contains. If they are all episodes, ``old``
+                is not used.
 
         """
         if old is None or len(rows) >= len(old.low):
@@ -564,7 +569,7 @@ class Boxes(NamedTuple):
 
         Args:
             plans: [n, L] action of the shielded vehicle at each decision, for each world.
-            harm: [n] largest harm of the plan in a corner of the box, m2/s2; a bound close to it is not refined.
+            harm: [n] largest harm of the plan in any corner of the box, m2/s2; the search stops at a bound close to it.
 
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
@@ -579,10 +584,10 @@ class Boxes(NamedTuple):
         Args:
             rows: [m] indices of the boxes.
             plans: [m, L] action of the shielded vehicle at each decision, for each box.
-            enough: [m] bound that needs no refinement, m2/s2.
+            enough: [m] bound that is small enough to stop, m2/s2.
             cells: largest number of parts of a box to examine.
-            only_enough: True: a result above ``enough`` is no bound; it only says that no bound of at most ``enough``
-                was established.
+            only_enough: True: a result above ``enough`` is not a bound, because the search stops as soon as the harm
+                may exceed ``enough``.
 
         """
         bounds = np.empty(len(rows))

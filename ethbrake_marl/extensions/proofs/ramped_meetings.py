@@ -405,7 +405,7 @@ def at_onset_of(
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
         raise InvalidInput(
-            f"{where}: horizon_s = {horizon_s!r}: must be finite and at least {start.max():g}, when the vehicle acts"
+            f"{where}: horizon_s = {horizon_s!r}: must be finite and at least {start.max():g} s (first possible action)"
         )
     now, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
     early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
