@@ -91,8 +91,8 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
     A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command).
     Times count from the first decision. (If the shielded vehicle's latency is uncertain, the first decision falls at a
-    different time in each world.) The time of the first piece before the first decision is the shortest time that any
-    world needs from the alert to the first decision.
+    different time in each world.) The first piece starts before the first decision; the time between them is the
+    shortest time that any world needs from the alert to its first decision.
 
     Args:
         low_: [Q] smallest value of each number of the box.

@@ -1,10 +1,10 @@
-"""Shields in the estimated world: they certify on what the vehicle received and read nothing else.
+"""Shields in the estimated world: they read only the information that their vehicle received.
 
-*Estimated world*: see ``estimated``. Mode ``step`` certifies every action in the estimated world with the median of
-everything unknown; it promises nothing about the true world. Mode ``robust`` certifies in every corner of the ranges of
-everything unknown. If the true world is such a corner, its harm up to the horizon is at most the first bound: later
-messages only remove corners that contradict them, and the held plan is replaced only by a better plan for the
-remaining corners.
+``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world with the
+median of every unknown quantity. It promises nothing about the true world. Mode ``robust`` also certifies in every
+corner of the unknown quantities' ranges. If the true world is one of these corners, its harm up to the horizon is at
+most the first bound. For this, later messages only remove corners that contradict them, and a new plan replaces the
+present one only if it is better in the remaining corners.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """After a restart of the shield in ``rows``, restore the harm so far, and keep the old plan where it is no worse.
+    """Restore the harm so far after a restart of the shield in ``rows``, and keep the old plan where it is at least as
+    good.
 
-    ``shield`` was just restarted and is changed; ``before`` is its copy from before the restart.
+    ``shield`` has just been restarted; it is changed in place. ``before`` is its copy from before the restart.
     """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
@@ -64,18 +65,18 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
 class EstimatedShield:
     """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
-    It starts at the first decision, and again whenever another vehicle becomes known, is known to react, or moves
-    otherwise than predicted. The rest of the previous plan is then a candidate for the new plan. After the first
-    decision ``predicted_harm`` [n] is the first bound; it is infinite where the vehicle had an impact before, because
-    its harm is unknown.
+    The shield starts at the first decision. It starts again whenever another vehicle becomes known, is known to react,
+    or moves otherwise than predicted. At a restart, the rest of the previous plan is a candidate for the new plan.
+    After the first decision ``predicted_harm`` [n] is the first bound. It is infinite if the vehicle had an impact
+    before, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
         harm_count: ``first`` or ``total`` impacts.
-        robust: worlds to certify. None: the median of everything unknown. ``corners``: also all corners of the ranges;
-            more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the corners,
-            once, at the first decision.
+        robust: worlds to certify. None: the median of every unknown quantity. ``corners``: also all corners of the
+            ranges; more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the
+            corners, once, at the first decision.
         others: scripts of the other vehicles by index; None: the scenario's scripts.
 
     """
@@ -119,11 +120,11 @@ class EstimatedShield:
 
     @property
     def members(self) -> int:
-        """Number of worlds that are certified for each true world: 1 for the median, plus 1 for each corner."""
+        """Number of worlds that are certified for each true world: 1 for the median, plus the number of corners."""
         return 1 + len(self._corners())
 
     def __copy__(self) -> EstimatedShield:
-        """Return an independent copy: its decisions do not change this shield."""
+        """Return an independent copy. Decisions of the copy do not change this shield."""
         apart = object.__new__(EstimatedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
@@ -142,9 +143,9 @@ class EstimatedShield:
         return apart
 
     def begin(self, worlds: Worlds, rows: Ints) -> None:
-        """Start episodes in the batch at indices ``rows``; ``worlds`` [m] are their worlds at the alert.
+        """Start episodes at the indices ``rows`` of the batch; ``worlds`` [m] are their worlds at the alert.
 
-        The certification itself starts at the first decision, with the information received by then.
+        Certification starts later, at the first decision, with the information received by then.
         """
         if len(rows) >= len(self._wanted):
             self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
@@ -166,10 +167,10 @@ class EstimatedShield:
         ``begin``.
 
         Args:
-            worlds: the true worlds; only what the vehicle received is read.
+            worlds: the true worlds; only the information that the vehicle received is read.
             proposed: [n] proposed actions.
-            proposer: the policy and its memory. Where nothing else certifies a proposal, its rollout in the estimated
-                worlds is tried. None: no rollout.
+            proposer: the policy and its memory. If no other plan certifies a proposal, the policy's rollout in the
+                estimated worlds is tried. None: no rollout.
             only: [n] True for worlds that decide now; None: all.
 
         """
@@ -232,15 +233,15 @@ class EstimatedShield:
     def _begin_shield(
         self, worlds: Worlds, estimated: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Start the inner shield in ``rows``, with the median of everything unknown and, if robust, the corners of its
+        """Start the inner shield in ``rows``, with the median world and, in mode robust, the corners of the unknown
         ranges.
 
         Args:
             worlds: the true worlds of these rows.
-            estimated: their estimated worlds.
-            way_m: the vehicle's distance since the alert in each of them, m.
+            estimated: the estimated worlds of these rows.
+            way_m: the vehicle's distance since the alert in each of these rows, m.
             rows: indices of the episodes in the batch.
-            keeps: mask of vehicles, [rows, N], whose predicted state is better than their received state.
+            keeps: mask of the vehicles, [rows, N], whose predicted state is better than their received state.
             before: the inner shield before the restart; None at the first start.
 
         """
@@ -259,8 +260,8 @@ class EstimatedShield:
     def _keeps(self, told: Told, time_s: Floats) -> Bools:
         """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
 
-        These are unknown vehicles, and known vehicles without a message since their last predicted impact or contact.
-        ``told`` is the received information, ``time_s`` [n] the present time.
+        These vehicles are unknown, or have sent no message since their last predicted impact or contact. ``told`` is
+        the received information, ``time_s`` [n] the present time.
         """
         running = self.shield.memory.running
         if running is None:
@@ -277,8 +278,9 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time of ``worlds`` for vehicles that had an impact in any certified world since the last
-        decision.
+        """Store the present time for vehicles that had an impact in any certified world since the last decision.
+
+        ``worlds`` are the true worlds now.
         """
         running = self.shield.memory.running
         assert running is not None
