@@ -45,7 +45,7 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-# groups of a box's numbers: N numbers in each group, P in the last one
+# groups of the numbers of a box: N numbers in each group, P in the last group
 BRAKING, DRIVING, LATENCY, MASS, BRAKE_RATE, RELEASE_RATE, SPEED, GAP = range(8)
 
 LONGEST_PIECE_S = 0.25  # longest piece of time before the first decision
@@ -161,7 +161,7 @@ def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
 
     """
     forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
-    last, there = 0.0, True  # last action; whether the force has reached it
+    last, there = 0.0, True  # last action, and whether the acceleration has reached its target
     for j in range(cell.times.shape[0]):
         begin, end = cell.times[j - 1], cell.times[j]
         duration = between(end - begin, end - begin, late.shape[0])
@@ -370,7 +370,7 @@ def bound_of(
 
     """
     cell, late = cell_of(low_, high_, free, known, plan)
-    # rough bound for all worlds, whose first piece begins ``late`` after the alert
+    # rough bound for all worlds; their first piece begins ``late`` after the alert
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
     for i in range(N):
@@ -433,11 +433,12 @@ def bound_box(
 
 MOST_VEHICLES = 3
 
-CELLS_AT_ALERT, CELLS = 200, 40  # most cells to examine: for the bound at the alert, and for one later certificate
+# largest number of cells to examine: for the bound at the alert, and for each later certificate
+CELLS_AT_ALERT, CELLS = 200, 40
 
 NEAR = 1.02  # a bound below this multiple of the largest harm in a corner is not refined further
 
-NEARLY_NOTHING = 0.1  # m2/s2; added to that limit
+NEARLY_NOTHING = 0.1  # m2/s2; added to this multiple
 
 CORNERS, INTERIOR = "corners", "interior"  # worlds that mode robust certifies: the corners of a box, or the whole box
 
@@ -490,8 +491,8 @@ class Boxes(NamedTuple):
             name = getattr(script, "name", type(script).__name__)
             if name.split(":")[0] not in SCRIPTS:
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} is controlled by {name!r}, which it cannot enclose;"
-                    " full_brake, coast and constant:A are possible; robust corners takes every script"
+                    f"shield: robust interior: vehicle_{i + 1} follows {name!r}; must be full_brake, coast or"
+                    " constant:A (robust corners accepts every script)"
                 )
 
     @classmethod
@@ -526,9 +527,8 @@ class Boxes(NamedTuple):
                 continue
             if not (command[:, :, i] == command[:, :1, i]).all():
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} is controlled by {name!r}, whose command is another one"
-                    " in each world of the box; full_brake, coast and constant:A are possible, A being at most every"
-                    " capacity of the box"
+                    f"shield: robust interior: vehicle_{i + 1} follows {name!r}, whose command differs between worlds"
+                    " of the box; must be full_brake, coast, or constant:A with A at most every capacity of the box"
                 )
             constant[:, i] = command[:, 0, i]
         numbers = np.concatenate(
@@ -604,8 +604,8 @@ class Boxes(NamedTuple):
 
 def _refusal(what: str) -> InvalidInput:
     return InvalidInput(
-        f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles without"
-        " an obstacle; robust corners takes every scenario"
+        f"shield: robust interior: {what}: cannot be certified; use robust corners, or first-impact harm of at most"
+        f" {MOST_VEHICLES} vehicles without an obstacle"
     )
 
 

@@ -53,15 +53,15 @@ class Told(NamedTuple):
     A vehicle is *known* if its message has arrived or it is in sight. Columns of unknown vehicles have no meaning.
     """
 
-    known: Bools  # [n, N] True where place and speed are known; always True for the vehicle itself
-    pieces: Bools  # [n, N, len(PIECES)] True for each known piece; nothing of a vehicle without news
+    known: Bools  # [n, N] True for vehicles with known place and speed, and for the vehicle itself
+    pieces: Bools  # [n, N, len(PIECES)] True for each known piece; all False for a vehicle without news
     at_s: Floats  # [n, N] time of the received state
     place_m: Floats  # [n, N] position at that time, relative to the receiving vehicle's present position
     speed_mps: Floats  # [n, N] speed at that time
     command_mps2: Floats  # [n, N] command in force at that time
     obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position; infinite: none is known
     obstacle_hit: Bools  # [n] True if an impact with the obstacle is known
-    hit: Bools  # [n, P] True for an own pair with a known neighbour that had an impact
+    hit: Bools  # [n, P] True for a pair of the vehicle and a known neighbour that had an impact
 
     @property
     def reacts(self) -> Bools:
@@ -165,8 +165,8 @@ class Ranges:
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
             raise InvalidInput(
-                f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
-                " estimated agents need one of these"
+                f"scenario {scenario.name!r} is a mixture: an unknown vehicle could belong to any of {names}; estimated"
+                " agents and shields need one of these scenarios"
             )
         world = middle_world(scenario)
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
@@ -311,10 +311,10 @@ def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
 
     """
     N = place.shape[1]
-    for way in (-1, 1):  # first the vehicles ahead, then those behind
+    for way in (-1, 1):  # first the vehicles ahead, then the vehicles behind
         side = np.arange(vehicle + way, -1 if way < 0 else N, way)
         limit = np.full(len(place), np.inf)
-        for j in side[::-1]:  # from the far end: no farther away than the next known vehicle beyond
+        for j in side[::-1]:  # from the far end: at most as far away as the next known vehicle beyond it
             far = np.where(known[:, j], -way * place[:, j], np.minimum(-way * place[:, j], limit))
             limit = np.where(known[:, j], np.minimum(far, limit), limit)
             place[:, j] = -way * far

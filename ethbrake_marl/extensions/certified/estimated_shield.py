@@ -37,7 +37,7 @@ from ethbrake_marl.shields.step import StepShield
 
 PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # attributes [n, ...]
 
-SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
+SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its prediction that counts as equal
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
@@ -98,7 +98,7 @@ class EstimatedShield:
         self._harm_count: HarmCount = harm_count
         self._others = script_agents(scenario, except_for=vehicle) if others is None else others
         self._odometer: tuple[Floats, ...] = ()  # an ``Odometer``
-        self._heard: Floats = np.zeros((0, 0))  # [n, 2 N] news on which the shield began; NaN where it has not begun
+        self._heard: Floats = np.zeros((0, 0))  # [n, 2 N] information at the last start; NaN: not started
         self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
         self._wanted: Floats = np.zeros(0)  # [n] last certified actions
         self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] predicted total harm at the last decision (m2/s2)
@@ -107,8 +107,8 @@ class EstimatedShield:
         numbers = len(self._ranges.uncertain)
         if self.robust is not None and 2**numbers > MOST_CORNERS:
             raise InvalidInput(
-                f"robust:estimated: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
-                f" which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
+                f"robust:estimated: scenario {scenario.name!r} has {numbers} uncertain numbers of other vehicles, which"
+                f" make {2**numbers} corners; must be at most {MOST_CORNERS} corners"
             )
         self.shield = self._make()
 
@@ -177,7 +177,7 @@ class EstimatedShield:
         shield, vehicle = self.shield, self.vehicle
         if worlds.n > len(self._heard):
             raise InvalidInput(
-                f"shield: estimated: asked to decide in {count_of(worlds.n, 'world')}, but begin was called for"
+                f"shield: estimated: decide was called for {count_of(worlds.n, 'world')}, but begin for"
                 f" {len(self._heard)}; call begin for each world first"
             )
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
@@ -224,7 +224,7 @@ class EstimatedShield:
         self._begin_shield(worlds.take(rows), estimated.take(rows), way_m[rows], rows, keeps[rows], before)
         if before is not None and (held_before := rows[~fresh[rows]]).size:
             _hold_better(shield, held_before, before)
-        rows = rows[due[rows]]  # the other worlds begin again at their own first decision
+        rows = rows[due[rows]]  # the other worlds start at their own first decision
         first, self._heard[rows] = rows[fresh[rows]], heard[rows]
         felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
         felt |= worlds.obstacle_hit[first] & (vehicle == 0)

@@ -85,7 +85,7 @@ class Estimating(AgentAround):
         """
         return {
             "way": Odometer.begun(alert, vehicle),
-            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # news on which the policy began; NaN: not begun
+            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # information at the last start; NaN: not started
             "predicted_harm": np.full(alert.n, np.nan),
             "policy": None,
         }
@@ -124,7 +124,7 @@ class Estimating(AgentAround):
         ``worlds`` are the true worlds now.
         """
         known = Told.to(worlds, vehicle)
-        # a latency that was told predicts the reaction, unless a channel may extend it
+        # a received latency predicts the reaction, unless a channel may delay the reaction
         unforetold = known.reacts & (self.scenario.v2x.delays | ~known.pieces[..., LATENCY])
         return np.concatenate([known.heard, unforetold], axis=1)
 
