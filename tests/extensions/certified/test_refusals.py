@@ -101,7 +101,7 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "shield: robust interior: an obstacle ahead: cannot be certified": lambda: make_agent(
         "coast+robust:interior:estimated", scenario=PERIODIC.replace(obstacle_gap_m=60.0)
     ),
-    "shield: robust interior: 5 vehicles: cannot be certified; use robust corners, or first-impact harm of at": lambda: (
+    "shield: robust interior: 5 vehicles: cannot be certified; use robust corners, or first-impact harm of": lambda: (
         RobustShield(line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
     ),
     "shield: mode step takes no uncertainty; must be mode robust": lambda: ShieldOptions(
