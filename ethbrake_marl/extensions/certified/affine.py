@@ -4,7 +4,7 @@ A *box* contains all worlds whose K uncertain numbers lie in given intervals. An
 differs from world to world. It is an array [W], W = K + 2, for ``c + g_1 e_1 + ... + g_K e_K + r e``: a centre c, one
 slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of the world in the interval
 of uncertain number k; it is the same in all forms. ``e`` in [-1, 1] is arbitrary, and independent in each form. In a
-difference of two forms the common ``e_k`` cancel. Plain intervals cannot do this.
+difference of two forms the common ``e_k`` cancel. Plain intervals do not have this advantage.
 
 Every operation encloses the exact result: for each world of the box, some value of ``e`` makes the form equal to the
 exact result. The operations ignore floating-point rounding; instead, ``ROUNDING`` widens the results once in each

@@ -289,9 +289,9 @@ def wait(cell: Cell, late: Floats) -> bool:
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
     """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether this acceleration is certain.
 
-    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. It is
-    uncertain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W] is
-    the time from the alert to the first piece (time interval of constant command), s.
+    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. The
+    acceleration is uncertain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds;
+    ``late`` [W] is the time from the alert to the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -553,8 +553,8 @@ class Boxes(NamedTuple):
 
         Args:
             old: boxes of all episodes before; None at the first start.
-            rows: [m] indices of the new episodes, whose boxes this object contains. If they are all episodes, ``old``
-                is not used.
+            rows: [m] indices of the new episodes, whose boxes this object contains. If all episodes are new, ``old`` is
+                not used.
 
         """
         if old is None or len(rows) >= len(old.low):

@@ -8,8 +8,8 @@ A vehicle is *known* if its message has arrived or it is in sight. The estimate 
 * For a vehicle that is not known: the scenario. Each quantity is the median of its distribution, or a chosen value of
   its range. The vehicle's script starts at the alert.
 * For a known vehicle whose messages lack a piece (``v2x: tells``): the scenario, for this piece only. Place and speed
-  are used only together. A command in force is used only with both of them. A received intent is not used, because the
-  scripts already predict what the vehicle does.
+  are used only together. A command in force is used only together with place and speed. A received intent is not used,
+  because the scripts already predict what the vehicle does.
 * From the vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
   neighbours.
 
@@ -143,8 +143,8 @@ class Ranges:
 
     Keys of the mappings: ``place`` (position relative to the estimating vehicle at the alert, m), ``speeds_mps``,
     ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the alert message, s) and
-    ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a channel). Each value is
-    [N].
+    ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a channel). Each value has
+    the shape [N].
     """
 
     vehicle: int  # index of the estimating vehicle

@@ -1,10 +1,10 @@
 """Shields in the estimated world: they read only the information that their vehicle received.
 
 ``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world with the
-median of every unknown quantity. It promises nothing about the true world. Mode ``robust`` also certifies in every
-corner of the unknown quantities' ranges. If the true world is one of these corners, its harm up to the horizon is at
-most the first bound. For this, later messages only remove corners that contradict them, and a new plan replaces the
-present one only if it is better in the remaining corners.
+median of every unknown quantity. This mode promises nothing about the true world. Mode ``robust`` also certifies in
+every corner of the unknown quantities' ranges. If the true world is one of these corners, its harm up to the horizon is
+at most the first bound. The bound holds because later messages only remove corners that contradict them, and a new plan
+must be better than the present plan in the remaining corners.
 """
 
 from __future__ import annotations
@@ -65,10 +65,10 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
 class EstimatedShield:
     """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
-    The shield starts at the first decision. It starts again whenever another vehicle becomes known, is known to react,
-    or moves otherwise than predicted. At a restart, the rest of the previous plan is a candidate for the new plan.
-    After the first decision ``predicted_harm`` [n] is the first bound. It is infinite if the vehicle had an impact
-    before, because the harm of that impact is unknown.
+    The shield starts at the first decision. The shield starts again whenever another vehicle becomes known, is known to
+    react, or moves otherwise than predicted. At a restart, the rest of the previous plan is a candidate for the new
+    plan. After the first decision ``predicted_harm`` [n] is the first bound. ``predicted_harm`` is infinite if the
+    vehicle had an impact before, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.

@@ -35,8 +35,8 @@ class Odometer(NamedTuple):
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
         """Return the odometer for the present time; ``worlds`` [n] are the present worlds.
 
-        The added distance is exact under a constant command, even if the vehicle stops. Otherwise it is the mean speed
-        times the time since the last decision.
+        The added distance is exact under a constant command, even if the vehicle stops. Otherwise the added distance is
+        the mean speed times the time since the last decision.
         """
         speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
         way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
@@ -48,15 +48,15 @@ class Odometer(NamedTuple):
 class Estimating(AgentAround):
     """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
 
-    The policy starts at its first decision, with the information received by then. It starts again in worlds where
-    another vehicle becomes known, or where a message over a channel says that a vehicle reacts. The estimate assumes
-    that the other vehicles follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected
-    at its first decision.
+    The policy starts at its first decision, with the information received by then. The policy starts again in worlds
+    where another vehicle becomes known, or where a message over a channel says that a vehicle reacts. The estimate
+    assumes that the other vehicles follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy
+    expected at its first decision.
 
     Args:
         policy: any agent that reads the state of the line.
         scenario: the scenario, which declares the ranges of all unknown quantities; a mixture raises ``InvalidInput``.
-        shows: True: the policy sees the estimated world at every decision. False: the policy sees it only at its
+        shows: True: the policy sees the estimated world at every decision. False: the policy sees it only when it
             starts.
 
     """

@@ -138,8 +138,7 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return ``given`` as an ``Uncertainty``. It may be an object, a text such as ``"gaps_m=0.5"``, or None, which
-    stays None.
+    """Return ``given`` as an ``Uncertainty``, or None if it is None. A text such as ``"gaps_m=0.5"`` is parsed.
 
     Raises ``InvalidInput`` for anything else.
     """

@@ -87,7 +87,7 @@ def new_stack(N: int, width: int) -> Stack:
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
     """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W], m2/s2.
 
-    If ``harm`` is the larger one, it is copied to ``out`` [W].
+    If the value of ``harm`` is the larger one, ``harm`` is copied to ``out`` [W].
     """
     if not high(harm) <= worst:
         out[:] = harm
@@ -116,7 +116,8 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Treat the worlds in which pair ``p`` has an impact in the present piece; return the largest recorded harm, m2/s2.
+    """Record or branch off the worlds in which pair ``p`` has an impact in this piece; return the largest recorded
+    harm.
 
     If no other impact can follow, the harm of these worlds is final and is recorded. Otherwise the worlds become a new
     path on the stack. If that path cannot be simulated, a rough bound (``rough_harm``) is recorded instead.
@@ -361,8 +362,8 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
 def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
     """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed so.
 
-    With brake build-up the pair may separate and have its first impact within the piece. The path below on the stack
-    covers such worlds. Returns False if the stack is full.
+    With brake build-up the pair may separate and have its first impact within the piece. The path below this one on the
+    stack covers such worlds. Returns False if the stack is full.
 
     Args:
         cell: the box of worlds, with the commands and the pieces (time intervals of constant command).

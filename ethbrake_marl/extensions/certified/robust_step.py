@@ -119,9 +119,10 @@ class RobustShield(StepShield):
     def _leaves_range(self, running: Running) -> Bools:
         """Return a mask [n] of the worlds that may leave the range between their members, in the states ``running``.
 
-        The members are the reported world and the corners of its uncertainty. The mask has the worlds of
-        ``StepShield``, and worlds whose own latency is uncertain, because decisions then fall at different times in the
-        worlds of a box. The mask is True for all worlds if one uncertain number (friction) changes several quantities.
+        The members are the reported world and the corners of its uncertainty. The mask is True where the mask of
+        ``StepShield`` is, and in worlds in which the shielded vehicle's latency is uncertain, because decisions then
+        fall at different times in the worlds of a box. The mask is True everywhere if one uncertain number (friction)
+        changes several quantities.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:
@@ -135,7 +136,8 @@ class RobustShield(StepShield):
 def certify_inside(
     boxes: Boxes, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
 ) -> Decision:
-    """Replace each plan of a decision that is not certified for every world of its box by the held plan.
+    """Replace plans of a decision that are not certified for every world of their box by the plans from before the
+    decision.
 
     Args:
         boxes: range of every number of each world.

@@ -1,6 +1,6 @@
 """Rough upper bound on harm, from the largest speeds that the vehicles of a line can still reach.
 
-The bound applies to worlds whose path cannot be simulated. It is always finite.
+The bound applies to worlds whose path cannot be simulated. The bound is always finite.
 
 Without impacts, a vehicle reaches at most its present speed, or the speed that it can reach by driving. An impact with
 closing speed w changes each vehicle's speed by (1 + e) w times the partner's share of the mass; e is the restitution.

@@ -147,8 +147,8 @@ def begin_touch(touch: Floats) -> None:
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """Move pair ``p``, which is in contact, through the present piece (time interval of constant command).
 
-    Before the call ``motion`` has each vehicle as if it were alone. After it the two vehicles move as one body, or
-    apart if they separate.
+    Before the call ``motion`` has each vehicle as if it were alone. After the call it has the two vehicles as one body,
+    or apart if they separate.
 
     Args:
         cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
@@ -316,8 +316,8 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     commands. While the closing acceleration is between b- (``least``) and b+ (``most``), both above 0, the relative
     speed does not grow. A *flight* (the time between two impacts) with gap g and relative speed w has a gap of at most
     ``h = g + w^2 / (2 b-)`` and ends with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with e
-    times this speed, where e is the restitution. This is smaller than before if ``e sqrt(b+ / b-) < 1``. (If one
-    vehicle stands or moves backwards, its brakes hold it, which makes flights shorter and slower.)
+    times this speed, where e is the restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ /
+    b-) < 1``. (If one vehicle stands or moves backwards, its brakes hold it, which makes flights shorter and slower.)
 
     Args:
         cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
@@ -358,7 +358,7 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
     """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
     The new phase covers the accelerations of the old and the new phase if the relative speed then still decreases from
-    impact to impact. Otherwise it covers only its own accelerations.
+    impact to impact. Otherwise the new phase covers only its own accelerations.
 
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.

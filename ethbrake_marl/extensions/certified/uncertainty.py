@@ -256,8 +256,8 @@ def _of(quantity: str, place: int) -> str:
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
     """Return the worlds with each uncertain number at a given position in its interval.
 
-    Without a V2X channel, an uncertain latency also changes when a message arrives. With a channel, it changes only
-    when the vehicle reacts. Friction limits the capacities of all vehicles together.
+    Without a V2X channel, an uncertain latency also changes when a message arrives. With a channel, an uncertain
+    latency changes only when the vehicle reacts. Friction limits the capacities of all vehicles together.
 
     Args:
         worlds: the reported worlds, [n].

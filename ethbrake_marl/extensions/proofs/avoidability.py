@@ -169,7 +169,7 @@ def leader_at_onset(
     then.
 
     The leader brakes by then. Until then the gap is a concave function of time: if it is not negative at ``start``, it
-    never was.
+    was not negative before.
 
     Args:
         gap: gap now, m.

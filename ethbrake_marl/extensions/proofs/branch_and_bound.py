@@ -1,9 +1,9 @@
 """Find the smallest harm over all first contacts with one neighbour, by branch and bound.
 
-A first contact has a time and a closing speed. Its harm is the squared closing speed plus the harm that must follow
-(``obstacle.after``). A *cell* is a range of times and a range of closing speeds. The search halves cells until the
-smallest bound of any cell is close to the smallest harm found so far. docs/internals/proofs/lower-bound.md has the
-proof.
+A first contact has a time and a closing speed. The harm of a first contact is its squared closing speed plus the harm
+that must follow (``obstacle.after``). A *cell* is a range of times and a range of closing speeds. The search halves
+cells until the smallest bound of any cell is close to the smallest harm found so far.
+docs/internals/proofs/lower-bound.md has the proof.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Compute the smallest possible closing speed of a pair's first contact, whatever all vehicles do.
 
-The bound compares with two extreme motions. The leader (front vehicle) goes as far ahead as it can: it drives fully if
-it is controlled, and brakes fully otherwise. The follower brakes fully, so it stays as far behind as it can. If the
-extreme motions lead to contact, every other motion of the pair leads to contact at the same time or earlier.
-docs/internals/proofs/team-bound.md has the proof.
+The bound compares every motion of the pair with two extreme motions. The leader (front vehicle) goes as far ahead as it
+can: it drives fully if it is controlled, and brakes fully otherwise. The follower brakes fully, so it stays as far
+behind as it can. If the extreme motions lead to contact, every other motion of the pair leads to contact at the same
+time or earlier. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations

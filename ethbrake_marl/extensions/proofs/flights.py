@@ -105,7 +105,7 @@ def lead(
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
     """Return whether giving up acceleration to make a later bounce larger never pays.
 
-    If this is true, ``reach`` may be used to bound the speed that the vehicle gains in any flight.
+    If the result is True, ``reach`` limits the speed that the vehicle can gain in any flight.
 
     Args:
         share: partner's share of the mass of both vehicles, 0 to 1.
@@ -130,9 +130,9 @@ def largest_lead(
 ) -> float:  # fmt: skip
     """Return an upper bound (m/s) on how much faster the controlled vehicle is than the centre of mass of a pair.
 
-    The pair is the controlled vehicle and the neighbour of its first contact. The centre of mass moves as under the
-    best command, given from the first contact on. In the *window*, the rest of the decision step, the earlier command
-    still applies instead, which costs the speed ``lost``.
+    The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
+    computed for the best command from the first contact on. In the *window* (the rest of the decision step) the earlier
+    command still applies instead, which costs the speed ``lost``.
 
     A *flight* is a time in which the pair is apart. The bound is the maximum over three cases: the last flight before
     the contact with the other neighbour began with the first impact, within the window, or after the window.

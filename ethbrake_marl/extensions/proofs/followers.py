@@ -6,8 +6,8 @@ controlled vehicle is faster or slower than this centre of mass only until it re
 ``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
 
 The functions bound all first contacts between the times ``early`` and ``late`` at once, starting from the state at
-``early``. From ``late`` to ``end`` the command of the earlier decision still applies. It differs from the extreme
-command by at least ``lack`` (m/s2).
+``early``. From ``late`` to ``end`` the command of the earlier decision still applies. This command differs from the
+extreme command by at least ``lack`` (m/s2).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def least_closing(
 ) -> float:  # fmt: skip
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The first neighbour is the one that it had contact with before. Take the closing speed of the second neighbour
+    The controlled vehicle had contact with its first neighbour before. Take the closing speed of the second neighbour
     relative to the centre of mass of the controlled vehicle and its first neighbour. The result is this speed, minus
     the largest difference between the controlled vehicle and the centre of mass (``largest_lead``). In the *window* the
     command of the earlier decision still applies, which costs the speed ``lost``. Times count from the first contact,
@@ -233,8 +233,8 @@ def after_front(
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
     """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
 
-    Only the brakes of the front vehicle slow it down. The result is 0 if the front vehicle already stands at the
-    obstacle, because the push is then one impact of both vehicles and the obstacle.
+    After the push only its own brakes slow the front vehicle. The result is 0 if the front vehicle already stands at
+    the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

@@ -1,9 +1,9 @@
 """Find the smallest harm over all first contacts with a rear vehicle that may act freely.
 
-The rear vehicle is at least as far ahead and at least as fast as under its own full braking. Its *lead* is the distance
-(m) by which it is farther ahead than under full braking. A first contact has a time, a lead and a closing speed; a
-*cell* is a range of each. The search halves cells until the smallest bound of any cell is close to the smallest harm
-found so far. docs/internals/proofs/team-bound.md has the proof.
+The rear vehicle is at least as far ahead and at least as fast as under its own full braking. The *lead* of the rear
+vehicle is the distance (m) by which it is farther ahead than under full braking. A first contact has a time, a lead and
+a closing speed; a *cell* is a range of each. The search halves cells until the smallest bound of any cell is close to
+the smallest harm found so far. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ def after_behind(
 ) -> float:  # fmt: skip
     """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The bound starts from one state at ``early``. After any of these contacts, the controlled vehicle is at every later
-    time at least as far ahead and at least as fast as from this state.
+    The bound starts from one state at ``early``. After each of these contacts, the controlled vehicle is always at
+    least as far ahead and at least as fast as it would be from this state.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

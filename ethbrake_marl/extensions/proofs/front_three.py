@@ -67,8 +67,8 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
     """Return whether the rear vehicle may first reach the controlled one after ``stand``, as a code.
 
-    0: it cannot. 1: it can, but the harm is then at least the harm of some first contact with the front vehicle. 2: it
-    can, and nothing is proven about the harm.
+    Code 0: no. Code 1: yes, but the harm is then at least the harm of some first contact with the front vehicle. Code
+    2: yes, and nothing is proven about the harm.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

@@ -63,7 +63,7 @@ _PARTS = 8  # number of parts into which the times of soft meetings are divided
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
 
-    Both results are those of full drive by the controlled vehicle. The time is infinite if full drive avoids contact.
+    The controlled vehicle reaches both values by full drive. The time is infinite if full drive avoids contact.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -275,9 +275,9 @@ def rear_first(
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
-    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. If it brakes
-    harder than the controlled vehicle, by b (m/s2), it was faster by at least ``b t`` at a time t before the contact.
-    This holds only from the rear vehicle's onset on.
+    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. If the rear
+    vehicle brakes harder than the controlled one, by b (m/s2), it was faster than the controlled one by at least ``b
+    t`` at every time t before the contact. This is true only after the rear vehicle's onset.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -302,8 +302,7 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) at which the rear one
-    rests.
+    """Return when (s) all harm of the combined bound has happened, and when (s) the rear vehicle comes to rest.
 
     The rear vehicle comes to rest at the second time if it brakes fully and no other vehicle pushes it.
 
@@ -409,9 +408,11 @@ def lower_bound(
     Args:
         worlds: the worlds now, [n].
         vehicle: index of the controlled vehicle, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, further impacts of a pair that already had one count as 0.
+        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts, even if it came
+            before now.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: full_brake.
+        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
+            brake fully.
         time_step_s: time between two decisions, s. The bound is then larger, but holds only for commands that change at
             decisions: the first decision when the vehicle may act, then one every ``time_step_s``, as for every agent.
             The computation takes ten times as long. None: commands may change at any time.

@@ -1,8 +1,8 @@
 """Bound the harm that must follow a first contact if an obstacle is ahead of the leader.
 
-``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. It limits how far ahead the leader can be
-at any time. Positions count from the controlled vehicle's position at its onset. Masses are in units of the controlled
-vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. This speed limits how far ahead the
+leader can be at any time. Positions count from the controlled vehicle's position at its onset. Masses are in units of
+the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations

@@ -389,8 +389,8 @@ def at_onset_of(
 ) -> tuple[Worlds, Floats, Floats, Bools]:
     """Simulate worlds until the first of ``vehicles`` may act.
 
-    Returns the worlds at that moment, that time ([n] s), the harm so far ([n] m2/s2), and a mask of pairs, [n, P]. The
-    mask is True for pairs whose next impact counts and whose vehicles move forward.
+    Returns the worlds at that moment, the time of that moment ([n] s), the harm so far ([n] m2/s2), and a mask of
+    pairs, [n, P]. The mask is True for pairs whose next impact counts and whose vehicles move forward.
 
     Args:
         where: name of the caller, for error messages.
@@ -447,9 +447,9 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
     r`` if brakes build up at rate r). So all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
 
     A segment of motion rounds each speed twice and each gap five times. A round of impacts rounds each speed by up to 8
-    eps of the largest speed. Either of them changes D by at most 8 eps S. These errors add up and do not multiply,
-    because the proofs compare a motion with itself. ``BOUND_EPS`` covers 500 segments and rounds: an episode of 8 s has
-    80 steps, and the bound's own arithmetic is a few hundred roundings.
+    eps of the largest speed. Each segment and each round changes D by at most 8 eps S (eps = 2^-52). These errors add
+    up and do not multiply, because the proofs compare a motion with itself. ``BOUND_EPS`` covers 500 segments and
+    rounds: an episode of 8 s has 80 steps, and the bound's own arithmetic is a few hundred roundings.
 
     With several controlled vehicles (a team), the largest speed is a speed limit if any of them may drive, and the
     largest closing acceleration uses the strongest drive.

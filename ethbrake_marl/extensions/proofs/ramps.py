@@ -208,9 +208,9 @@ def meeting(
     speed.
 
     The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of ``w + (gap -
-    slack) / t`` until the contact, with t counted from ``since``. It is a lower bound for other motions of the pair
-    too: those whose gap is ``slack`` smaller at ``since``, whose closing speed exceeds the one here by an amount that
-    never shrinks.
+    slack) / t`` until the contact, with t counted from ``since``. It is also a lower bound on the closing speed of
+    other motions of the pair. The gap of such a motion may be smaller by ``slack`` at ``since``. Its closing speed must
+    exceed the closing speed here by an amount that never decreases.
 
     Args:
         gap: gap at ``since``, m.

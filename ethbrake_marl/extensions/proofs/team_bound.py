@@ -141,9 +141,11 @@ def team_bound(
     Args:
         worlds: the worlds now, [n].
         vehicles: indices of the controlled vehicles, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, further impacts of a pair that already had one count as 0.
+        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts, even if it came
+            before now.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: full_brake.
+        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
+            brake fully.
         time_step_s: time between two decisions, s. The bound then holds only for commands that change at decisions: the
             first decision when the first of the vehicles may act, then one every ``time_step_s``. The bound is larger
             if Vehicle 2 is the first to act. None: commands may change at any time.
