@@ -27,13 +27,12 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def spring_apart(
-    cell: Cell, path: Path, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
+    cell: Cell, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
     """Set speed and distance, up to the end of the piece, of both vehicles of a pair that separates after an impact.
 
     Args:
         cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
-        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).

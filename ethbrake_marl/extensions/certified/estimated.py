@@ -91,20 +91,20 @@ class Told(NamedTuple):
         place = _places_of(worlds, vehicle)
         hit = np.zeros((n, N - 1), np.bool_)
         at_s = np.repeat(worlds.time_s[:, np.newaxis], N, axis=1)
-        told = cls(
+        received = cls(
             known, pieces, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
             worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
         )  # fmt: skip
         if (periodic := Messages.of(worlds).periodic).any():
-            told._hear_messages(worlds, vehicle, periodic)
+            received._hear_messages(worlds, vehicle, periodic)
         pieces &= known[..., np.newaxis]
         known &= pieces[..., PLACE] & pieces[..., SPEED]
         for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
             if 0 <= pair < N - 1:
                 hit[:, pair] = worlds.pair_hit[:, pair] & known[:, other]
         unheard = ~pieces[:, 0, PLACE]
-        told.obstacle_m[unheard], told.obstacle_hit[unheard] = np.inf, False
-        return told
+        received.obstacle_m[unheard], received.obstacle_hit[unheard] = np.inf, False
+        return received
 
     def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
         """Replace the present state of other vehicles in place by their newest message, except for vehicles in sight.
@@ -236,13 +236,13 @@ class Ranges:
         worlds.refuse_build_up(":estimated")
         vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
         known, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
-        given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
-                 "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
+        reported = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
+                    "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
         some, pieces = known.pieces.any(axis=2), known.pieces
         has = {"mass_t": pieces[..., MASS], "speed_limit_mps": some}
         of = {
             key: np.where(has.get(key, pieces[..., BRAKING_CAPACITY]), values, self.at(share, key))
-            for key, values in given.items()
+            for key, values in reported.items()
         }
         at_s = np.where(known.known, known.at_s, 0.0)
         own_part = np.where(pieces[..., LATENCY], v.own_latency_s, self.at(share, "latency_s"))

@@ -185,7 +185,7 @@ class EstimatedShield:
         due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
         due &= True if only is None else only
         if due.any():
-            estimated = self._estimate(worlds, odometer.way_m, None)
+            estimated = self._ranges.estimate(worlds, odometer.way_m)
             self._begin_anew(worlds, estimated, odometer.way_m, due)
             proposer = None if proposer is None else proposer._replace(worlds=estimated)
             self.decision = decision = shield.decide(proposed, only=due, proposer=proposer)
@@ -254,26 +254,26 @@ class EstimatedShield:
                 expected = worlds_at(estimated, running.states[rows * running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
                 foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
-            parts.append(self._estimate(worlds, way_m, share, foretold))
+            parts.append(self._ranges.estimate(worlds, way_m, share, foretold))
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
-    def _keeps(self, told: Told, time_s: Floats) -> Bools:
+    def _keeps(self, received: Told, time_s: Floats) -> Bools:
         """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
 
-        These vehicles are unknown, or have sent no message since their last predicted impact or contact. ``told`` is
-        the received information, ``time_s`` [n] the present time.
+        These vehicles are unknown, or have sent no message since their last predicted impact or contact. ``received``
+        is the received information, ``time_s`` [n] the present time.
         """
         running = self.shield.memory.running
         if running is None:
-            return np.zeros(told.known.shape, np.bool_)
-        n, N = told.known.shape
+            return np.zeros(received.known.shape, np.bool_)
+        n, N = received.known.shape
         whole = running.problem.mass.shape[1]  # number of vehicles in the columns, counting an obstacle ahead
         gaps = running.states.reshape(n, running.members, -1)[:, :, whole : 2 * whole - 1]
         touching: Bools = np.any(gaps == 0.0, axis=1)
         pressed = np.zeros((n, whole), np.bool_)
         pressed[:, :-1], pressed[:, 1:] = touching, pressed[:, 1:] | touching
-        since = (told.at_s < self._impact_s) | (pressed[:, whole - N :] & (told.at_s < time_s[:, np.newaxis]))
-        keeps: Bools = ~told.known | ((self._heard[:, :N] == 2.0) & since)
+        since = (received.at_s < self._impact_s) | (pressed[:, whole - N :] & (received.at_s < time_s[:, np.newaxis]))
+        keeps: Bools = ~received.known | ((self._heard[:, :N] == 2.0) & since)
         keeps[:, self.vehicle] = False
         return keeps
 
@@ -317,12 +317,3 @@ class EstimatedShield:
         uncertain = self._ranges.uncertain
         shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
         return [dict(zip(uncertain, each, strict=True)) for each in shares]
-
-    def _estimate(
-        self,
-        worlds: Worlds,
-        way_m: Floats,
-        share: dict[tuple[str, int], float] | None,
-        foretold: tuple[Worlds, Bools] | None = None,
-    ) -> Worlds:
-        return self._ranges.estimate(worlds, way_m, share, foretold)

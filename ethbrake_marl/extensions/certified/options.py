@@ -159,8 +159,7 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
     """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
-        what = f"needs an uncertainty, for instance {UNCERTAINTY_EXAMPLE}"
-        if uncertainty is not None:
-            what = "takes no uncertainty; must be mode robust"
+        needed = f"needs an uncertainty, for instance {UNCERTAINTY_EXAMPLE}"
+        what = needed if uncertainty is None else "takes no uncertainty; must be mode robust"
         raise InvalidInput(f"{where}: mode {mode} {what}")
     return uncertainty

@@ -258,7 +258,7 @@ def strike(
     if most < 0.0 or -returns * low(speed) + max(most, 0.0) * high(left) < 0.0:
         jump = speed * (1.0 + bounces)
         jump[-1] = abs(jump[-1]) + (bounces - returns) * BOUND.PLASTIC_SPEED_MPS
-        spring_apart(cell, path, motion, p, how, jump, left, after, way)
+        spring_apart(cell, motion, p, how, jump, left, after, way)
     else:
         most_apart, touch = bounces * high(speed), after.touch[p]  # largest opening speed after the impact
         least, hardest = pressing_together(motion, p)

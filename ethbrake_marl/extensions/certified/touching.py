@@ -176,7 +176,7 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     slowest = min(low(path.forms[front]), low(motion.onward[front])) - dip_of(cell, vague, length)
     bounce(cell, touch, p, least, most, length, vague)
     creep(cell, touch, p, slowest, weakest, hardest, length)
-    settle(touch, cell.restitution, length)
+    settle(touch, cell.restitution)
     motion.rest[front], motion.vague[front] = MOVES, vague
     if cell.moving:
         hold(path.forms[front], front, length, motion)
@@ -382,7 +382,7 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 
 
 @compiled(apart=True)
-def settle(touch: Floats, e: float, length: float) -> None:
+def settle(touch: Floats, e: float) -> None:
     """Reset the state of a contact if the pair certainly moves as one body by the end of the present piece.
 
     Let the closing acceleration lie between ``b-`` and ``b+``, and let e be the restitution. A *flight* (the time
@@ -394,7 +394,6 @@ def settle(touch: Floats, e: float, length: float) -> None:
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
         e: coefficient of restitution.
-        length: length of the piece (time interval of constant command), s.
 
     """
     if touch[SOFTEST] == math.inf or touch[CREEP] > 0.0:

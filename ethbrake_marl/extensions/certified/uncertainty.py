@@ -189,8 +189,10 @@ class Uncertainty:
                     f"uncertainty: {interval}: {name} is not known in every world; declare it in the scenario"
                 )
             if interval.place is not None and interval.place >= every.shape[1]:
-                kind = "pairs" if name == "gaps_m" else "vehicles"
-                raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} {kind}")
+                raise InvalidInput(
+                    f"uncertainty: {interval}: the line has only {every.shape[1]}"
+                    f" {'pairs' if name == 'gaps_m' else 'vehicles'}"
+                )
             for place in range(every.shape[1]) if interval.place is None else (interval.place,):
                 values = every[:, place]
                 half = interval.half_width * values if interval.relative else np.full(worlds.n, interval.half_width)
