@@ -189,15 +189,16 @@ def cut(x: Floats, least: float, most: float) -> Floats:
 
 MOVES, MAY_STOP, STANDS = 0, 1, 2  # state of a vehicle in a piece
 
-FREE, TOUCHES, PARTS = 0, 1, 2  # state of a pair; PARTS: it was in contact when the piece began and opens in it
+FREE, TOUCHES, PARTS = 0, 1, 2  # state of a pair; PARTS: in contact at the start of the piece, then separates
 
 ROUNDING = 1e-12  # relative and absolute allowance for rounding in each piece, far above the engine's own rounding
 
 # Columns of Path.touch, the state of a pair in contact.
-# OPENING, CLOSING: largest speed at which the pair opens and closes (m/s). WIDE: its largest gap (m).
-# SOFTEST, HARDEST: least and largest closing acceleration since the commands press it together (m/s2).
-# SINCE: time since then (s). CREEP: largest speed of the rear vehicle in worlds that creep (m/s; 0: no world creeps).
-# SPREAD, REACH: largest difference of speeds (m/s) and largest gap (m) in the present piece.
+# OPENING, CLOSING: largest speed at which the pair opens and closes (m/s). WIDE: largest gap (m).
+# SOFTEST, HARDEST: smallest and largest closing acceleration (m/s2) since the commands press the pair together.
+# SINCE: time since the commands press the pair together (s).
+# CREEP: largest speed of the rear vehicle in worlds that creep (m/s); 0: no world creeps.
+# SPREAD, REACH: largest difference of the two speeds (m/s) and largest gap (m) in the present piece.
 OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE, CREEP, SPREAD, REACH = range(9)
 
 TOUCH_WIDTH = 9
@@ -213,8 +214,7 @@ class Forces(NamedTuple):
     mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
     rise: Floats  # [N, J + 1, W] change of speed in the piece, m/s
     gain: Floats  # [N, J + 1, W] distance in the piece beyond initial speed times length, m
-    # [N, J + 1, 2] largest deviation from the mean (m/s2): column 0 where the acceleration falls, column 1 where it
-    # rises
+    # [N, J + 1, 2] largest deviation from the mean (m/s2); index 0: the acceleration falls, index 1: it rises
     swing: Floats
     build: Bools  # [N] True where the vehicle's command builds up; the other arrays are 0 for all other vehicles
 
@@ -230,8 +230,7 @@ class Cell(NamedTuple):
     gap: Floats  # [P, W] gaps at the start of the first piece, m
     brake: Floats  # [N, W] braking capacities, m/s2
     drive: Floats  # [W] driving capacity of the shielded vehicle, m/s2
-    # [P, 2, W] fraction of an impact's change of relative speed that the front (0) and the rear (1) vehicle take; both
-    # sum to 1
+    # [P, 2, W] share of an impact's change of relative speed for the front (0) and rear (1) vehicle; their sum is 1
     share: Floats
     onset: Floats  # [N, W] time after the first decision at which a vehicle's command takes effect, s
     constant: Floats  # [N] command of each other vehicle, m/s2; NaN: full braking
@@ -252,12 +251,12 @@ class Path(NamedTuple):
     """
 
     forms: Floats  # [N + P + 1, W] affine forms of the speeds (m/s), the gaps (m) and the harm so far (m2/s2)
-    # [P, TOUCH_WIDTH] state of each pair in contact (columns ``OPENING`` to ``REACH``); meaningless for other pairs.
-    # Both speeds of a pair in contact are the speed of its centre of mass, and the gaps to its neighbours are measured
-    # from there.
+    # [P, TOUCH_WIDTH] state of each pair in contact (columns ``OPENING`` to ``REACH``); no meaning for other pairs.
+    # For a pair in contact ``forms`` has the speed of its centre of mass twice; the gaps to its neighbours are measured
+    # from this centre.
     touch: Floats
-    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE (not in contact), TOUCHES (in
-    # contact) or PARTS (it opens in the present piece); last: index of the present piece
+    # [2 P + 1] first P entries: 1 if the pair had an impact, else 0. Next P entries: FREE (not in contact), TOUCHES (in
+    # contact) or PARTS (separates in the present piece). Last entry: index of the present piece
     marks: Ints
 
 
@@ -313,7 +312,7 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
             add(onward, length, pull)
             add(reach, 0.5 * length * length, pull)
         if high(motion.pull[i]) + motion.vague[i] > 0.0:
-            # how much faster than its form a vehicle in contact may be within the piece
+            # largest excess of a vehicle's speed over its affine form within the piece, for a vehicle in contact
             P, most = cell.gap.shape[0], 0.0
             for p in range(max(i - 1, 0), min(i + 1, P)):
                 if path.marks[P + p] == TOUCHES:

@@ -161,7 +161,7 @@ def approach(
         squared[-1] += 2.0 * vague * (max(high(gap), 0.0) + 2.0 * length * opening)
     squared[-1] += NEVER
     there = high(squared) > BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
-    if slack > 0.0:  # at contact
+    if slack > 0.0:  # bounces of neighbouring pairs may change the closing speed at contact
         least = math.sqrt(max(low(squared), 0.0)) - slack
         rough = square_root(cut(squared, 0.0, math.inf))
         rough[-1] += slack

@@ -75,7 +75,7 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 
     """
     least = low(speed)
-    if cell.moving and low(pull) - vague < 0.0 < high(pull) + vague:  # it may drive off again, as in ``hold``
+    if cell.moving and low(pull) - vague < 0.0 < high(pull) + vague:  # the vehicle may drive off again, as in ``hold``
         least -= (high(pull) + vague) * left
         speed[:] = between_shifted(speed, max(-least, 0.0))
     if least < 0.0:

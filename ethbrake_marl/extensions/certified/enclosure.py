@@ -48,7 +48,7 @@ from ethbrake_marl.scenario.schema import Scenario
 # groups of the numbers of a box: N numbers in each group, P in the last group
 BRAKING, DRIVING, LATENCY, MASS, BRAKE_RATE, RELEASE_RATE, SPEED, GAP = range(8)
 
-LONGEST_PIECE_S = 0.25  # longest piece of time before the first decision
+LONGEST_PIECE_S = 0.25  # longest piece before the first decision
 
 
 class Known(NamedTuple):
@@ -128,7 +128,7 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     times, action = pieces(known, onset, earliest, plan)
     first[0] -= earliest
     build = np.zeros(N, np.bool_)
-    for i in range(N):  # another vehicle only brakes or only drives, so only one of its rates matters
+    for i in range(N):  # the other vehicles only brake or only drive, so one of their rates matters
         down, up = low_[BRAKE_RATE * N + i] < math.inf, low_[RELEASE_RATE * N + i] < math.inf
         build[i] = (up and (i == v or known.constant[i] > 0.0)) or (down and not known.constant[i] >= 0.0)
     J, moving = times.shape[0] if build.any() else 0, bool(build.any())
@@ -452,7 +452,7 @@ class Boxes(NamedTuple):
     numbers.
     """
 
-    # [n, Q] least values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
+    # [n, Q] smallest values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
     # vehicle, then the gaps
     low: Floats
     high: Floats  # [n, Q] largest values, in the same order

@@ -55,11 +55,11 @@ class Told(NamedTuple):
 
     known: Bools  # [n, N] True for vehicles with known place and speed, and for the vehicle itself
     pieces: Bools  # [n, N, len(PIECES)] True for each known piece; all False for a vehicle without news
-    at_s: Floats  # [n, N] time of the received state
-    place_m: Floats  # [n, N] position at that time, relative to the receiving vehicle's present position
-    speed_mps: Floats  # [n, N] speed at that time
-    command_mps2: Floats  # [n, N] command in force at that time
-    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position; infinite: none is known
+    at_s: Floats  # [n, N] time of the received state, s
+    place_m: Floats  # [n, N] position at ``at_s`` relative to the receiving vehicle's present position
+    speed_mps: Floats  # [n, N] speed at ``at_s``
+    command_mps2: Floats  # [n, N] command in force at ``at_s``
+    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position; infinite: no known obstacle
     obstacle_hit: Bools  # [n] True if an impact with the obstacle is known
     hit: Bools  # [n, P] True for a pair of the vehicle and a known neighbour that had an impact
 
@@ -149,9 +149,9 @@ class Ranges:
 
     vehicle: int  # index of the estimating vehicle
     others: Mapping[int, Script]  # scripts of the other vehicles, by index; a vehicle without a script brakes fully
-    middle: Mapping[str, Floats]  # median of each quantity, [N] each
-    low: Mapping[str, Floats]  # least value of each quantity, [N] each
-    high: Mapping[str, Floats]  # largest value of each quantity, [N] each
+    middle: Mapping[str, Floats]  # median of each quantity, [N]
+    low: Mapping[str, Floats]  # smallest value of each quantity, [N]
+    high: Mapping[str, Floats]  # largest value of each quantity, [N]
     obstacle_gap_m: float  # gap of vehicle_1 to the obstacle, m; infinite without an obstacle
 
     @classmethod

@@ -93,7 +93,7 @@ class EstimatedShield:
         self.scenario, self.vehicle = scenario, vehicle
         self.robust = None if robust is None else checked_robust(robust, "estimated")
         self.predicted_harm: Floats = np.zeros(0)
-        self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.interventions: Ints = np.zeros(0, np.int64)  # [n] number of interventions so far in the running episodes
         self.decision: Decision | None = None  # last decision
         self._harm_count: HarmCount = harm_count
         self._others = script_agents(scenario, except_for=vehicle) if others is None else others
@@ -304,7 +304,7 @@ class EstimatedShield:
         running = self.shield.memory.running
         assert running is not None
         seen, wrong = seen_columns(Packed.of(estimated)), np.zeros(estimated.n, np.bool_)
-        first = (seen.shape[1] + 4) // 5 - estimated.N  # 1: an obstacle ahead is vehicle 0 of the columns
+        first = (seen.shape[1] + 4) // 5 - estimated.N  # 1 if an obstacle ahead is vehicle 0 of the columns, else 0
         foretold = running.states[:, : seen.shape[1]].reshape(estimated.n, running.members, -1)
         outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
         for i in range(estimated.N):

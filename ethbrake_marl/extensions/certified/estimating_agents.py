@@ -64,8 +64,8 @@ class Estimating(AgentAround):
     def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
         super().__init__(policy, f"{policy.name}:estimated")
         self.scenario, self._shows = scenario, shows
-        self._ranges: dict[int, Ranges] = {}  # by the agent's vehicle
-        Ranges.of(scenario, 0, {})  # refuses a mixture at once
+        self._ranges: dict[int, Ranges] = {}  # ranges by the index of the agent's vehicle
+        Ranges.of(scenario, 0, {})  # raises InvalidInput for a mixture
 
     @property
     def knows(self) -> Knowledge:

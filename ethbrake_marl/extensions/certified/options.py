@@ -105,7 +105,7 @@ class RobustOptions(ShieldOptions):
         ``several`` is True for one shield of all learners together.
         """
         one = one_learner(scenario)
-        if self.estimated:  # the scenario's scripts apply only if it has exactly one learner
+        if self.estimated:  # the scenario's scripts are used only if the scenario has exactly one learner
             self.shield(scenario, one or 0, {} if one is None else None)
         else:
             super().check_in(scenario, several=several)

@@ -140,7 +140,7 @@ def branch(
     other = 1 - p
     final = P == 1 or path.marks[other] == 1
     touches = path.marks[p] == 0 and pressing(motion, p)[1] >= 0.0 and may_only_touch(cell, path, motion, p, how)
-    touches = touches and (P == 1 or may_turn(cell, motion, p, path.marks[2 * P]))  # its first impact is then to come
+    touches = touches and (P == 1 or may_turn(cell, motion, p, path.marks[2 * P]))  # the first impact is still to come
     if final:
         worst = keep_worst(harm, worst, out)
         if not touches:
@@ -417,7 +417,7 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
     return share * high(speed) > slowest and not last
 
 
-MOST_PATHS = 4000  # most paths to follow in one cell
+MOST_PATHS = 4000  # largest number of paths to simulate in one cell
 
 
 @compiled(apart=True)
@@ -453,7 +453,7 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
             for k in range(stack.size[0]):
                 worst = keep_rough(cell, Path(stack.forms[k], stack.touch[k], stack.marks[k]), worst, out)
             return worst
-    return worst if worst >= 0.0 else math.inf  # every world takes some path, so no path at all is an error
+    return worst if worst >= 0.0 else math.inf  # every world is on some path; without a path there is no bound
 
 
 @compiled(apart=True)

@@ -150,7 +150,7 @@ def certify_inside(
 
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
-    bound = np.where(asked & ~other, held.harm, decision.bound)  # an unchanged plan keeps its bound
+    bound = np.where(asked & ~other, held.harm, decision.bound)  # the bound of an unchanged plan does not change
     changed = np.flatnonzero(asked & other)
     bounds = boxes.bound(changed, plan[changed], budget[changed], only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
@@ -162,7 +162,7 @@ def certify_inside(
     plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
     decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
     refused = bad[~decision.intervened[bad]]
-    if refused.size:  # apply the action of the held plan instead
+    if refused.size:  # apply the action of the plan from before the decision
         part, plan = running.take(refused), held.plan[refused]
         action, harm = plan[np.arange(len(plan)), part.steps], held.harm[refused]
         with renumbered(refused):

@@ -43,9 +43,9 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.state import Floats
 
-SHARP = 0.1  # m/s; vehicles of an opening pair move alone once their relative speed is known to this
+SHARP = 0.1  # m/s; the vehicles of an opening pair move alone if their relative speed is this certain
 
-UNEVEN = 3.0  # largest ratio of closing to separating speed of a flight for the bound by flights, with brake build-up
+UNEVEN = 3.0  # largest ratio of closing to separating speed in a flight, for bounds by flights with brake build-up
 
 
 @compiled(apart=True)
@@ -295,7 +295,7 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     touch[REACH] = wide + opening * length
     path.forms[N + p] = between(
         0.0, touch[REACH], width
-    )  # from the relative speed alone; the effect of the commands is added later
+    )  # effect of the relative speed; the effect of the commands is added later
     for side in range(2):
         share = (2.0 * side - 1.0) * high(cell.share[p, side])
         speed = between(min(-share * opening, 0.0) - astray, max(-share * opening, 0.0) + astray, width)

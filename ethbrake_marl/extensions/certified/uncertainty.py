@@ -93,7 +93,7 @@ class Interval:
         return f"{self.quantity}{where}={width}"
 
 
-_Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, place, least and largest value, each [n]
+_Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, index, smallest and largest value [n]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +103,7 @@ class Uncertainty:
     Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
     """
 
-    intervals: tuple[Interval, ...]  # one entry for each uncertain quantity
+    intervals: tuple[Interval, ...]  # intervals of the uncertain quantities
 
     def __post_init__(self) -> None:
         if not isinstance(self.intervals, tuple) or not all(isinstance(each, Interval) for each in self.intervals):

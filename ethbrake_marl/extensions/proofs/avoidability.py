@@ -358,8 +358,8 @@ class Avoidability:
     applies. Both arrays are NaN in worlds where contact is unavoidable.
     """
 
-    # [n] 0: avoidable. 1, early: a pair meets before the controlled vehicle may act. 2, front: even full braking meets
-    # the front vehicle. 3, rear: the rear vehicle meets the largest trajectory
+    # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
+    # full braking leads to contact with the front vehicle. 3, rear: the rear vehicle reaches the largest trajectory
     reason: Ints
     margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
     switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s

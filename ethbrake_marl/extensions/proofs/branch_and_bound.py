@@ -19,15 +19,15 @@ from ethbrake_marl.physics.state import Floats
 
 CELLS = 600  # size of the heap, which limits the number of divisions
 
-# Columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s); for meetings with the
-# rear vehicle also how much further than by full braking it has come (m).
+# Columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s); for contacts with the
+# rear vehicle also the range of its lead over its own full braking (m).
 HARM, EARLY, LATE, SOFT, HARD, NEAR, FAR, HEAP_WIDTH = range(8)
 
-_SPLITS = 64  # largest number of first cells, which decisions divide
+_SPLITS = 64  # largest number of cells at the start of the search, one for each decision step
 
-_PART_S = 0.05  # length of a first cell with brake build-up
+_PART_S = 0.05  # length of a cell at the start of the search with brake build-up, s
 
-_TRIED = 8  # number of meetings evaluated before the search, for a first best value
+_TRIED = 8  # number of first contacts evaluated before the search
 
 
 @compiled(apart=True)
@@ -276,7 +276,7 @@ def least_harm(
         time = first + (last - first) * k / (_TRIED - 1)
         closing = gentlest(kind, at, time)[0]
         best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
-    # put the meetings between both times, with closing speeds up to ``hard``, on the heap: one cell for each step
+    # put the contacts between both times, with closing speeds up to ``hard``, on the heap: one cell for each step
     hard = math.sqrt(best)
     count, begin = 0, first
     while begin < last:

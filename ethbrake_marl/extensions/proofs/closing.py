@@ -15,8 +15,8 @@ from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-# columns of a pair: gap; speed, onset and braking capacity of both vehicles; whether the leader is controlled, and then
-# its driving capacity and speed limit
+# columns of a pair: gap; speed, onset and braking capacity of both vehicles; whether the leader is controlled; driving
+# capacity and speed limit of a controlled leader
 PAIR_GAP, LEADER_V, LEADER_ONSET, LEADER_A, LEADER_FREE, LEADER_U, LEADER_LIMIT = range(7)
 
 FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)

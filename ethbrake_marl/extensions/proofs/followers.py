@@ -20,11 +20,12 @@ from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_drive_then_
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-STRUCK_M = 1e-6  # below this distance a leader counts as in contact with the obstacle
+STRUCK_M = 1e-6  # a leader nearer to the obstacle than this counts as in contact with it
 
-HELD_M = 1e-6  # allowance for rounding in the gap to the leader
+HELD_M = 1e-6  # largest rounding error of the gap to the leader
 
-LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting; the time is divided there to bound both parts
+# times before the latest contact, s; the bound treats the times before and after each of them separately
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 
 @compiled

@@ -29,13 +29,13 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
 
-# Columns of a search: SINCE and POWER are arguments of ``gained``; FLOOR is the front pair's own bound; BEST is the
-# least harm of a meeting so far.
+# Columns of a search: SINCE and POWER are arguments of ``gained``; FLOOR is the bound of the front pair alone; BEST is
+# the smallest harm of a first contact so far.
 SINCE, POWER, FLOOR, BEST, SEARCH = range(5)
 
 SEARCHED = 400  # largest number of divisions
 
-_SHORT_S = 1e-3  # least time to divide by
+_SHORT_S = 1e-3  # smallest time in a denominator
 
 
 @compiled
@@ -92,7 +92,7 @@ def soft_behind(at: Floats, early: float, late: float, near: float, far: float, 
 
     """
     faster = gained(near, late, since, power)
-    # the fastest way of the controlled vehicle to that place is to brake, then to drive
+    # the controlled vehicle arrives at that place with the largest speed if it brakes first and then drives
     brake = braking_to_rear(at, late, far + faster * (late - early))
     closing = follower(at, late)[0] - braked_then_driven(at, brake, late)[1]
     return max(closing + faster, 0.0)

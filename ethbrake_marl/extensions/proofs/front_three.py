@@ -82,7 +82,7 @@ def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: F
         return 0
     _, end, leans = last_meeting(
         at, first, plan, other
-    )  # latest first meeting with the leader if the rear vehicle brakes fully
+    )  # latest first contact with the leader if the rear vehicle brakes fully
     if end <= stand and not leans:
         return 0
     leader_moves = at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_L] > at[LINE.A_L] * stand

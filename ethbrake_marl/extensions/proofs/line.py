@@ -31,7 +31,7 @@ class _Line(NamedTuple):
     FRONT_SHARE: int = 11  # m_l / (m_l + m_f), with the masses m
     REAR_SHARE: int = 12  # m_r / (m_f + m_r), with the masses m
     RESTITUTION: int = 13  # coefficient of restitution
-    TIME_STEP: int = 14  # time between decisions (s), the first one now; 0 if commands may change at any time
+    TIME_STEP: int = 14  # time between decisions, s; the first decision is now. 0 if commands may change at any time
     # gap from the leader to an obstacle ahead that it does not reach by itself, m; infinite without an obstacle
     OBSTACLE: int = 15
     # present acceleration of the front vehicle, m/s2 (this column and the next six only with brake build-up)
@@ -43,7 +43,7 @@ class _Line(NamedTuple):
     FORCE_R: int = 21  # present acceleration of the rear vehicle, m/s2
     FALL_R: int = 22  # rate at which the acceleration of the rear vehicle falls, m/s3
     UNTIL: int = 23  # horizon (s); 0 if unknown
-    WALL: int = 24  # OBSTACLE if an impact with it counts and the rear vehicle brakes fully; else 0
+    WALL: int = 24  # OBSTACLE if an impact with the obstacle counts and the rear vehicle brakes fully; else 0
     WIDTH: int = 25  # number of columns
 
 

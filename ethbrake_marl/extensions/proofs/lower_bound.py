@@ -54,9 +54,9 @@ from ethbrake_marl.physics.jit import by_parts, compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 
-_GRAZE_S = 1e-3  # allowance for rounding in the time of a contact without closing speed
+_GRAZE_S = 1e-3  # largest rounding error in the time of a contact at closing speed 0
 
-_PARTS = 8  # number of parts into which the times of soft meetings are divided
+_PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 
 @compiled
@@ -173,7 +173,7 @@ def front_first(
     first = meet_front(at, math.inf, plan, other)
     if (
         first == math.inf and at[LINE.GAP_L] <= TOUCHING_M
-    ):  # it stands in contact with the leader, so both are hit at once
+    ):  # the vehicle stands in contact with the leader, so the rear vehicle hits both at once
         return min(best, rear_bound(at, plan, other)[0])
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return best
@@ -437,7 +437,7 @@ def lower_bound(
         return LowerBound(harm, early, front, rear, combined, None)
     if slow.any():
         check_covered(worlds, vehicle, scripts)
-        verdict, reason = None, np.full(worlds.n, 2)  # assume unavoidable contact: the bound itself finds out
+        verdict, reason = None, np.full(worlds.n, 2)  # assume unavoidable contact; ``bound_ramped`` checks it
     else:
         verdict = avoidability(worlds, vehicle, scripts=scripts)
         reason = verdict.reason
@@ -445,7 +445,7 @@ def lower_bound(
     none = np.zeros(worlds.n, dtype=np.bool_)
     has_front = counts[:, vehicle - 1] if vehicle > 0 else none
     has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
-    struck = at_onset.obstacle_hit & (harm_count == "first")  # a further impact with the obstacle is not counted
+    struck = at_onset.obstacle_hit & (harm_count == "first")  # further impacts with the obstacle do not count
     unavoidable = has_front & has_rear & (reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
     arguments: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)

@@ -24,15 +24,15 @@ from ethbrake_marl.physics.state import Floats
 
 CELL = 1e-3  # relative and absolute (m2/s2) precision of a minimum
 
-ZONE_M = 1.0  # distance from the obstacle within which a vehicle that was stopped there is assumed to stay
+ZONE_M = 1.0  # a vehicle that was stopped at the obstacle is assumed to stay within this distance of it
 
-_BEYOND_PARTS, _BEYOND_FINEST = 4, 4  # number of parts of the range of ``beyond``, and of a part that is divided again
+_BEYOND_PARTS, _BEYOND_FINEST = 4, 4  # number of parts of the range of ``beyond``, and largest number of their parts
 
-_MOST = 400.0  # m2/s2; harm at the rear pair is cut to this
+_MOST = 400.0  # m2/s2; a larger bound of the rear pair's harm is cut to this value
 
-_FLIGHTS = 6  # number of lengths of a last drive that are tried
+_FLIGHTS = 6  # number of lengths that are tried for the last drive
 
-_SHORTEST_S = 1e-3  # shortest time or last drive to divide by
+_SHORTEST_S = 1e-3  # smallest time in a denominator
 
 
 @compiled
@@ -175,7 +175,7 @@ def stopped_there(
     soonest = early + 2.0 * most / max(top + fastest, _SHORTEST_S)
     wait = max(until - max(soonest, struck, late), 0.0)
     back = bounce * max((1.0 - at[LINE.FRONT_SHARE]) * (1.0 + bounce), 1.0)
-    # what it arrives with falls with the time, until it can stop on the way
+    # the speed of its arrival falls with the time, until it can stop on the way
     time, stand, room = max(struck, late) - late, speed / brakes, wall - place
     flight = last_drive(room, speed, brakes, drive, time)
     if time < stand and flight <= time and room > (speed - 0.5 * brakes * time) * time:
@@ -215,7 +215,7 @@ def behind_leader(
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
     rest = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
-    # time by which the rear vehicle must have arrived: at the leader, or at the obstacle
+    # latest time at which the rear vehicle arrives at the leader, or at the obstacle
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
     v, struck = leader_pushed(at, early, beyond)
@@ -230,7 +230,7 @@ def behind_leader(
     time, stand = until - late, low / brakes
     if not _SHORTEST_S < time < math.inf:
         return 0.0
-    # largest speed of the controlled vehicle then: it was never further back than by braking, or where it was stopped
+    # largest speed of the controlled vehicle at that time, from the smallest position that it had before
     v_r, goal = follower(at, until)
     goal -= at[LINE.GAP_R]
     longest = last_drive(goal - least, low, brakes, drive, time)
@@ -255,7 +255,7 @@ def behind_leader(
         fastest = min(fastest, (goal - behind) / flight + 0.5 * drive * flight)
     closing = max(v_r - fastest, 0.0)
     if not at_wall:
-        # the drive that makes this meeting so soft brings all three nearer to the obstacle
+        # the drive that makes this contact so soft brings all three vehicles nearer to the obstacle
         fill_braking(plan, 0.0, brakes)
         fill_braking(other, max(onset - late, 0.0), at[LINE.A_R])
         v_r, way_r = follower(at, late)
@@ -303,7 +303,7 @@ def after_at_obstacle(
     place = ((front + 1.0) * place + rear * (way_r - at[LINE.GAP_R])) / (front + 1.0 + rear)
     speed = ((front + 1.0) * speed + rear * v_r) / (front + 1.0 + rear)
     least = least_beyond(at, early, late, place, speed, least, plan, other)
-    # the harder the leader hits the obstacle, the softer the meeting with the rear vehicle can be
+    # the harder the leader hits the obstacle, the softer the contact with the rear vehicle can be
     first = min(max(behind_leader(at, early, late, soft, hard, least, place, speed, plan, other), follows), _MOST)
     step, begin, known = (first - follows) / _BEYOND_PARTS, least, least + first
     size, proven = step, known

@@ -91,7 +91,7 @@ def _combined_bound_of_line(
     rows, three = rows[unavoidable], three.take(np.flatnonzero(unavoidable))
     steps = np.where(onset[rows, _MIDDLE] <= 0.0, 0.0 if time_step_s is None else time_step_s, 0.0)
     since, power = np.zeros(len(rows)), np.full(len(rows), np.inf)
-    if now.N == 3:  # nobody pushes the last vehicle
+    if now.N == 3:  # no vehicle pushes the last vehicle
         full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
         since, power = onset[rows, _REAR], full if _REAR in chosen else np.zeros(len(rows))
     bounds, out = np.zeros(now.n), np.empty(len(rows))
