@@ -1,6 +1,6 @@
 """Forecast of contacts: time and closing speed of the next impact of each pair under constant commands.
 
-The forecast uses the physics of ``advance`` on a table that the caller has filled. It does not return the motion.
+The forecast uses the physics of ``advance`` on a table that the caller has filled, and does not return the motion.
 """
 
 from __future__ import annotations

@@ -19,8 +19,8 @@ ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time,
         and places, speeds and commands in force of all vehicles
 
 If the scenario says what a message contains (``v2x: tells``), the link of Vehicle 1 to itself is marked, and each
-sample also contains the commands chosen at the last decision (*intents*, N columns). Three more groups of columns then
-lie between links and ring, also without periodic messages:
+sample also contains the commands chosen at the last decision (*intents*, N columns). Then three more groups of columns
+exist between links and ring, even in a world without periodic messages:
 
 contents    N * CONTENTS: 1 if messages of this vehicle contain this piece of information
 intents     N, present intent of each vehicle (m/s2)
