@@ -399,7 +399,7 @@ def test_set_options__gives_each_world_its_own_start_once_and_fails_one_reset_on
     env.reset()
     assert env.engine.worlds.gaps_m[:, 0].tolist() == [3.0, 3.0]
     env.set_options([{"listed_world": {"seed": 7, "number": 40}}] * 4)
-    with pytest.warns(UserWarning, match="unknown option listed_world, ignored; known: initial_state"):
+    with pytest.warns(UserWarning, match="unknown keys listed_world, which are ignored; known keys: initial_state"):
         env.reset()
 
 

@@ -211,8 +211,8 @@ KNOWN = ("own sensors", "messages", "messages + true model", "true state", "not 
 def check_marked(text: str, share: float) -> None:
     assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
     assert "† messages |" not in text and "† own sensors" not in text
-    assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
-    assert "† ppo+episode, e_v2x_bm:pairwise: sees the line as it is" in text
+    assert f"In {100 * share:.1f} % of these worlds the V2X channel hides something" in text
+    assert "† ppo+episode, e_v2x_bm:pairwise: reads hidden values nevertheless" in text
     assert "These agents do not state what they know: mine." in text
 
 

@@ -582,7 +582,7 @@ def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
 ) -> None:
     notes: list[str] = []
     damage(newest(run) / file)
-    told = f"a damaged checkpoint was left aside: {newest(run)}"
+    told = f"deleted a damaged checkpoint: {newest(run)}"
     resume(run, measure=measure, on_progress=lambda p: notes.append(p.note) if p.note else None)
     assert len(notes) == 1 and notes[0].startswith(told)
     assert_same(run, whole("ppo")[0])
@@ -601,7 +601,9 @@ def test_resume__with_other_versions_is_refused_unless_it_is_asked_for(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(train_module, "installed_versions", lambda: {"torch": "99.0"})
-    with pytest.raises(InvalidInput, match=r"was trained with ethbrake-marl .*: the numbers would differ"):
+    with pytest.raises(
+        InvalidInput, match=r"this training began with ethbrake-marl .*, which may compute other numbers"
+    ):
         resume(run)
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
     assert resume(run, other_versions=True).status == "finished"
@@ -625,7 +627,7 @@ def test_resume__an_edited_configuration_is_another_training(
     config = json.loads((run / "config.json").read_text())
     edited = {part: config[part] | change for part, change in changes.items()}
     (run / "config.json").write_text(json.dumps(config | edited))
-    told = r"config.json: was changed after the checkpoint step_\d+ of this training"
+    told = r"config.json: this file was changed after the checkpoint step_\d+ was written"
     with nullcontext() if same else pytest.raises(InvalidInput, match=told):
         assert resume(run, measure=measure).status == "finished"
 
@@ -636,7 +638,7 @@ def test_resume__one_process_at_a_time(run: Path, monkeypatch: pytest.MonkeyPatc
     def second(step: int, answer: Answer) -> Answer:
         if step == 5:
             asked.append(step)
-            with pytest.raises(InvalidInput, match="another process is training here"):
+            with pytest.raises(InvalidInput, match="another process is training in this folder"):
                 resume(run, measure=measure)
         return answer
 
@@ -652,13 +654,13 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
     place = newest(run)
     if change == "lost":  # as of another version
         (place / NUMBERS).unlink()
-        told = rf"{place}: has no numbers.json, so another version of this package wrote it"
+        told = rf"{place}: the checkpoint has no numbers.json, so another version of this package wrote it"
     elif change == "arrays":
         monkeypatch.setattr(safetensors.numpy, "save_file", lambda arrays, file: file.write_bytes(b"forged"))
         state = read_checkpoint(place)
         shutil.rmtree(place)
         write_checkpoint(place, state)
-        told = rf"{place / ARRAYS}: .*; delete the checkpoint to resume from the one before"
+        told = rf"{place / ARRAYS}: .*; delete this checkpoint to resume from an earlier one"
     elif change != "forged":
         state = read_checkpoint(place)
         shutil.rmtree(place)
@@ -669,7 +671,7 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         shutil.rmtree(place)
         arrays = state.arrays | {"policy.log_std": np.zeros(2, np.float32)}
         write_checkpoint(place, TrainingState(state.numbers, arrays))
-        told = rf"the checkpoint of step {state.steps} is not of this training: .*log_std.*; delete it to resume from"
+        told = rf"the checkpoint of step {state.steps} does not belong to this training: .*log_std.*; delete this"
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
     with pytest.raises(EthBrakeError, match=told) as error:
         resume(run, measure=measure)

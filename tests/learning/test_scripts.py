@@ -121,7 +121,7 @@ def test_single_file__advantages_by_hand(script: str) -> None:
         (["--seed", "-1"], "seed"),
         (["--output", "there"], "there: is there already"),
         (["--harm-count", "all"], "harm_count"),
-        (["--scenario", "cooperation-0-sensors"], "nobody learns"),
+        (["--scenario", "cooperation-0-sensors"], "has no learner"),
     ],
 )
 def test_single_file__refuses_what_cannot_be_before_it_trains(

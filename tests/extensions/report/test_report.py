@@ -261,8 +261,8 @@ def test_report__says_below_its_first_sentence_what_must_not_be_overlooked(
     (text,) = re.findall(r'<ul class="remarks">(.*?)</ul>', html, re.DOTALL)
     assert re.findall(r"<li>(.*?)</li>", text) == [
         "The training was interrupted.",
-        "At the horizon (1 s) something still moved; harm after it is not counted. Worlds, of 60: full_brake"
-        " 60, coast 60.",
+        "In some of the 60 worlds a vehicle still moved at the horizon (1 s): full_brake 60, coast 60. Harm after the"
+        " horizon is not counted.",
         "‡ Harm does not count this: full_brake still moves at the horizon in 100.0 % of the worlds; coast still moves"
         " at the horizon in 100.0 % of the worlds (docs/train.md).",
     ]
