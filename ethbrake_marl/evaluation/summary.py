@@ -161,7 +161,7 @@ class SummaryTable(list[SummaryRow]):
             return ""
         ours = (
             f"Ours: {self[0].parameters.line}. Harms are means per world in m²/s². The 95 % interval of a value is in"
-            " brackets or below the value. Decreases are relative to full braking."
+            " brackets or below the value. A decrease is relative to full braking."
         )
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 

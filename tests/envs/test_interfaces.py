@@ -91,7 +91,7 @@ def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str
             costs.append(info["cost"])
             assert cost == info["cost"]
         assert sum(costs) == near(info[total] - before) and info["reward_harm"] == -info["cost"]
-    with pytest.raises(InvalidInput, match="reports no cost"):
+    with pytest.raises(InvalidInput, match="must be an EthBrakeEnv, or a wrapper"):
         eb.CostEnv(eb.make_sb3_vec_env("paper-random", n_envs=2))  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match="already contains a CostEnv"):
         eb.CostEnv(gymnasium.wrappers.ClipAction(environment))

@@ -121,7 +121,7 @@ def test_reset_mask__is_refused_with_a_seed_or_a_generator_that_no_row_has_start
     with pytest.raises(InvalidInput, match="reset: reset_mask omits some rows, but seed requires a reset of all rows;"):
         env.reset(seed=3, options=some)
     env.np_random = np.random.default_rng(3)
-    with pytest.raises(InvalidInput, match="reset: np_random with a reset_mask that leaves rows out"):
+    with pytest.raises(InvalidInput, match="reset: reset_mask omits some rows, but np_random requires a reset of all rows"):
         env.reset(options=some)
     env.reset()
     assert env.reset(options=some)[1]["world"].tolist() == [0, 4, 5, 0]
@@ -140,7 +140,7 @@ def test_disabled_autoreset__wants_its_ended_rows_reset() -> None:
     with pytest.raises(InvalidInput, match=r"step: the episodes in rows 0, 1, 2 have ended; .*reset_mask"):
         env.step(np.zeros((3, 1), np.float32))
     env.reset(options={"reset_mask": np.array([True, False, True])})
-    with pytest.raises(InvalidInput, match="step: episodes are over in rows 1;"):
+    with pytest.raises(InvalidInput, match="step: the episodes in rows 1 have ended;"):
         env.step(np.zeros((3, 1), np.float32))
     env.reset(options={"reset_mask": np.array([False, True, False])})
     assert not env.step(np.zeros((3, 1), np.float32))[2].any()

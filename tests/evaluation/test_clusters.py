@@ -109,7 +109,7 @@ def test_intervals__of_one_cluster_are_unknown() -> None:
     assert paired_difference(x, x[::-1], one).interval is None
     assert relative_decrease(x, x[::-1], one).interval is None
     assert share_of(x > 1.0, one).interval is None
-    with refused("statistics: 2 clusters of 3 values; one for each is needed", InvalidInput):
+    with refused("statistics: clusters has 2 entries for 3 values: must have one per value", InvalidInput):
         mean(x, one[:2])
 
 

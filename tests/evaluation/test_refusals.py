@@ -248,7 +248,7 @@ def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_
 def test_record__is_of_one_world_at_a_positive_time(sample_s: float) -> None:
     with refused("record_episode: world has 3 worlds; pass exactly 1, for instance worlds.take([0])"):
         eb.record_episode(WORLDS, BRAKE["full_brake"], scenario=PAPER)
-    with refused(f"record_episode: sample_s = {sample_s}; must be finite and above 0"):
+    with refused(f"record_episode: sample_s = {sample_s}: must be a finite number of seconds above 0"):
         eb.record_episode(WORLDS.take([0]), BRAKE["full_brake"], scenario=PAPER, sample_s=sample_s)
 
 

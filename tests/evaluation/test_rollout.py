@@ -350,7 +350,7 @@ def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once(agen
 
 def check_beyond(agent: str, scenario: Scenario, beyond: str) -> None:
     with pytest.warns(
-.*, but {scenario.name} differs from it: {beyond}$"
+        Unfamiliar, match=f"{agent.partition('+')[0]}.*, but {scenario.name} differs from it: {beyond}$"
     ) as told:
         evaluate(None, [agent], scenario=scenario, episodes=50, vehicle=None)
     assert len(told) == 1
