@@ -238,9 +238,9 @@ def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> Non
         RunDirectory(run.path).create({})
     Path("thesis").mkdir()
     Path("thesis/chapter-1").touch()
-    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
+    with refused("thesis: already exists and is not the folder of a run; choose another name", AlreadyExists):
         RunDirectory(Path("thesis")).create({}, force=True)
-    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
+    with refused("thesis: already exists and is not the folder of a run; choose another name", AlreadyExists):
         train(TINY_PPO, PAPER, Path("thesis"))
 
 
@@ -358,7 +358,7 @@ def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDire
         "team: this team is for a line of 3 vehicles, but scenario 'cooperation-3-pair' has 4 vehicles; choose a"
     ):
         load_team(team.path, FOUR)
-    with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has nobody to drive"):
+    with refused("team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has no learner"):
         load_team(team.path, PAIR.with_learners([]))
     with refused("team: each of its learners has a policy of its own; name one, for instance team/policy/vehicle_2"):
         load_policy(TEAM.parent)

@@ -705,7 +705,9 @@ def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str
     else:
         del arrays[name]
     write_checkpoint(place, TrainingState(numbers, arrays))
-    with pytest.raises(EthBrakeError, match=rf"is not of this training: .*{told}.*; delete it to resume") as error:
+    with pytest.raises(
+        EthBrakeError, match=rf"does not belong to this training: .*{told}.*; delete this checkpoint to resume"
+    ) as error:
         resume(run, measure=measure)
     assert "\n" not in str(error.value)
 
@@ -721,9 +723,9 @@ def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
         restore = partial(model_state.restore_model, model, algorithm)
         restore(TrainingState(numbers, arrays))
         for forged in ([-1, False], [1.5, False], [1 << 40, True], [0, 1]):
-            with pytest.raises(ValueError, match=r"replay = .*: is no place in its memory"):
+            with pytest.raises(ValueError, match=r"replay = .*: must be .position, full., with a position below 50"):
                 restore(TrainingState(numbers | {"replay": forged}, arrays))
-        with pytest.raises(ValueError, match=r"replay.observations: .* are needed"):
+        with pytest.raises(ValueError, match=r"replay.observations: must be finite numbers"):
             restore(TrainingState(numbers | {"replay": [3, False]}, arrays))
 
 
@@ -731,7 +733,7 @@ def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
 def test_resume__a_policy_that_cannot_be_replaced_is_refused_at_once(run: Path, name: str) -> None:
     shutil.rmtree(run / name)
     (run / name).touch()
-    with pytest.raises(InvalidInput, match=rf"{name}: is not a plain folder; a training deletes in it, or replaces it"):
+    with pytest.raises(InvalidInput, match=rf"{name}: must be a plain folder, not a link or a file"):
         resume(run, measure=measure)
 
 
