@@ -362,7 +362,9 @@ def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDire
         load_team(team.path, PAIR.with_learners([]))
     with refused("team: each of its learners has a policy of its own; name one, for instance team/policy/vehicle_2"):
         load_policy(TEAM.parent)
-    with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has vehicle_1 to drive"):
+    with refused(
+        "team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has learner vehicle_1"
+    ):
         script_agents(PAIR.replace(roles={"vehicle_1": "team@team", "vehicle_2": "team@team", "vehicle_3": "learner"}))
 
 
