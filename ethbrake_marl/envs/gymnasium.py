@@ -87,12 +87,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
 
     - Observation: the features of ``ObservationSpec``, float32 [F].
     - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
-    - End: the episode is *terminated* when all vehicles are at rest and no command would move one of them. It is
-      *truncated* at the horizon.
-    - Infos: see docs/environments.md.
-
-    ``reset(seed=s)`` starts the first world of seed s, and each ``reset()`` without a seed the next world. An initial
-    state can be chosen: ``reset(options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}})``.
+    - End: *terminated* when all vehicles are at rest and no command would move one, *truncated* at the horizon.
+    - Infos and options of ``reset``: docs/environments.md.
 
     Args:
         scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
@@ -106,8 +102,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N], minus the harm that each
             vehicle bears in the step. A list: a reward is an array with the named components (docs/environments.md).
 
-    Raises ``InvalidInput`` unless there is exactly one learner, for an action outside [-1, 1], and for a step without a
-    running episode.
+    Raises ``InvalidInput`` unless there is exactly one learner.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")

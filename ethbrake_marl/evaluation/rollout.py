@@ -59,8 +59,7 @@ def evaluate(
     """Let each agent drive every world once, from the alert to the end of the episode.
 
     The other vehicles follow the scenario's scripts. The outcome in a world does not depend on the other worlds. If the
-    physics fails in a world with one agent (a defect of this package), the world is left out for all agents, and
-    ``left_out`` of the result lists it.
+    physics fails in a world with one agent, the world is left out for all agents (``left_out``).
 
     Args:
         worlds: worlds at the alert, or a sample from ``scenario.sample``; None: draw ``episodes`` worlds from ``seed``.

@@ -115,7 +115,7 @@ def train(
     Ctrl-C stops the training after the current update (status ``interrupted``); a second Ctrl-C raises
     ``KeyboardInterrupt``. In both cases, and after an error, ``policy/`` contains the best policy so far, and
     ``policy-last/`` the last policy with finite weights. ``resume`` continues the training. The same recipe, scenario
-    and seed give exactly the same policy on the same machine. The caller's global random generators do not change.
+    and seed give exactly the same policy on the same machine.
 
     Args:
         recipe: a recipe, its name, or the path of its file.

@@ -509,11 +509,7 @@ def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message)
         ("paper-random", "full_brake", "host: 'str' is no agent: it has no name and no act; make_agent(name) makes"),
         ("paper-random-obstacle", None, "host: scenario 'paper-random-obstacle': has an obstacle ahead (obstacle_gap"),
         ("paper-random-buildup", None, "host: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and"),
-        (
-            PAPER.with_learners([]),
-            None,
-            "host: scenario 'paper-random' has no learner that the agents could drive; scenario.with_learn",
-        ),
+        (PAPER.with_learners([]), None, "host: scenario 'paper-random' has no learner to drive; scenario.with_learn"),
         (PAPER, PAPER, "is no agent"),
     ],
 )
