@@ -96,7 +96,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     The rows of a world end together. Each new episode takes the next world of one stream. At the end of an episode, the
     infos of its rows contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
     steps ``l``, and ``t``, which is always 0), and all infos of the other environments. At other steps the infos
-    contain only those of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on the whole
+    contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on the whole
     environment.
 
     Args:
@@ -167,7 +167,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         """Start an episode in every world, and return the observations, float32 [rows, F].
 
         Use ``seed`` and ``set_options`` before to choose the worlds. Options apply to one reset only. Invalid options
-        raise ``InvalidInput``; they, too, do not apply to the reset after it.
+        raise ``InvalidInput``, and are then forgotten.
         """
         try:
             worlds = self._read_options()
@@ -277,7 +277,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         Args:
             ended: indices of the worlds whose episodes have ended.
             step: results of the last step.
-            infos: one dictionary per row; those of ended episodes are replaced.
+            infos: one dictionary per row; the dictionaries of ended episodes are replaced.
 
         """
         rows, final = self._rows(ended), self._observe(ended)

@@ -178,7 +178,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome with only those of its user measures (``Outcome.metrics``) that ``names`` lists."""
+    """Return the outcome without the user measures (``Outcome.metrics``) that ``names`` does not list."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 

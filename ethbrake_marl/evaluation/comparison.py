@@ -56,7 +56,7 @@ class Comparison:
 
     @property
     def exploits_line(self) -> str:
-        """Sentence that names agents with exploits, and the result in which they have them; empty if there are none."""
+        """Sentence that names agents with exploits, and the result in which they have them; "" without such agents."""
         of_agents: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
@@ -95,8 +95,8 @@ def compare_results(first: Result, second: Result) -> Comparison:
     common = [agent for agent in first.rows if agent in second.rows]
     left_over = [tuple(agent for agent in one.rows if agent not in common) for one in (first, second)]
     if not common:
-        agents = " and ".join(f"{', '.join(names)}" for names in left_over)
-        raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
+        agents = [", ".join(names) for names in left_over]
+        raise InvalidInput(f"{first.path} ({agents[0]}) and {second.path} ({agents[1]}) have no agent in common")
     worlds, because = _worlds_of_both(first, second, common)
     recordings = int(recorded_value(first.about, "recordings") or 0)
     differences = []

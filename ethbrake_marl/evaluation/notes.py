@@ -54,14 +54,14 @@ def _sets_in(rows: Sequence[SummaryRow]) -> list[MeasureSet]:
 
 
 def _left_out(row: SummaryRow) -> str:
-    """Return the note about worlds that were left out for every agent; empty if there are none."""
+    """Return the note about worlds that were left out for all agents; "" without such worlds."""
     if not row.left_out:
         return ""
     return LeftOut.line([str(left) for left in row.left_out], row.episodes + len(row.left_out))
 
 
 def _rejected(row: SummaryRow) -> str:
-    """Return the note about drawn worlds that were rejected because of an early impact; empty if there are none."""
+    """Return the note about drawn worlds that were rejected because of an early impact; "" without such worlds."""
     rejected = row.parameters.get("rejected_draws", 0)
     draws = rejected + row.episodes + len(row.left_out)
     text = (
@@ -73,7 +73,7 @@ def _rejected(row: SummaryRow) -> str:
 
 
 def _cut_off(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about worlds in which a vehicle still moved at the horizon; empty if there are none."""
+    """Return the note about worlds in which a vehicle still moved at the horizon; "" without such worlds."""
     moving = ", ".join(f"{row.agent} {row.horizon_ends:,}" for row in rows if row.horizon_ends)
     if not moving:
         return ""
@@ -84,7 +84,7 @@ def _cut_off(rows: Sequence[SummaryRow]) -> str:
 
 
 def _no_impact(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about agents that had no impact in any world; empty if there are none."""
+    """Return the note about agents that had no impact in any world; "" without such agents."""
     unhurt = [row for row in rows if not row.collisions]
     if not unhurt:
         return ""

@@ -90,7 +90,7 @@ class Outcome:
 
     @property
     def impacts(self) -> Ints:
-        """Number of impacts in each world, [n]. Impacts with an obstacle count, too."""
+        """Number of impacts in each world, between vehicles and with an obstacle, [n]."""
         return self.ledger.impacts
 
     def world_harm(self, harm_count: HarmCount) -> Floats:

@@ -103,9 +103,9 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Two samples of a step are at most ``sample_s`` apart (s). The end of a step is a sample of the next step, and the
-    end of the last step is a sample, too. A world does not contain positions, so Vehicle 1's position is computed from
-    its gap to an obstacle. If the world has no obstacle, one is assumed that Vehicle 1 cannot reach.
+    Two samples of a step are at most ``sample_s`` apart (s). The end of a step is sampled as the beginning of the next
+    step, and the end of the last step as its last sample. A world does not contain positions, so Vehicle 1's position
+    is computed from its gap to an obstacle. If the world has no obstacle, one is assumed that Vehicle 1 cannot reach.
 
     Args:
         segments: steps of one world, each as (world at the beginning, commands [1, N], time of the end [1]).

@@ -110,7 +110,7 @@ def mean_over_seeds(
 def share_over_seeds(
     values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, clusters: Texts | None = None, seed: int = 0
 ) -> Estimate | None:
-    """Return the share of the possible reduction: 0 if ``values`` has the mean of ``worst``, 1 for that of ``best``.
+    """Return the share of the possible reduction: 0 for values as bad as ``worst``, 1 for values as good as ``best``.
 
     The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
     ``mean_over_seeds``. Returns None if the mean of ``best`` is not below the mean of ``worst``, or if it is not

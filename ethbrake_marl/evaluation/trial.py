@@ -130,7 +130,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Try all agents, shields and settings on ``worlds``, and return the error messages of those that fail.
+    """Try all agents, shields and settings on ``worlds``, and return the error messages where one fails.
 
     The keys of the result are specs of agents, ``+SHIELD`` for shields, and names of settings.
     """

@@ -169,7 +169,7 @@ def resume(
         stop_at: the same argument as in the call of ``train``. It is called with new evaluations only.
         on_progress: as in ``train``.
         other_versions: accept a checkpoint that was written by other versions of packages. The resulting policies may
-            differ from those of an uninterrupted training.
+            differ from the policies of an uninterrupted training.
 
     Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if
     ``config.json`` was edited after the checkpoint was written, and for a checkpoint of other versions.
