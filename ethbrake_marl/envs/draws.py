@@ -23,7 +23,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 def describe_worlds(engine: Engine) -> Columns:
-    """Return the random draw of each running world, as columns: ``{"gap_1_m": [n], "mass_2_t": [n], ...}``.
+    """Return the random draw of each running world, as columns such as ``{"gap_1_m": [n], "mass_2_t": [n]}``.
 
     There is one column for each quantity of a world at the alert, with the same name as in a table of initial states.
     For worlds that were drawn, a mixture adds the column ``scenario``, and vehicle types add ``vehicle_2_type`` and so

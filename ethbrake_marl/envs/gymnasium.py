@@ -83,11 +83,11 @@ def _plain(setting: Any) -> Any:
 
 
 class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]):
-    """Environment with one learner in a line of vehicles that follow scripts: ``gymnasium.make("EthBrake-v0")``.
+    """Environment with one learner in a line of vehicles that follow scripts (``gymnasium.make("EthBrake-v0")``).
 
     - Observation: the features of ``ObservationSpec``, float32 [F].
     - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
-    - End: *terminated* when all vehicles are at rest and no command would move one, *truncated* at the horizon.
+    - End: it is *terminated* when all vehicles are at rest and no command would move one, *truncated* at the horizon.
     - Infos and options of ``reset``: docs/environments.md.
 
     Args:
@@ -95,7 +95,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
         learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
             of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
         observation: features that the learner observes; None: ``observation_for(scenario)``.
         actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
             of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
@@ -149,8 +149,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
 
         Args:
             seed: start the first world of this seed; None: start the next world of the current seed.
-            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` to choose the world
-                (docs/environments.md).
+            options: choose the world with ``{"initial_state": ...}``, or with
+                ``{"listed_world": {"seed": 7, "number": 3}}`` (docs/environments.md).
 
         """
         self._restart(seed, options)

@@ -65,7 +65,7 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 
 
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
-    """Return one dictionary of plain values for each world and vehicle: ``[{"time_s": 0.5, "collided": 0.0}, ...]``.
+    """Return one dictionary of plain values for each world and vehicle, such as ``{"time_s": 0.5, "collided": 0.0}``.
 
     The result begins with all vehicles of the first world.
 
@@ -174,8 +174,8 @@ class Report(NamedTuple):
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
         """Return one vehicle's infos in all worlds in Gymnasium's vector format.
 
-        The format is ``{"time_s": [n], "_time_s": [n], ...}``, where ``_time_s`` is true for the worlds that have the
-        info ``time_s``.
+        There are two arrays for each info, such as ``time_s`` [n] and ``_time_s`` [n]. The array ``_time_s`` is true for
+        the worlds that have the info ``time_s``.
 
         Args:
             vehicle: index of the vehicle (0 = front).

@@ -74,7 +74,7 @@ def make_engine(
             ``Scenario``.
         n: number of worlds that are simulated together, at least 1.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
         observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
             observation of the scenario.
         seed: seed of the stream of worlds.

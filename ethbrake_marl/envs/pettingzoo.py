@@ -140,10 +140,10 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
             ``Scenario``.
         render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
         observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
             observation of the scenario.
-        agents: vehicles that are agents: ``all``, or ``learners``. Use ``learners`` for trainers that train all agents.
+        agents: vehicles that are agents, ``all`` or ``learners``. Use ``learners`` for trainers that train all agents.
         max_cycles: number of steps after which an episode is truncated; None: it is truncated at the horizon only.
         actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
             of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
@@ -231,8 +231,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
         Args:
             seed: start the first world of this seed; None: start the next world of the current seed.
-            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` to choose the world
-                (docs/environments.md).
+            options: choose the world with ``{"initial_state": ...}``, or with
+                ``{"listed_world": {"seed": 7, "number": 3}}`` (docs/environments.md).
 
         """
         self._restart(seed, options)

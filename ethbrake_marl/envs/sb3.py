@@ -58,7 +58,7 @@ def make_sb3_vec_env(
         n_envs: number of worlds that are simulated together, at least 1.
         seed: seed of the stream of worlds; None: a random seed.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
         observation: features that the learners observe; None: ``observation_for(scenario)``.
         horizon_is_end: report no truncation at the horizon, so that the algorithm does not add an estimated value of
             the time after the horizon. Such an estimate can grow without limit, because harm after the horizon is not
@@ -180,7 +180,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions of the next step: [rows, 1] in [-1, 1] or, with discrete actions, indices [rows]."""
+        """Store the actions of the next step, [rows, 1] in [-1, 1] or, with discrete actions, indices [rows]."""
         self._actions = own_actions(actions, "the learners", self.actions)
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:

@@ -84,7 +84,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 
 
 class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
-    """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
+    """Many worlds of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``).
 
     After ``reset(seed=s)``, row k is world k of seed s. Each new episode takes the next world of this seed. All
     returned arrays are new.
@@ -95,7 +95,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         render_mode: ``rgb_array``, ``ansi``, or None. ``render`` returns one frame or text for each world.
         learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
             of the scenario.
-        reward: reward of a step: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
         observation: features that the learner observes; None: ``observation_for(scenario)``.
         autoreset_mode: Gymnasium's autoreset mode, which says what happens when an episode ends. ``NextStep``
             (default): the step returns the last observation, and the next step resets the world, ignores its action and

@@ -21,7 +21,7 @@ class Viewer:
 
     Args:
         engine: the engine to show, from its next reset on.
-        mode: render mode: ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: there are no pictures.
+        mode: render mode, namely ``human``, ``rgb_array``, ``rgb_array_list`` or ``ansi``; None: there are no pictures.
         batch: whether the environment has many worlds and shows all of them. Only the modes ``rgb_array`` and ``ansi``
             are then allowed.
 

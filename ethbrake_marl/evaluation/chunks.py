@@ -50,7 +50,7 @@ class Lineup:
     Args:
         agents: specs of the agents (``full_brake``, ``ppo+step``), as on the command line.
         scenario: scenario whose learners the agents drive.
-        harm_count: harm that agents minimise: each pair's first impact (``first``) or all impacts (``total``).
+        harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
         uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.
         measures: names or ``FILE:NAME`` of user measures to load (``load_measures``).
         reported: names of all user measures that the evaluation reports.
@@ -129,7 +129,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every file that a spec or measure names: Python files, and weights of their agents."""
+        """Return the SHA-256 of every Python file and weights file that a spec or measure names."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]

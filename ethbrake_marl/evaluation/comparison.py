@@ -35,7 +35,7 @@ class Difference:
         return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return the entry for JSON: ``agent``, ``policy``, ``exploits``, and differences of harm with intervals."""
+        """Return the entry for JSON, with agent, policy, exploits, and differences of harm with intervals."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         exploits = [list(each.names) for each in self.exploits]
         return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}

@@ -40,7 +40,7 @@ class Conditions(dict[str, Any]):
 
     @classmethod
     def of(cls, worlds: Worlds) -> Conditions:
-        """Return every quantity of the worlds by key: ``{"gaps_m": [7.0, [5.0, 9.0]], "restitution": 0.1}``.
+        """Return every quantity of the worlds by key, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
 
         A quantity of vehicles or pairs has a list with one entry for each of them, front to rear. A quantity of the
         whole world has a single entry. An entry is a number if all worlds agree, else ``[smallest, largest]``.
@@ -128,7 +128,7 @@ class Conditions(dict[str, Any]):
 
     @property
     def quantities(self) -> str:
-        """All quantities in one line, with symbols and units: ``d = 7 m; v = (20, 18, 20) m/s; ...``.
+        """All quantities in one line, with symbols and units, such as ``d = 7 m; v = (20, 18, 20) m/s``.
 
         A value that all vehicles or pairs share is written once.
         """

@@ -85,7 +85,7 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
 
 
 def _contents(trained: Scenario, scenario: Scenario) -> list[str]:
-    """Return descriptions of how the contents of messages differ between two scenarios: ``messages without mass``."""
+    """Return how the contents of messages differ between two scenarios, such as ``messages without mass``."""
     usual = np.array([piece in USUAL_PIECES for piece in PIECES])
     contents = [each.v2x.channel.contents(scenario.vehicles) for each in (trained, scenario)]
     before, here = (np.tile(usual, (scenario.vehicles, 1)) if each is None else each for each in contents)

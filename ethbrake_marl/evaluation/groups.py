@@ -17,7 +17,7 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
 
     Args:
         evaluation: evaluation on a mixture, or on a scenario with types of vehicles.
-        by: what the worlds are grouped by: ``scenario``, or the type of a vehicle, such as ``vehicle_2_type``.
+        by: what the worlds are grouped by, ``scenario`` or the type of a vehicle, such as ``vehicle_2_type``.
         baseline: name of the agent to compare with.
 
     Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` for an unknown ``by``.

@@ -111,7 +111,7 @@ def scenario_sha256(scenario: Scenario) -> str:
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return the SHA-256 of each vehicle's trained policy: ``{"vehicle_2": "3f..."}``.
+    """Return the SHA-256 of each vehicle's trained policy, such as ``{"vehicle_2": "3f..."}``.
 
     ``drivers`` maps the index of a vehicle (0 = front) to its agent. Vehicles without a trained policy are omitted.
     """

@@ -60,7 +60,7 @@ def make_lineup(
         specs: texts that name agents (``"full_brake"``, ``"ppo+step"``), as a list or as one text with commas between
             the specs. The name of a group, such as ``ladder``, stands for several agents.
         scenario: scenario whose learners the agents drive.
-        harm_count: count of harm that optimising agents minimise: ``first`` or ``total``.
+        harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
         uncertainty: uncertainty for shields that need one, as ``make_agent`` takes it.
         alone: refuse teams, which drive several vehicles.
         bare: refuse agents with a shield, because the caller adds one; with one learner, also refuse teams.
@@ -102,7 +102,7 @@ def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCou
     Args:
         specs: texts that name agents, such as ``full_brake``.
         scenario: scenario whose learners the agents drive.
-        harm_count: count of harm that optimising agents minimise: ``first`` or ``total``.
+        harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
 
     Raises ``InvalidInput`` for a team, and the errors of ``make_lineup``.
 

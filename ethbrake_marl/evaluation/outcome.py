@@ -119,7 +119,7 @@ class Outcome:
 
     @property
     def ended(self) -> NDArray[np.str_]:
-        """How each episode ended, [n]: ``at_rest`` or ``horizon``."""
+        """How each episode ended, ``at_rest`` or ``horizon``, [n]."""
         return np.where(self.at_rest, "at_rest", "horizon")
 
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:

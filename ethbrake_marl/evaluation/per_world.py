@@ -191,7 +191,7 @@ class Result:
 
         Args:
             agent: name of the agent, a key of ``rows``.
-            harm: key of the harm in the JSON object: ``first_impact_harm``, ``total_harm`` or ``harm``.
+            harm: key of the harm in the JSON object, such as ``first_impact_harm``, ``total_harm`` or ``harm``.
 
         """
         row = self.rows[agent]

@@ -144,7 +144,7 @@ class Moments:
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the mean: ``s / sqrt(n)``, where s is the standard deviation with n - 1 degrees of freedom.
+        """Standard error of the mean, ``s / sqrt(n)``, where s is the standard deviation with n - 1 degrees of freedom.
 
         With G clusters it is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where D_g is the sum of the deviations from
         the mean in cluster g. Raises ``ZeroDivisionError`` for fewer than two values or clusters.

@@ -147,7 +147,7 @@ class SummaryTable(list[SummaryRow]):
         return (*_ALWAYS_SHOWN, *last)
 
     def tables(self) -> list[Sheet]:
-        """Return the tables to print: ``terminal()``, and a table of the measures that the user registered, if any."""
+        """Return the tables to print, which are ``terminal()`` and, if there are any, the measures of the user."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]

@@ -10,7 +10,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
-    """Return the initial state of each world by column: ``{"gap_1_m": 6.6, "speed_1_mps": 19.0, ...}``.
+    """Return the initial state of each world by column, such as ``{"gap_1_m": 6.6, "speed_1_mps": 19.0}``.
 
     The columns are all gaps and speeds, and every other quantity that the scenario does not fix. In a world without an
     obstacle, the distance to the obstacle is None.
@@ -39,7 +39,7 @@ def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Float
     """Return the values of every quantity that differs between worlds.
 
     A group consists of the vehicles (or pairs) for which the scenario declares the same smallest and largest value. The
-    result maps the key of a quantity to a dictionary from group to values [n, entries]:
+    result maps the key of a quantity to a dictionary from group to values [n, entries], as in
     ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``. The name of a group lists its vehicles; "" stands for
     all vehicles (or pairs) of the line. Worlds without the quantity are omitted.
     """

@@ -204,8 +204,8 @@ def compared_agents(
     Args:
         trained: the trained policy or policies.
         scenario: scenario whose learners the agents drive.
-        harm_count: count of harm that baselines minimise and shields bound: ``first`` or ``total``.
-        baselines: specs of the baselines; None: ``BASELINES``, or ``TEAM_BASELINES`` for several learners.
+        harm_count: count of harm that baselines minimise and shields bound, ``first`` or ``total``.
+        baselines: specs of the baselines; None means ``BASELINES``, or ``TEAM_BASELINES`` for several learners.
 
     """
     several = len(scenario.learners) > 1

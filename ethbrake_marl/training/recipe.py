@@ -208,7 +208,7 @@ class TrainingRecipe(FileModel):
         return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
-        """Return the scheme in which the scenario's learners train: ``single``, ``shared``, ``independent``, ...
+        """Return the scheme in which the scenario's learners train, such as ``single`` or ``shared``.
 
         If the recipe does not set a scheme, it is ``single`` for one learner and ``shared`` for several. Raises
         ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the number of learners.
@@ -382,7 +382,7 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
     class and the algorithm.
 
     Args:
-        name: name of the algorithm, 1 to 64 characters: ``a-z``, digits, ``-`` and ``_``.
+        name: name of the algorithm, with 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
         recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which checks YAML files.
         algorithm: class of the algorithm, a subclass of ``training.algorithm.Algorithm``, or the text
             ``"module:class"``. With a text, the module (and torch, which takes seconds) is not imported before a

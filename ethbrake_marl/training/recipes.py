@@ -130,17 +130,17 @@ class SacRecipe(TrainingRecipe):
 
     @property
     def rounds(self) -> int:
-        """Number of decisions of each learner in each world between two updates: ``steps_per_update``."""
+        """Number of decisions of each learner in each world between two updates (``steps_per_update``)."""
         return self.steps_per_update
 
     @property
     def updates_per_row(self) -> int:
-        """Number of updates between two rows of ``progress.csv``: ``log_every_updates``."""
+        """Number of updates between two rows of ``progress.csv`` (``log_every_updates``)."""
         return self.log_every_updates
 
     @property
     def update_ratio(self) -> float:
-        """Number of gradient steps per decision: ``gradient_steps / (n_envs * steps_per_update)``."""
+        """Number of gradient steps per decision, ``gradient_steps / (n_envs * steps_per_update)``."""
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:

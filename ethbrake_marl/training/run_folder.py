@@ -147,7 +147,7 @@ class RunDirectory:
         Args:
             evaluations: evaluations, or rows of ``progress.csv``.
             harm_count: count of harm that the training minimises.
-            prefix: prefix of metrics in ``evaluations`` and in the result: ``eval/`` for rows of ``progress.csv``.
+            prefix: prefix of metrics in ``evaluations`` and in the result (``eval/`` for rows of ``progress.csv``).
 
         """
         with_objective = evaluations and all(

@@ -58,7 +58,7 @@ def read_settings(
     Args:
         texts: settings ``KEY=VALUE`` as the user wrote them; None: there are no settings.
         recipes: recipes of the command, whose keys may be set.
-        of_agents: settings of agents that the command allows: ``harm_count``, ``measures``.
+        of_agents: settings of agents that the command allows, such as ``harm_count``.
 
     Raises ``UnknownName`` for an unknown key, and ``InvalidInput`` for an ambiguous key or an invalid value.
 

@@ -79,7 +79,7 @@ class Training:
         return self.recipe.begins(self.scenario)
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Return everything that affects the training as plain data: ``{"recipe": {...}, "scenario": {...}}``.
+        """Return everything that affects the training as plain data ``{"recipe": {...}, "scenario": {...}}``.
 
         The result includes default values, but no descriptive texts.
         """
@@ -117,12 +117,12 @@ class Training:
         return file.model_dump(mode="json")
 
     def agent_in(self, folder: Path) -> str:
-        """Return the spec of the agent that this training writes to the run's ``folder``: ``ppo@runs/mine``."""
+        """Return the spec of the agent that this training writes to the run's ``folder``, such as ``ppo@runs/mine``."""
         several, algorithm = len(self.drivers) > 1, self.recipe.algorithm
         return f"{'team' if several else algorithm if algorithm in AGENTS else 'policy'}@{folder}"
 
     def who_drives(self) -> str:
-        """Return a text about scheme and policies: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Return a text about scheme and policies, such as ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         bundles: dict[str, list[str]] = {}
         for vehicle, bundle in self.drivers.items():
             bundles.setdefault(bundle, []).append(vehicle)
