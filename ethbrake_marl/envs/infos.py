@@ -174,8 +174,8 @@ class Report(NamedTuple):
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
         """Return one vehicle's infos in all worlds in Gymnasium's vector format.
 
-        There are two arrays for each info, such as ``time_s`` [n] and ``_time_s`` [n]. The array ``_time_s`` is true for
-        the worlds that have the info ``time_s``.
+        There are two arrays for each info, such as ``time_s`` [n] and ``_time_s`` [n]. The array ``_time_s`` is true
+        for the worlds that have the info ``time_s``.
 
         Args:
             vehicle: index of the vehicle (0 = front).
