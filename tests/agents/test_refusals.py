@@ -78,7 +78,9 @@ SPECS: dict[str, Callable[[], object]] = {
     "agent 'profile:0=3,1=5+step': a profile is a role of a scenario, fixed at the alert; it is no agent": lambda: (
         make_agent("profile:0=3,1=5+step", scenario=PAPER)
     ),
-    "agent 'policy': a policy is needed: policy@PATH, where": lambda: make_agent("policy+step", scenario=PAPER),
+    "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of": lambda: make_agent(
+        "policy+step", scenario=PAPER
+    ),
 }
 
 

@@ -60,9 +60,9 @@ EVALUATIONS = [
     ("evaluate --episodes 0", "number of worlds = 0: must be a whole number, at least 1"),
     ("evaluate --episodes 100000000000000", "episodes = 100000000000000: must be a whole number in 1..1000000000000"),
     ("evaluate --seed -1", "seed of the list = -1: must be a whole number, at least 0"),
-    ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command takes no recipe, so nothing of one can be set"),
+    ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command has no recipe; remove this setting"),
     ("evaluate --agents full_brke", "unknown agent 'full_brke'; did you mean 'full_brake'?"),
-    ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; each agent drives every world once"),
+    ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; list each agent once"),
     (
         "evaluate --agents coast,",
         "agent '': must be name or name:argument, the name in lower case letters, digits and _ @ . -",
@@ -70,7 +70,7 @@ EVALUATIONS = [
     ("evaluate --agents constant:7.5", "agent 'constant:7.5': above the braking capacity 7 m/s2"),
     (
         "evaluate --agents policy",
-        "agent 'policy': a policy is needed: policy@PATH, where PATH is a run or a policy bundle",
+        "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of a run or a policy bundle,",
     ),
     (
         "evaluate --agents ppo@runs/nothing-here",
@@ -78,9 +78,12 @@ EVALUATIONS = [
     ),
     (
         "evaluate --scenario cooperation-0-sensors --agents vine-pair",
-        "scenario 'cooperation-0-sensors' has no learner to drive; give the scenario",
+        "scenario 'cooperation-0-sensors' has no learner that the agents could drive; choose the scenario",
     ),
-    ("evaluate --agents team@.", ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@."),
+    (
+        "evaluate --agents team@.",
+        ".: has no team.json, so it is not a team; name the folder of a run, or write ppo@. for a policy",
+    ),
     ("evaluate --agents policy@shipped+step", "'policy@shipped' is now written universal (the policies"),
     ("evaluate --agents ppo@shipped/ppo", "'ppo@shipped/ppo' is now written ppo"),
     ("agent export shipped/ppo --onnx policy.onnx", "'shipped/ppo' is now written ppo"),
@@ -103,17 +106,17 @@ TRAININGS = [
     ("train --output /proc/x", "/proc/x: No such file or directory"),
     (
         "train --scenario cooperation-3-pair --set scheme=single --output no",
-        "scheme single: scenario 'cooperation-3-pair' has 2 learners; use shared, independent or centralised",
+        "scheme single: scenario 'cooperation-3-pair' has 2 learners; use the scheme shared, independent or",
     ),
     (
         "train --scenario cooperation-3-pair --set scheme=centralized --output no",
         "recipe 'ppo': scheme = centralized: must be single, shared, independent or centralised",
     ),
-    ("train --resume .", ".: contains no training; give the folder of a run"),
+    ("train --resume .", ".: is not the folder of a run; name the folder of a run, for instance"),
     ("agent export ppo --onnx none/policy.onnx", "none/policy.onnx: there is no folder none; make it first"),
     (
         "shield --agents ppo+episode",
-        "agent 'ppo+episode': has a shield already; this command puts its own around each agent",
+        "agent 'ppo+episode' already has a shield, and this command adds its own; name the agent without a",
     ),
 ]
 
@@ -157,7 +160,7 @@ def test_role_that_cannot_drive__is_refused_before_anything_is_written(command: 
 
 def test_run__needs_a_learner(refuse: Refuse) -> None:
     write_scenario("vehicle_2: learner\n", "vehicle_2: full_brake\n")
-    refuse("run --output new --scenario mine.yaml", "has no learner to drive")
+    refuse("run --output new --scenario mine.yaml", "has no learner that the agents could drive")
 
 
 @pytest.mark.parametrize(
@@ -180,7 +183,7 @@ def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refus
     [
         ("evaluate --output file/x", "is no folder; give a folder of its own (--output)"),
         ("run --output file/x", "file: Not a directory"),
-        ("train --output . --force", ".: exists already and is not a run; give another name"),
+        ("train --output . --force", ".: already exists and is not the folder of a run; choose another name"),
     ],
 )
 def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse) -> None:

@@ -220,7 +220,7 @@ def test_second_shield__is_refused_because_a_bound_holds_for_one_alone(interface
     ("actions", "message"),
     [
         ({}, "shield: no action was given, and there is no policy that could propose one"),
-        ([0.0], "step: actions = [0.0]: must be a mapping such as {'vehicle_2': [-1.0]}"),
+        ([0.0], "step: actions = [0.0]: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}"),
         ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2: nan; must be in [-1, 1]"),
         ({"vehicle_2": np.array([1.5])}, "action of vehicle_2: 1.5; must be in [-1, 1]"),
         ({"vehicle_2": np.array([1j])}, "action of vehicle_2: array([0.+1.j]) is not a number"),

@@ -212,7 +212,9 @@ def test_interior__takes_no_command_beyond_the_least_capacity() -> None:
 
 
 def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
-    with refused("uncertainty gaps_m=1: nobody uses it; an agent with +robust does: ppo@PATH+robust"):
+    with refused(
+        "uncertainty gaps_m=1: none of the agents uses an uncertainty; agents with +robust do: ppo@PATH+robust"
+    ):
         make_lineup(["coast"], PAPER, uncertainty="gaps_m=1")
 
 
