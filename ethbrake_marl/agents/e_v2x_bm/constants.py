@@ -134,7 +134,7 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
         bound: harm at which a simulation stops, m2/s2. Its harm is then only known to be at least ``bound``, and its
             other columns are meaningless.
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
     """
     for s in range(first, end):
@@ -154,7 +154,7 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 def _simulate_one(line: Line, command: float, bound: float) -> int:
     """Simulate one ``command`` (m/s2) in ``line.table``, until the harm reaches ``bound`` at the latest.
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command

@@ -61,7 +61,7 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
         tau: time until which the follower coasts, s.
 
@@ -90,9 +90,9 @@ def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
         tau: time until which the follower coasts, s.
 
     """
@@ -121,9 +121,9 @@ def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: fl
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
         tau: time until which the follower coasts, s.
 
     """
@@ -167,11 +167,11 @@ def closing_speed_squared(
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
-        onset_l: time until which it coasts, s.
+        a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
+        onset_l: time until which the leader coasts, s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
-        onset_f: time until which it coasts, s.
+        a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
+        onset_f: time until which the follower coasts, s.
 
     """
     w = v_f - v_l
@@ -201,7 +201,7 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, > 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, > 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
         tau: time until which the follower coasts, s, >= 0.
 
@@ -231,7 +231,7 @@ def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from ``lead`` to standstill, m/s2, > 0.
+        a_l: the leader's deceleration, held from ``lead`` to standstill, m/s2, > 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
         lead: time until which the leader coasts, s, > 0.
 
@@ -261,10 +261,10 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
-        onset_l: time until which it coasts, s.
+        a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
+        onset_l: time until which the leader coasts, s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        onset_f: time until which it coasts, s.
+        onset_f: time until which the follower coasts, s.
 
     """
     w = v_f - v_l
@@ -287,7 +287,7 @@ def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: 
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``tau`` to standstill, m/s2, > 0.
+        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, > 0.
         tau: time until which the follower coasts, s, >= 0.
 
     """
@@ -316,10 +316,10 @@ def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        onset_l: time until which it coasts, s.
+        onset_l: time until which the leader coasts, s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
-        onset_f: time until which it coasts, s.
+        a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
+        onset_f: time until which the follower coasts, s.
 
     """
     w = v_f - v_l

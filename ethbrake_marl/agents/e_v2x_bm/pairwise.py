@@ -68,8 +68,8 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
 def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
     """Return the predicted harm of vehicle ``i`` with the vehicle in front, m2/s2; 0 for the first vehicle.
 
-    Vehicle ``i`` brakes with ``a``, the one in front with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
-    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    Vehicle ``i`` brakes with ``a``, the one in front with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, the
+    braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may brake) describe the world.
     """
     if i == 0:
         return 0.0
@@ -80,8 +80,8 @@ def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, o
 def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
     """Return the predicted harm of vehicle ``i`` with the vehicle behind, m2/s2; 0 for the last vehicle.
 
-    Vehicle ``i`` brakes with ``a``, the one behind with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
-    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    Vehicle ``i`` brakes with ``a``, the one behind with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, the
+    braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may brake) describe the world.
     """
     if i == gap.shape[0]:
         return 0.0

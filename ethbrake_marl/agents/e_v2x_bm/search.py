@@ -96,7 +96,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
         capacity: braking capacity of the vehicle, m/s2.
         out: [3] receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2).
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
     """
     status = share_start(line)
@@ -118,7 +118,7 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
     """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
 
     The grid is left in ``room.one``, grid and breakpoints sorted in ``room.two``. ``capacity`` is the largest
-    deceleration, m/s2. Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    deceleration, m/s2. Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     grid, new = room.one, room.few
     for k in range(GRID):
@@ -139,7 +139,7 @@ def look_inside(line: Line, room: Room) -> int:
 
     These are intervals in which the number of impacts changes, or whose estimated harm is below every sample so far.
     Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated. Returns a status:
-    ``FLAG.DONE``, or the code of the check of the physics that failed.
+    ``FLAG.DONE``, or the code of the physics check that failed.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -182,7 +182,7 @@ def locate_borders(line: Line, room: Room) -> int:
 
     Between two such borders the harm is smooth, so harm that falls towards a border is least there. Each located border
     ends up between two samples 1e-9 m/s2 apart. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or
-    the code of the check of the physics that failed.
+    the code of the physics check that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -210,7 +210,7 @@ def _cut(line: Line, few: Samples) -> int:
     """Bring samples 0 and 5 of ``few``, on the two sides of a border, to a distance of 1e-9 m/s2.
 
     A border is a deceleration at which the number of impacts changes. Each round divides the distance by five. Returns
-    a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
@@ -233,7 +233,7 @@ def _cut(line: Line, few: Samples) -> int:
 def narrow_minima(line: Line, room: Room) -> int:
     """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     inner, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(inner, _NARROWED, room.values, minima)
@@ -300,7 +300,7 @@ def step_back(line: Line, around: Samples, best: float, capacity: float, out: Fl
         capacity: braking capacity of the vehicle, m/s2.
         out: [3] receives the deceleration, its harm, and its harm under the other count.
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
     """
     for k in range(5):
