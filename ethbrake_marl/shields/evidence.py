@@ -60,8 +60,8 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
         raise InvalidInput("review: the shield has no log; make it with logging=True, and run episodes behind it")
     if worlds.n != shield.memory.running.n:
         raise InvalidInput(
-            f"review: worlds: has {count_of(worlds.n, 'world')}; must have the {shield.memory.running.n} worlds of the"
-            " shield's last episodes"
+            f"review: worlds: has {count_of(worlds.n, 'world')}; must be the {shield.memory.running.n} of the shield's"
+            " last episodes"
         )
     log = [
         entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.memory.episode[entry.world]

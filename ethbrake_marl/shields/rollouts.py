@@ -205,7 +205,7 @@ def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int)
 
 
 class _Rounded(AgentAround):
-    """Policy whose commands are converted to actions and back, as in a plan. Its memory contains the last ``action``."""
+    """Policy whose commands are converted to actions and back, as in a plan. Its memory contains ``action``."""
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         return {"policy": begin_script(self.policy, alert, vehicle, scripts), "action": np.zeros(alert.n)}

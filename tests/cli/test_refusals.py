@@ -74,7 +74,7 @@ EVALUATIONS = [
     ),
     (
         "evaluate --agents ppo@runs/nothing-here",
-        "runs/nothing-here: is not a folder; give a policy bundle (manifest.json, weights.safetensors)",
+        "runs/nothing-here: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)",
     ),
     (
         "evaluate --scenario cooperation-0-sensors --agents vine-pair",

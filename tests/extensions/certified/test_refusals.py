@@ -105,19 +105,19 @@ SHIELDS: dict[str, Callable[[], object]] = {
         line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior"
     ),
     "shield: mode step takes no uncertainty; robust does": lambda: ShieldOptions(mode="step", uncertainty="gaps_m=1"),
-    "shield: robust = 'interior': mode step takes none; robust does": lambda: ShieldOptions(
+    "shield: robust = 'interior': not a setting of mode step; use mode robust": lambda: ShieldOptions(
         mode="step", robust="interior"
     ),
-    "shield: allowance = 5.0: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: allowance = 5.0: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", allowance=5.0
     ),
-    "shield: logging = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: logging = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", logging=True
     ),
-    "shield: shares = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: shares = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", shares=True
     ),
-    "shield: estimated = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: estimated = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", estimated=True
     ),
     "not together with estimated = True, which certifies against": lambda: ShieldOptions(estimated=True, allowance=1.0),
