@@ -347,7 +347,7 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
 
     with refused("learned: shape of actions = (12, 2): must be (12, 1), one action per world"):
         LearnedAgent(Fixed()).act(WORLDS, 1)
-    with refused("predict on 27 features: its state has arrays of shape (1, 8) for two worlds and (1, 8) for three"):
+    with refused("predict on 27 features: a state array has shape (1, 8) for two worlds and (1, 8) for three"):
         eb.policy_agent(Shared())
     states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
     with refused("initial_state(12): state: ndarray of shape (3,); its first axis must be the 12 worlds", AgentFailed):
@@ -390,5 +390,5 @@ def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_give
     with refused("the policy takes observations of shape (28,), but this observation has 27 features; pass scenario"):
         eb.policy_agent(numbered, scenario=PAIR)
     stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
-    with refused("agent 'ActorCriticPolicy': appended = 'state' needs the scenario that it was trained in"):
+    with refused("agent 'ActorCriticPolicy': appended = 'state': pass scenario=, the scenario of the training"):
         eb.policy_agent(stated, appended="state")

@@ -242,7 +242,7 @@ def test_dqn__of_a_file_says_what_its_indices_mean(tmp_path: Any) -> None:
     model.save(tmp_path / "dqn.zip")
     loaded = DQN.load(tmp_path / "dqn.zip")
     with pytest.raises(
-        InvalidInput, match=r"gives actions in Discrete\(9\); must be a number in \[-1, 1\]; say actions=9 if"
+        InvalidInput, match=r"gives actions in Discrete\(9\); must be a number in \[-1, 1\]; pass actions=9 if"
     ):
         eb.policy_agent(loaded)
     with pytest.raises(InvalidInput, match=r"in Discrete\(9\); must be an index from 0 to 4 \(actions=5\)"):

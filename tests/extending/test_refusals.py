@@ -141,7 +141,7 @@ THERE: dict[str, Callable[[], object]] = {
         "nominal", {"lost": 0.1, "preset": "clear"}
     ),
     "objective 'own' is registered already; give another name": lambda: eb.register_objective("own", gives(0.0)),
-    "agent 'ladder': stands for several agents in --agents; give another name": lambda: eb.register_agent(
+    "agent 'ladder': is the name of a group of agents; choose another name": lambda: eb.register_agent(
         "ladder", gives(None)
     ),
 }

@@ -169,7 +169,7 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
     np.testing.assert_allclose(action, policy(seen), rtol=0.0, atol=1e-5)
     for wrong, why in (
         ({"output": "clip", "choices": None}, "among: must have output choice"),
-        ({"among": (spec,)}, "its policies choose among no others"),
+        ({"among": (spec,)}, "and policies without among"),
         (
             {"among": (squashed.model_copy(update={"observation_size": 26}),)},
             r"among\[0\]: observation_size and action_size are",
@@ -414,7 +414,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: the content has SHA-256"),
     "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: the content has SHA-256"),
     "other_reward": (_edit(rehash=False, reward={"jerk": 1.0}), r"manifest.json: the content has SHA-256"),
-    "no_vehicle": (_edit(learners=["car_2"]), r"manifest.json: learners: 'car_2' is no vehicle"),
+    "no_vehicle": (_edit(learners=["car_2"]), r"manifest.json: learners: 'car_2': must be a vehicle's name"),
     "learner_twice": (
         _edit(learners=["vehicle_2"] * 2),
         r"manifest.json: learners: .*must name each vehicle only once",

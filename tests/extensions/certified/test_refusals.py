@@ -89,7 +89,7 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: make_agent(
         "full_brake+robust", scenario=PAIR
     ),
-    "agent 'coast+step:estimated+robust': +search comes first and once, then one shield of +episode": lambda: (
+    "agent 'coast+step:estimated+robust': must have at most one +search, then at most one shield (+episode": lambda: (
         make_agent("coast+step:estimated+robust", scenario=PERIODIC)
     ),
     "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated decides on what was received itself": lambda: (
@@ -226,7 +226,7 @@ SLOW = PAPER.replace(brake_rate_mps3=9)
 PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 AGENTS: dict[str, Callable[[], object]] = {
     "agent 'ppo+robust': mode robust needs an uncertainty": lambda: make_agent("ppo+robust", scenario=PAPER),
-    "agent 'e_v2x_bm:estimated': needs a scenario: make_agent('e_v2x_bm:estimated'": lambda: make_agent(
+    "agent 'e_v2x_bm:estimated': needs a scenario, for instance make_agent('e_v2x_bm:estimated'": lambda: make_agent(
         "e_v2x_bm:estimated"
     ),
     "scenario 'mixture-delays': is a mixture, and a vehicle that is not known could be of any": lambda: make_agent(
@@ -258,7 +258,7 @@ def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
     team = Team.of(make_agent("coast"), [1, 2])
     entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     monkeypatch.setitem(registry.AGENTS.loaded, "team", entry)
-    with refused("'team@run+robust': is a team, and +robust is for one controlled vehicle"):
+    with refused("'team@run+robust': +robust works for one controlled vehicle only, not for a team"):
         make_lineup(["team@run+robust"], PAIR)
 
 
