@@ -452,7 +452,7 @@ class PolicyAgent:
     def _checked_indices(self, indices: NDArray[Any], count: int, what: str, worlds: Worlds, steps: Ints) -> Floats:
         """Check the indices of discrete actions and return the actions as [n] in [-1, 1]."""
         n, last = worlds.n, count - 1
-        right = f"with actions={count} it must be a whole number from 0 to {last} per world, shape ({n},) or ({n}, 1)"
+        right = f"must be a whole number from 0 to {last} per world with actions={count}, shape ({n},) or ({n}, 1)"
         if indices.shape not in ((n,), (n, 1)) or indices.dtype.kind not in "iu":
             raise self._refusal(0, worlds, steps, f"{what}; {right}")
         row = indices.reshape(n).clip(0, last) if self._clip else indices.reshape(n)
