@@ -60,7 +60,7 @@ class NetworkSpec(FileModel):
     among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()  # policies that are scored
 
     @model_validator(mode="after")
-    def _a_gate_between_several(self) -> NetworkSpec:
+    def _settings_fit(self) -> NetworkSpec:
         if (self.networks > 1) != bool(self.gate_hidden):
             raise ValueError(
                 f"gate_hidden = {list(self.gate_hidden)}: must be given with several networks, and only then; networks"

@@ -186,8 +186,8 @@ class EV2XBM:
         horizon_s: end of the simulations in mode ``coupled``, s since the alert.
 
     The memory contains ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2). Raises
-    ``InvalidInput`` for an unknown mode or harm count. In mode ``coupled``, ``begin`` raises ``InvalidInput`` if another
-    vehicle's script has a command that is not fixed at the alert.
+    ``InvalidInput`` for an unknown mode or harm count. In mode ``coupled``, ``begin`` raises ``InvalidInput`` if the
+    script of another vehicle has a command that is not fixed at the alert.
 
     """
 
