@@ -117,7 +117,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     "team 'half': does not drive vehicle_3; behind a shield, a team must drive every learner": lambda: ShieldedDriver(
         Team({1: COAST}, "half"), PAIR
     ),
-    "e_v2x_bm mode 'couple': must be 'coupled' or 'pairwise'": lambda: HybridAgent(BRAKE, PAPER, bound="couple"),
+    "e_v2x_bm: mode = 'couple': must be 'coupled' or 'pairwise'": lambda: HybridAgent(BRAKE, PAPER, bound="couple"),
     "harm_count 'both': must be 'first' or 'total'": lambda: HybridAgent(BRAKE, PAPER, harm_count="both"),
     "shield: agent 'coast': pass scenario= (the scenario for certification) and no policy=": lambda: eb.shield(COAST),
     "shield: agent 'coast+step' already has a shield": lambda: eb.shield(
