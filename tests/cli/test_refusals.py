@@ -74,7 +74,7 @@ EVALUATIONS = [
     ),
     (
         "evaluate --agents ppo@runs/nothing-here",
-        "runs/nothing-here: is not a folder; give a policy bundle (manifest.json, weights.safetensors)",
+        "runs/nothing-here: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)",
     ),
     (
         "evaluate --scenario cooperation-0-sensors --agents vine-pair",
@@ -214,7 +214,7 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
         (
             "worst = 3\n",
             "--agents bad.py:worst",
-            "file 'bad.py': 'worst' is no function; name the one that makes the agent",
+            "file 'bad.py': 'worst' is not a function; name the function that makes the agent",
         ),
         ("", "--set measures=injur", "unknown measure 'injur'; did you mean 'injury'?"),
         (

@@ -104,7 +104,7 @@ def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) ->
     )
     assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
     with pytest.raises(
-        InvalidInput, match=r"'team@run\+episode': is a team, and \+episode is for one controlled vehicle"
+        InvalidInput, match=r"'team@run\+episode': \+episode works for one controlled vehicle only, not for a team"
     ):
         make_lineup(["team@run+episode"], scenario)
 

@@ -72,7 +72,7 @@ OBSERVATIONS: dict[str, Callable[[], object]] = {
     "observation: time_step_s = -1.0; must be a positive number of seconds": lambda: ObservationSpec(
         contact=True, time_step_s=-1.0
     ),
-    "policy: scenario: time_step_s = None; contact features need a number above 0": lambda: make_policy(
+    "policy: scenario: time_step_s = None: must be a number above 0": lambda: make_policy(
         choose_observation(["own", "contact"]), {}
     ),
 }

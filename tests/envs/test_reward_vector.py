@@ -95,7 +95,7 @@ def test_interfaces__give_the_same_vectors() -> None:
 
 def test_vector__behind_a_shield_takes_no_penalty() -> None:
     for env in (eb.EthBrakeEnv(reward_vector="vehicles"), eb.parallel_env(reward_vector="vehicles")):
-        with pytest.raises(InvalidInput, match=r"intervention_penalty = 0\.5: is subtracted from a number"):
+        with pytest.raises(InvalidInput, match=r"intervention_penalty = 0\.5: cannot be subtracted, because"):
             eb.shield(env, mode="step", intervention_penalty=0.5)
 
 

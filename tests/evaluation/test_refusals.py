@@ -88,7 +88,7 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "number of worlds = 0: must be a whole number, at least 1": lambda: eb.evaluate(
         agents="coast", scenario=PAPER, episodes=0
     ),
-    "evaluate: agent 'a': 'str' is no agent: it has no name and no act; make_agent(name) makes one": lambda: (
+    "evaluate: agent 'a': 'str' is not an agent, because it has no name and no act; to make an agent": lambda: (
         eb.evaluate(WORLDS, {"a": "full_brake"}, scenario=PAPER)
     ),
     "agent 'confused': predicted_harm in its memory has type float64 and shape (3, 2); must be one": lambda: (

@@ -141,7 +141,7 @@ THERE: dict[str, Callable[[], object]] = {
         "nominal", {"lost": 0.1, "preset": "clear"}
     ),
     "objective 'own' is registered already; give another name": lambda: eb.register_objective("own", gives(0.0)),
-    "agent 'ladder': stands for several agents in --agents; give another name": lambda: eb.register_agent(
+    "agent 'ladder': is the name of a group of agents; choose another name": lambda: eb.register_agent(
         "ladder", gives(None)
     ),
 }
@@ -251,9 +251,9 @@ def test_feature__that_is_not_finite_later_is_told_with_its_world_and_step() -> 
 @pytest.mark.parametrize(
     ("urgency", "message"),
     [
-        (None, "observes 'urgency', which is not registered; install the package that gives it"),
-        ((1.0, 3.0), "observes 'urgency', whose scale was 2.0 when it was trained and is 3.0 now"),
-        ((1.001, 2.0), "observes 'urgency', whose function gives other numbers than when it was trained"),
+        (None, "observes 'urgency', which is not registered; install the package that registers"),
+        ((1.0, 3.0), "observes 'urgency', whose scale was 2.0 in training and is 3.0 now"),
+        ((1.001, 2.0), "observes 'urgency', whose function returns other numbers than in training"),
     ],
     ids=["missing", "other scale", "other numbers"],
 )

@@ -168,8 +168,8 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
     (action,) = onnx_of(policy).run(["action"], {"observation": seen})
     np.testing.assert_allclose(action, policy(seen), rtol=0.0, atol=1e-5)
     for wrong, why in (
-        ({"output": "clip", "choices": None}, "among: is for output choice"),
-        ({"among": (spec,)}, "its policies choose among no others"),
+        ({"output": "clip", "choices": None}, "among: must have output choice"),
+        ({"among": (spec,)}, "and policies without among"),
         (
             {"among": (squashed.model_copy(update={"observation_size": 26}),)},
             r"among\[0\]: observation_size and action_size are",
@@ -367,33 +367,33 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "future_version": (_edit(format_version=6), r"manifest.json: format_version: must be 2, 3, 4 or 5"),
     "version_of_several_networks": (
         _edit(format_version=3),
-        r"manifest.json: format_version: 3 for 1 networks and output clip; must be 2",
+        r"manifest.json: format_version = 3: must be 2 with networks = 1 and output clip",
     ),
     "several_networks_in_an_old_version": (
         _edit(network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
-        r"manifest.json: format_version: 2 for 2 networks and output clip; must be 3",
+        r"manifest.json: format_version = 2: must be 3 with networks = 2 and output clip",
     ),
     "several_networks_without_a_gate": (
         _edit(format_version=3, network__networks=2, network__value_hidden=[]),
-        r"manifest.json: network: networks = 2 with gate_hidden = \[\]; several need a gate",
+        r"manifest.json: network: gate_hidden = \[\]: must be given with several networks",
     ),
-    "gate_of_one_network": (_edit(network__gate_hidden=[4]), r"manifest.json: network: networks = 1 with gate_hidden"),
+    "gate_of_one_network": (_edit(network__gate_hidden=[4]), r"manifest.json: network: gate_hidden = \[4\]: must be"),
     "critic_beside_several_networks": (
         _edit(format_version=3, network__networks=2, network__gate_hidden=[4]),
-        r"manifest.json: network: value_hidden = \[5\]: must be empty beside several networks",
+        r"manifest.json: network: value_hidden = \[5\]: must be empty with several networks",
     ),
     "choice_among_nothing": (
         _edit(format_version=4, network__output="choice", network__value_hidden=[]),
-        r"manifest.json: network: choices = None with output choice; output choice needs a number of them",
+        r"manifest.json: network: choices = None: must be a number with output choice",
     ),
-    "choices_that_nobody_takes": (_edit(network__choices=9), r"manifest.json: network: choices = 9 with output clip"),
+    "choices_that_nobody_takes": (_edit(network__choices=9), r"manifest.json: network: choices = 9: must be a number"),
     "critic_beside_choices": (
         _edit(format_version=4, network__output="choice", network__choices=9),
-        r"manifest.json: network: output choice is for one network without a critic",
+        r"manifest.json: network: output = 'choice': must have one network, no critic",
     ),
     "choices_in_an_old_version": (
         _edit(network__output="choice", network__choices=9, network__value_hidden=[]),
-        r"manifest.json: format_version: 2 for 1 networks and output choice; must be 4",
+        r"manifest.json: format_version = 2: must be 4 with networks = 1 and output choice",
     ),
     "too_many_networks": (_edit(network__networks=17), r"manifest.json: network.networks"),
     "networks_without_their_tensors": (
@@ -405,34 +405,37 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "many_layers": (_edit(network__value_hidden=[1] * 9), r"manifest.json: network.value_hidden"),
     "fewer_inputs": (
         _edit(network__observation_size=4),
-        r"manifest.json: 27 observation features for a network that takes 4",
+        r"manifest.json: observation.features: has 27 features; must have 4",
     ),
     "other_features": (_edit(observation__features=[f"own.{k}" for k in range(27)]), r"manifest.json: observation: "),
     "other_scaling": (_edit(observation__scaling_sha256="0" * 64), r"manifest.json: observation: features or their"),
     "older_version": (_edit(format_version=1), r"manifest.json: format_version: must be 2, 3, 4 or 5"),
-    "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: its content has SHA-256"),
-    "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: its content has SHA-256"),
-    "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: its content has SHA-256"),
-    "other_reward": (_edit(rehash=False, reward={"jerk": 1.0}), r"manifest.json: its content has SHA-256"),
-    "no_vehicle": (_edit(learners=["car_2"]), r"manifest.json: learners: 'car_2' is no vehicle"),
-    "learner_twice": (_edit(learners=["vehicle_2"] * 2), r"manifest.json: learners: .*each vehicle learns once"),
+    "other_activation": (_edit(rehash=False, network__activation="tanh"), r"manifest.json: the content has SHA-256"),
+    "other_output": (_edit(rehash=False, network__output="tanh"), r"manifest.json: the content has SHA-256"),
+    "other_steps": (_edit(rehash=False, steps=999_999_999), r"manifest.json: the content has SHA-256"),
+    "other_reward": (_edit(rehash=False, reward={"jerk": 1.0}), r"manifest.json: the content has SHA-256"),
+    "no_vehicle": (_edit(learners=["car_2"]), r"manifest.json: learners: 'car_2': must be a vehicle's name"),
+    "learner_twice": (
+        _edit(learners=["vehicle_2"] * 2),
+        r"manifest.json: learners: .*must name each vehicle only once",
+    ),
     "learner_beyond_the_line": (
         _edit(learners=["vehicle_9"], scenario={"name": "x", "vehicles": 3}),
-        r"manifest.json: learners: vehicle_9: the scenario has 3 vehicles",
+        r"manifest.json: learners: vehicle_9: must be one of the 3 vehicles",
     ),
     "learner_with_a_script": (
         _edit(scenario={"name": "x", "roles": {"vehicle_2": "coast"}}),
-        r"manifest.json: learners: vehicle_2: does not learn",
+        r"manifest.json: learners: vehicle_2: must be a learner",
     ),
     "last_digit_of_the_weights_hash": (
         _last_digit_of("weights_sha256"),
-        r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
+        r"weights.safetensors: the file has SHA-256 [0-9a-f]{64}, but",
     ),
-    "last_digit_of_the_own_hash": (_last_digit_of("manifest_sha256"), r"manifest.json: its content has SHA-256"),
+    "last_digit_of_the_own_hash": (_last_digit_of("manifest_sha256"), r"manifest.json: the content has SHA-256"),
     "hash_not_hex": (_edit(weights_sha256="x" * 64), r"manifest.json: weights_sha256"),
     "bit_flip": (
         lambda f: _replace(f / "weights.safetensors", lambda d: d[:-3] + bytes([d[-3] ^ 1]) + d[-2:]),
-        r"weights.safetensors: SHA-256 is [0-9a-f]{64}, the manifest says",
+        r"weights.safetensors: the file has SHA-256 [0-9a-f]{64}, but",
     ),
     "endless_device": (
         _instead("weights.safetensors", _endless_device),
@@ -446,7 +449,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "utf16": (_manifest(lambda data: data.decode().encode("utf-16")), r"manifest.json: "),
     "null_byte": (_manifest(lambda data: data + b"\0"), r"manifest.json: Extra data"),
     "path_to_weights": (_edit(weights="../../other/weights.safetensors"), r"manifest.json: weights: unknown key"),
-    "path_as_learner": (_edit(learners=["../../vehicle_2"]), r"manifest.json: learners: '../../vehicle_2' is no"),
+    "path_as_learner": (_edit(learners=["../../vehicle_2"]), r"manifest.json: learners: '../../vehicle_2': must be"),
     "unknown_activation": (_edit(network__activation="gelu"), r"manifest.json: network.activation: must be"),
     "unknown_output": (_edit(network__output="eval"), r"manifest.json: network.output: must be"),
     "negative_layer": (_edit(network__policy_hidden=[-13, 9]), r"manifest.json: network.policy_hidden.0"),
@@ -476,7 +479,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "empty_header": (_raw_header(b"{}"), r"tensor 'policy.0.bias' is missing"),
     "minus_infinite_weight": (
         _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] - np.float32(np.inf)}),
-        r"tensor 'value.0.bias' holds a number",
+        r"tensor 'value.0.bias': contains a number",
     ),
     "empty_weights": (_weights(lambda _: b""), r"weights.safetensors: not a safetensors file"),
     "pickle": (_weights(lambda _: pickle.dumps(_Payload())), r"weights.safetensors: not a safetensors file"),
@@ -512,11 +515,11 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     ),
     "nan_weight": (
         _tensors(lambda t: {**t, "value.0.bias": np.append(t["value.0.bias"][1:], np.float32(np.nan))}),
-        r"tensor 'value.0.bias' holds a number that is not",
+        r"tensor 'value.0.bias': contains a number that is not",
     ),
     "infinite_weight": (
         _tensors(lambda t: {**t, "value.0.bias": t["value.0.bias"] + np.float32(np.inf)}),
-        r"tensor 'value.0.bias' holds a number that is",
+        r"tensor 'value.0.bias': contains a number that is",
     ),
 }
 

@@ -89,7 +89,7 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: make_agent(
         "full_brake+robust", scenario=PAIR
     ),
-    "agent 'coast+step:estimated+robust': +search comes first and once, then one shield of +episode": lambda: (
+    "agent 'coast+step:estimated+robust': must have at most one +search, then at most one shield (+episode": lambda: (
         make_agent("coast+step:estimated+robust", scenario=PERIODIC)
     ),
     "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated already decides on received": lambda: make_agent(
@@ -107,19 +107,19 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "shield: mode step takes no uncertainty; must be mode robust": lambda: ShieldOptions(
         mode="step", uncertainty="gaps_m=1"
     ),
-    "shield: robust = 'interior': mode step takes none; robust does": lambda: ShieldOptions(
+    "shield: robust = 'interior': not a setting of mode step; use mode robust": lambda: ShieldOptions(
         mode="step", robust="interior"
     ),
-    "shield: allowance = 5.0: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: allowance = 5.0: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", allowance=5.0
     ),
-    "shield: logging = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: logging = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", logging=True
     ),
-    "shield: shares = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: shares = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", shares=True
     ),
-    "shield: estimated = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: estimated = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", estimated=True
     ),
     "shield: allowance = 1.0: must be 0.0 if estimated = True": lambda: ShieldOptions(estimated=True, allowance=1.0),
@@ -222,7 +222,7 @@ SLOW = PAPER.replace(brake_rate_mps3=9)
 PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 AGENTS: dict[str, Callable[[], object]] = {
     "agent 'ppo+robust': mode robust needs an uncertainty": lambda: make_agent("ppo+robust", scenario=PAPER),
-    "agent 'e_v2x_bm:estimated': needs a scenario: make_agent('e_v2x_bm:estimated'": lambda: make_agent(
+    "agent 'e_v2x_bm:estimated': needs a scenario, for instance make_agent('e_v2x_bm:estimated'": lambda: make_agent(
         "e_v2x_bm:estimated"
     ),
     "scenario 'mixture-delays' is a mixture: an unknown vehicle could belong to any": lambda: make_agent(
@@ -254,7 +254,7 @@ def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
     team = Team.of(make_agent("coast"), [1, 2])
     entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     monkeypatch.setitem(registry.AGENTS.loaded, "team", entry)
-    with refused("'team@run+robust': is a team, and +robust is for one controlled vehicle"):
+    with refused("'team@run+robust': +robust works for one controlled vehicle only, not for a team"):
         make_lineup(["team@run+robust"], PAIR)
 
 

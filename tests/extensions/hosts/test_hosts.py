@@ -506,11 +506,11 @@ def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message)
 @pytest.mark.parametrize(
     ("scenario", "agent", "message"),
     [
-        ("paper-random", "full_brake", "host: 'str' is no agent: it has no name and no act; make_agent(name) makes"),
+        ("paper-random", "full_brake", "host: 'str' is not an agent, because it has no name and no act; to make"),
         ("paper-random-obstacle", None, "host: scenario 'paper-random-obstacle': has an obstacle ahead (obstacle_gap"),
         ("paper-random-buildup", None, "host: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and"),
         (PAPER.with_learners([]), None, "host: scenario 'paper-random' has no learner to drive; scenario.with_learn"),
-        (PAPER, PAPER, "is no agent"),
+        (PAPER, PAPER, "is not an agent"),
     ],
 )
 def test_host__of_what_it_cannot_know_is_refused(scenario, agent, message):

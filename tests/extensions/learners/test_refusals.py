@@ -85,8 +85,8 @@ REFUSED: dict[str, Callable[[], object]] = {
         shares={"pretraining_first": 0.5, "pretraining_others": 0.5, "gating": 0.5, "joint": 0.0}
     ),
     "recipe 'vine': experts.gatin: unknown key; did you mean gating?": lambda: experts(gatin=[8]),
-    "runs/mine: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run": lambda: train(
-        load_recipe("vine").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
+    "runs/mine: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)": lambda: (
+        train(load_recipe("vine").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1)
     ),
     "drawn = 2: must be at most the number of policies, 1": lambda: train(
         load_recipe("rollout-classification").replace(policies=["ppo"]), "paper-random", "new"

@@ -101,7 +101,7 @@ SEARCHES: dict[str, Callable[[], object]] = {
         Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1)))
     ),
     "t.npz: there is no such table of best known harm": lambda: BestHarmTable.load(Path("t.npz")),
-    "a profile: the pieces in which vehicles brake in these worlds are not those of its scripts": lambda: best_harm(
+    "the braking profiles in these worlds differ from the profiles of the scripts; draw": lambda: best_harm(
         PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}), PAPER.sample(2, 7).worlds
     ),
 }

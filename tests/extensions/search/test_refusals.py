@@ -27,8 +27,8 @@ def problem(*vehicles: int) -> ProfileProblem:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "agent 'planner+step+episode': +search comes first and once, then one shield of +episode": lambda: make_agent(
-        "planner+step+episode", scenario=PAPER
+    "agent 'planner+step+episode': must have at most one +search, then at most one shield (+episode": lambda: (
+        make_agent("planner+step+episode", scenario=PAPER)
     ),
     "agent 'planner:0': the argument must be a number of candidates per decision": lambda: make_agent("planner:0"),
     "agent 'planner:1.5': the argument must be a number of candidates per decision": lambda: make_agent("planner:1.5"),

@@ -67,7 +67,7 @@ FALSIFIED = [
     ("study falsify --agent coast --budget 10 --measure hram", "unknown measure 'hram'; did you mean 'harm'?"),
     (
         "study falsify --agent ppo@nowhere --budget 10",
-        "nowhere: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run",
+        "nowhere: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)",
     ),
     (
         "study falsify --agent coast --budget 10 --scenario mixture-delays",
