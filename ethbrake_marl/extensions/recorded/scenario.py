@@ -126,7 +126,7 @@ def scenario_from_data(
 
 
 def _name(file: str, vehicles: str) -> str:
-    """Return the name of a row's recording and vehicles, such as ``drive_1.csv: 2-3-4``. Long texts lose their start."""
+    """Return the name of a row: recording and vehicles, such as ``drive_1.csv: 2-3-4``. A long name loses its start."""
     return f"{file}: {vehicles}".strip()[-MOST_CHARACTERS:].strip()
 
 

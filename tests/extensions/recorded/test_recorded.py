@@ -73,7 +73,7 @@ def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) 
     (folder / "later.csv").write_text("Date,later\n" + (folder / "platoon.csv").read_text())
     assert scenario_from_data("mine", folder, "openacc").found[0].startswith("60 chains")
     with pytest.raises(
-        InvalidInput, match=r"gaps change 0\.31 times as much as they should by the speeds .*OpenACC has m and m/s"
+        InvalidInput, match=r"gaps change 0\.31 times as much as they should by the speeds .*must be in m and m/s"
     ):
         scenario_from_data("mine", write_openacc(tmp_path / "feet", 100, unit=0.3048), "openacc")
 
@@ -87,12 +87,12 @@ def scaled(text: str, lengths: float, speeds: float) -> str:
 
 
 REFUSED = {
-    "a column is missing": (lambda t: t.replace("precedingId", "-"), "lacks columns that files of highD have: precedingId"),
+    "a column is missing": (lambda t: t.replace("precedingId", "-"), "lacks columns .* highD have: precedingId"),
     "semicolons": (lambda t: t.replace(",", ";"), "commas must separate the columns"),
-    "a column twice": (lambda t: t.replace("ttc", "width"), "csv: columns frame, id, .*: each name must occur only once"),
+    "a column twice": (lambda t: t.replace("ttc", "width"), "columns frame, id, .*: each name must occur only"),
     "text": (lambda t: t.replace("4.50", "long", 1), "line 2, column width: 'long' is not a number"),
     "nan": (lambda t: t.replace("4.50", "nan", 1), "line 2, column width: nan must be a finite number"),
-    "no length": (lambda t: t.replace("4.50", "0.00", 1), r"line 2, column width: 0 m: the length must be above 0 and at most 40 m"),
+    "no length": (lambda t: t.replace("4.50", "0.00", 1), r"line 2, column width: 0 m: the length must be above 0"),
     "a huge id": (lambda t: t.replace("\n1,1,", "\n1,1e300,", 1), r"column id: 1e\+300 must have the drivingDirection"),
     "half an id": (lambda t: t.replace("\n1,1,", "\n1,1.5,", 1), r"column id: 1.5 must be a whole number, 0 or above"),
     "half written": (lambda t: t[:-20], "values, but the header has 25 columns; is the file complete?"),
@@ -100,12 +100,12 @@ REFUSED = {
     "empty": (lambda t: "", "lacks columns that files of highD have: frame, id"),
     "no UTF-8": (lambda t: "\udcff" + t, "cannot be read .*utf-8"),
     "half a frame": (lambda t: t.replace("\n2,1,", "\n2.5,1,", 1), "column frame: 2.5 must be a multiple of 0.04 s"),
-    "twice": (lambda t: t + t.splitlines()[1] + "\n", "line 3122: vehicle 1 is recorded twice for this time .see line 2"),
+    "twice": (lambda t: t + t.splitlines()[1] + "\n", "line 3122: vehicle 1 is recorded twice .* .see line 2"),
     "nobody ahead": (lambda t: re.sub(r",1,0,0,0,0,0,0,0,3\n", ",77,0,0,0,0,0,0,0,3\n", t), "vehicle 77, which is not"),
     "feet": (lambda t: scaled(t, 2.8, 1.5), "long, which is less than a third; lengths and speeds must be"),
-    "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m: the length must be above 0 and at most 40 m; highD is in m and m/s"),
+    "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m: the length must be .* at most 40 m; highD is in m/s"),
     "half as fast": (lambda t: scaled(t, 1.0, 0.4), r"gaps change 2\.\d\d times as much as they should by the speeds"),
-    "too fast": (lambda t: t.replace("-27.879", "-127.879"), "127.879 m/s: the speed must be at most 75 m/s; highD is in m and m/s"),
+    "too fast": (lambda t: t.replace("-27.879", "-127.879"), "127.879 m/s: the speed must be at most 75 m/s; highD is"),
 }  # fmt: skip
 
 
