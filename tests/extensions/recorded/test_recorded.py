@@ -103,7 +103,7 @@ REFUSED = {
     "twice": (lambda t: t + t.splitlines()[1] + "\n", "line 3122: vehicle 1 is recorded twice .* .see line 2"),
     "nobody ahead": (lambda t: re.sub(r",1,0,0,0,0,0,0,0,3\n", ",77,0,0,0,0,0,0,0,3\n", t), "vehicle 77, which is not"),
     "feet": (lambda t: scaled(t, 2.8, 1.5), "long, which is less than a third; lengths and speeds must be"),
-    "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m: the length must be .* at most 40 m; highD is in m/s"),
+    "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m: the length must be .* at most 40 m; highD is in m"),
     "half as fast": (lambda t: scaled(t, 1.0, 0.4), r"gaps change 2\.\d\d times as much as they should by the speeds"),
     "too fast": (lambda t: t.replace("-27.879", "-127.879"), "127.879 m/s: the speed must be at most 75 m/s; highD is"),
 }  # fmt: skip

@@ -132,7 +132,7 @@ WRONG = {
     ),
     "backwards": (
         [(*car[:3], -car[3], car[4], -car[5]) for car in CARS],
-        "in lane E1_0, positions .front. change 1.00 times as much as they should by .*, which are below 0; front must increase",
+        "in lane E1_0, positions .front. change 1.00 times as much .*, which are below 0; front must increase",
     ),
     "feet": (
         [(*car[:3], car[3] / 0.3048, *car[4:]) for car in CARS],
