@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.extensions.cooperation.curves import algorithms, sweep_figures, swept_axis, with_intervals
+from ethbrake_marl.extensions.cooperation.curves import Json, algorithms, sweep_figures, swept_axis, with_intervals
 from ethbrake_marl.extensions.report.style import (
     ALARM,
     GREY,
@@ -37,8 +36,6 @@ _LEAST_IN = 2.6  # least height of a figure, which leaves space for titles and c
 _LEAST_TICKS = 4
 
 _BESIDE = 0.42  # distance at which a level with a worse channel is drawn to the right of its level
-
-Json = dict[str, Any]
 
 
 def ablation_figures(results: Json, caption: str) -> list[Figure]:

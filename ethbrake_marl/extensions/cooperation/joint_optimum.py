@@ -122,11 +122,12 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 
 
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
-    """Return for each world, [n] bool, whether the learners of ``own`` can give all commands of those of ``other``.
+    """Return for each world, [n] bool, whether the learners of ``own`` can imitate the learners of ``other``.
 
-    This needs five conditions. The learners of ``other`` are also learners in ``own``. The scripts of ``own`` are also
-    scripts in ``other``. The lines of vehicles are the same. The latencies are equal. The decision times of ``other``
-    are also decision times of ``own``. If only ``own`` has an obstacle, the profiles are simulated again with it.
+    Imitation needs five conditions. The learners of ``other`` are also learners in ``own``. The scripts of ``own``
+    are also scripts in ``other``. The lines of vehicles are the same. The latencies are equal. The decision times
+    of ``other`` are also decision times of ``own``. If only ``own`` has an obstacle, the profiles are simulated
+    again with it.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.spec import split_names
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput, check_whole_number, count_of
 from ethbrake_marl.evaluation.identity import LIST_SEED
 from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.cooperation.sweep import Swept
@@ -111,7 +111,7 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
         ]
         levels.append(Level(scenario, same[0] if same else None))
     if len(levels) < 2:
-        raise InvalidInput(f"levels: there is {len(levels)}; give at least two levels to compare")
+        raise InvalidInput(f"levels: only {count_of(len(levels), 'level')}; give at least two levels to compare")
     return levels
 
 

@@ -38,8 +38,8 @@ def smallest_offset(measured: Floats, least: float, most: float) -> float:
     offsets, the result is ``least``.
 
     Args:
-        measured: [n, 2] absolute gradient, and the offset with which it was measured (0: no measurement yet). The
-            function compares the measurements with the smaller offsets and those with the larger offsets.
+        measured: [n, 2] absolute gradient, and the offset with which it was measured (0: no measurement yet). The half
+            of the measurements with the smaller offsets is compared with the other half.
         least: lower end of the range of offsets.
         most: upper end of the range of offsets.
 

@@ -45,9 +45,9 @@ class _TorchActor(Actor):
 class ChoosingActor(Deterministic):
     """Actor whose network scores a number of choices; it takes the choice with the highest score.
 
-    The choices with the numbers below ``first`` are trained policies, one of which then decides on the action. All
-    other choices are actions, evenly spaced from -1 to 1. The network ``learning`` is in training. The network
-    ``average`` has the running average of its weights, and drives.
+    Choices are numbered. A number below ``first`` means a trained policy, which then decides on the action. Each
+    other number means an action; the actions are evenly spaced from -1 to 1. The network ``learning`` is in training.
+    The network ``average`` has the running average of its weights, and drives.
 
     A memory stores the last M decisions at which C choices were tried. The *extra cost* of a choice is its cost minus
     the cost of the best tried choice. F is the number of features.
@@ -126,7 +126,7 @@ class ChoosingActor(Deterministic):
 
         Args:
             seen: [m, F] observations.
-            tried: [m, C] numbers of the tried choices, as from ``choose``; the actor itself took the one in column 0.
+            tried: [m, C] numbers of the tried choices, as from ``choose``; the actor itself took column 0.
             more: [m, C] extra cost of each tried choice over the best one.
 
         """

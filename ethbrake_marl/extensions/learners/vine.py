@@ -31,7 +31,7 @@ class Vine(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         """Return a new model for a training. It learns in ``environment``.
 
-        Its first weights are those of the policy that the recipe's key ``start`` names. Without this key they are
+        Its first weights are copied from the policy that the recipe's key ``start`` names. Without this key they are
         random.
         """
         recipe = training.recipe

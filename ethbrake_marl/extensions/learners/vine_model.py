@@ -90,7 +90,7 @@ class VineModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive in all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each of them.
+        """Drive in all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each one.
 
         Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
         """

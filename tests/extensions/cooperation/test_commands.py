@@ -15,7 +15,7 @@ REFUSED = [
         "study ablate --output new --levels cooperation-3-pair,cooperation-3-pair",
         "levels: 'cooperation-3-pair' is given twice",
     ),
-    ("study ablate --output new --levels cooperation-3-pair", "levels: there is 1; give at least two levels"),
+    ("study ablate --output new --levels cooperation-3-pair", "levels: only 1 level; give at least two levels"),
     (
         "study ablate --output new --levels cooperation-0-sensors,paper-distance",
         "level 'paper-distance': speeds_mps is 20, 18, 20, but",
