@@ -263,7 +263,12 @@ def test_paper__treats_every_label_and_everything_that_has_a_number_once(title: 
 
 
 def test_paper__says_how_the_report_and_the_code_differ_from_it() -> None:
-    sentences = ("one `k_energy` for all pairs", "but not masses and e", "predict 3.07", "above v_max when pushed")
+    sentences = (
+        "one `k_energy` for all pairs",
+        "but not masses and e",
+        "predicts a harm of 3.07",
+        "above v_max when pushed",
+    )
     assert "docs/internals/paper.md" in PAPER_NOTE and [each for each in sentences if each not in PAPER_TEXT] == []
 
 

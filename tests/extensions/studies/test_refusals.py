@@ -264,16 +264,12 @@ def compare(**changes: object) -> None:
 
 
 LEVELS: dict[str, Callable[[], object]] = {
-    "level 'mine': its mass_t differs from that of 'cooperation-2-paper' (4.5, 5.5, 6; there 4.5, 5.5": lambda: compare(
-        mass_t=[4.5, 5.5, 6]
-    ),
-    "level 'mine': its restitution differs from that of 'cooperation-2-paper' (0.2; there 0.1)": lambda: compare(
-        restitution=0.2
-    ),
-    "level 'mine': its latency_s differs from that of 'cooperation-2-paper'": lambda: compare(latency_s=[0, 0.5, 0.9]),
-    "level 'mine': its observation differs from that of 'cooperation-2-paper'": lambda: compare(observation=["own"]),
-    "recipe 'cooperation-ppo': turns = 5: is allowed with scheme: independent only; remove the key turns": lambda: (
-        with_scheme(eb.load_recipe("cooperation-ppo").replace(scheme="independent", turns=5), "shared")
+    "level 'mine': mass_t is 4.5, 5.5, 6, but 4.5, 5.5": lambda: compare(mass_t=[4.5, 5.5, 6]),
+    "level 'mine': restitution is 0.2, but 0.1 at level 'cooperation-2-paper'": lambda: compare(restitution=0.2),
+    "level 'mine': latency_s is 0, 0.5, 0.9, but 0, 0.5, 0.8": lambda: compare(latency_s=[0, 0.5, 0.9]),
+    "level 'mine': its observation differs from the observation of level": lambda: compare(observation=["own"]),
+    "recipe 'cooperation-ppo': turns = 5: is allowed with scheme: independent only": lambda: with_scheme(
+        eb.load_recipe("cooperation-ppo").replace(scheme="independent", turns=5), "shared"
     ),
 }
 
@@ -289,7 +285,7 @@ def test_levels__may_differ_in_roles_objective_obstacle_and_channel_alone() -> N
     free = LEVEL_2.replace(name="mine", roles=roles, objective="own", obstacle_gap_m=42, v2x="blocked")
     late = LEVEL_2.replace(name="late", v2x="blocked")
     assert len(common_worlds([Level(LEVEL_2), Level(free), Level(late)], 5, 7)) == 3
-    with refused("level 'late': its latency_s differs from that of 'mine' (0, 0.5, 0.9; there 0, 0.5, 0.8)"):
+    with refused("level 'late': latency_s is 0, 0.5, 0.9, but 0, 0.5, 0.8 at level 'mine'"):
         common_worlds([Level(LEVEL_2), Level(free), Level(late.replace(latency_s=[0, 0.5, 0.9]))], 5, 7)
 
 
