@@ -282,7 +282,7 @@ def suggestion(key: str, known: Iterable[str]) -> str:
     """
     names = sorted(known)
     if new := new_name(key, names):
-        return f"this key is now called {new}"
+        return f"it is now called {new}"
     stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
     same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
     close = [same] if same else get_close_matches(key, names, n=1)

@@ -119,7 +119,7 @@ def parse_strict_json(data: bytes) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file of a training run; raise ``InvalidInput`` with path and reason if it is invalid."""
+    """Return the JSON object in a file of a training run; raise ``InvalidInput`` if the file is missing or damaged."""
     if not os.path.lexists(file):
         raise InvalidInput(f"{file}: is missing, but the run cannot be used without it")
     data = read_plain(file, LARGEST_OBJECT_BYTES)

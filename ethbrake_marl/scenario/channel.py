@@ -235,8 +235,7 @@ class V2X(FileModel):
     )
     actuation_s: Seconds | None = Field(default=None, description="t_act, time until the receiver's brakes respond")
     sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = Field(
-        default=None,
-        description="[low, high]: range of the uniform delay after which a neighbour is seen (a hop)",
+        default=None, description="[low, high]: range of the uniform delay after which a neighbour is seen (a hop)"
     )
     persistence: Persistence | None = Field(
         default=None,
