@@ -166,7 +166,7 @@ class ArrayArchive:
         size = start + math.prod(header.shape) * np.dtype(header.dtype).itemsize
         if member.file_size != size:
             raise ValueError(
-                f"array {name!r} has {member.file_size:,} bytes; {header.dtype} {list(header.shape)} needs {size:,} bytes"
+                f"array {name!r} has {member.file_size:,} bytes; {header.dtype} {list(header.shape)} needs {size:,}"
             )
         self.headers[name], self._starts[name] = header, start
 

@@ -25,7 +25,7 @@ WIDE = 120  # smallest width of a terminal (characters) in which every column is
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimated value and its confidence interval; the interval is None if it cannot be computed (a single world)."""
+    """An estimate and its confidence interval; the interval is None if it cannot be computed (a single world)."""
 
     value: float  # estimated value
     interval: tuple[float, float] | None  # low and high end of the confidence interval

@@ -221,7 +221,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
     path, where = Path(table["file"]), document.where((*at, "table", "file"))
     if path.is_absolute() or ".." in path.parts:
         raise InvalidInput(
-            f"{where}: table.file = {table['file']}: must be a relative path to a file in or below the scenario's folder"
+            f"{where}: table.file = {table['file']}: must be a relative path in the scenario's folder"
         )
     with document.refusing_at((*at, "table", "file")):
         rows = read_rows(folder / path, table.get("columns"), table.get("weights"))

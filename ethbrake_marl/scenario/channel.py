@@ -284,7 +284,7 @@ class V2X(FileModel):
         self._require(low <= high, "sensing_s", "low must not be above high")
         silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
         blind = channel.senses == "none" and silent and channel.timing != "latency"
-        right = "a vehicle that may get no message must see the vehicle ahead, or it never reacts; use senses: both or front"
+        right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
         # name a key that the user gave: of the presets only paper has senses none
         self._require(not blind, "senses" if self.senses is not None else "lost", right)
         return self
