@@ -1,4 +1,4 @@
-"""The command ``doctor``: check versions and folders of this installation, and the physics on worlds with known results.
+"""The command ``doctor``: check the versions and folders of this installation, and the physics on known results.
 
 With ``--compile`` the command also compiles the physics.
 """

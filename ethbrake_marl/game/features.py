@@ -521,8 +521,8 @@ def register_feature(
 
     if reads is not None and not (of == "neighbour" and not isinstance(reads, str) and set(reads) <= set(PIECES)):
         raise InvalidInput(
-            f"feature {name!r}: reads = {reads!r}: must be a list of names from {', '.join(PIECES)}; only a feature of a"
-            " neighbour can have reads"
+            f"feature {name!r}: reads = {reads!r}: must be a list of names from {', '.join(PIECES)}; only a feature of"
+            " a neighbour can have reads"
         )
 
     feature = Feature(name, str(unit), float(scale), float(low), float(high), " ".join(str(function.__doc__).split()))

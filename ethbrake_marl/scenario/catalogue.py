@@ -220,9 +220,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
         return content
     path, where = Path(table["file"]), document.where((*at, "table", "file"))
     if path.is_absolute() or ".." in path.parts:
-        raise InvalidInput(
-            f"{where}: table.file = {table['file']}: must be a relative path in the scenario's folder"
-        )
+        raise InvalidInput(f"{where}: table.file = {table['file']}: must be a relative path in the scenario's folder")
     with document.refusing_at((*at, "table", "file")):
         rows = read_rows(folder / path, table.get("columns"), table.get("weights"))
         entries = {key: value for key, value in table.items() if key != "file"}  # the file's name does not matter
