@@ -124,7 +124,7 @@ def evaluate_command(
                 )
             if chosen.measures:
                 raise InvalidInput(
-                    f"--set measures: cannot be used for {scenario}, a group of {len(group)} scenarios; give one of them"
+                    f"--set measures: is impossible for {scenario}, a group of {len(group)} scenarios; give one of them"
                 )
             _evaluate_group(out, output, [_task_of(name, chosen) for name in group], agents, episodes, seed)
             return
@@ -306,8 +306,8 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
     text = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
     if text:
         out.note(
-            f"note: the bounds of the shield do not cover harm after the horizon ({horizon_s:g} s); number of worlds, of"
-            f" {worlds}, in which a vehicle still moves at the horizon: {text}"
+            f"note: the bounds of the shield do not cover harm after the horizon ({horizon_s:g} s); worlds (of"
+            f" {worlds}) in which a vehicle still moves at the horizon: {text}"
         )
 
 
@@ -319,9 +319,7 @@ def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
-_FILE = typer.Argument(
-    metavar="RESULTS.json", help="results.json of evaluate or run, or output of evaluate --json or shield --json."
-)
+_FILE = typer.Argument(metavar="RESULTS.json", help="results.json of evaluate or run, or output of evaluate --json.")
 
 
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:

@@ -73,11 +73,12 @@ def run_command(
 ) -> None:
     """Train a policy, shield it, compare it, and write a report.
 
-    Trains a single learner or a team. Writes a run's folder with policies, results as CSV and JSON, results per world, three figures and report.html. If
-    the scenario is one of the three tests (paper-random, paper-random-brake-only, paper-random-obstacle), the policy is
-    also evaluated on the other two. For a team, the report also shows the harm that each vehicle bears, and the effect
-    of each learner and of the messages, for which further policies are trained. Ctrl-C ends the training early and
-    evaluates the policy so far; a second Ctrl-C stops at once.
+    Trains a single learner or a team. Writes a run's folder with policies, results as CSV and JSON, results per
+    world, three figures and report.html. If the scenario is one of the three tests (paper-random, paper-random-
+    brake-only, paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also
+    shows the harm that each vehicle bears, and the effect of each learner and of the messages, for which further
+    policies are trained. Ctrl-C ends the training early and evaluates the policy so far; a second Ctrl-C stops at
+    once.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn

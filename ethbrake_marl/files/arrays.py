@@ -97,10 +97,10 @@ def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
     """
     length = int.from_bytes(data[:8], "little")
     if not 2 <= length <= min(len(data) - 8, HEADER_LIMIT_BYTES):
-        raise ValueError(f"is not a safetensors file (a header of {length} bytes in a file of {len(data)} bytes)")
+        raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)} bytes)")
     table = parse_strict_json(data[8 : 8 + length])
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
-        raise ValueError("is not a safetensors file (the header is not a JSON object of tensors)")
+        raise ValueError("not a safetensors file (the header is not a JSON object of tensors)")
     return {name: ArrayHeader(str(entry.get("dtype")), _lengths(entry.get("shape"))) for name, entry in table.items()}
 
 
@@ -198,12 +198,12 @@ def _check_directory(data: bytes) -> None:
     The check comes first because a zip reader creates an object for every entry of the directory.
     """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
-        raise ValueError("is not a plain .npz archive")
+        raise ValueError("not a plain .npz archive")
     disk, first_disk, here, members, size, start, comment = struct.unpack("<4H2LH", data[-18:])
     if disk or first_disk or comment or here != members or data[-42:-38] == b"PK\x06\x07":
-        raise ValueError("is not a plain .npz archive (it has several disks or a comment, or is a zip64 archive)")
+        raise ValueError("not a plain .npz archive (it has several disks or a comment, or is a zip64 archive)")
     if members > _MEMBERS_LIMIT or size > _DIRECTORY_LIMIT_BYTES or start + size != len(data) - 22:
-        raise ValueError(f"is not a plain .npz archive (its directory has {members} members in {size:,} bytes)")
+        raise ValueError(f"not a plain .npz archive (its directory has {members} members in {size:,} bytes)")
 
 
 @contextmanager

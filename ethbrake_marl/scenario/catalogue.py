@@ -245,8 +245,7 @@ _HEAD = """\
 #   {{normal: {{mean: 20, sd: 1, low: 18, high: 22}}}}    truncated to [low, high]
 #   {{lognormal: {{median: 1.1, sigma: 0.4, low: 0.3, high: 3}}}}    truncated to [low, high]
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
-# A single entry applies to every vehicle (each vehicle draws its own value). A list has one entry per vehicle, front to
-# rear.
+# A single entry is for all vehicles, each of which draws its own value. A list has one entry per vehicle.
 """
 
 

@@ -270,16 +270,17 @@ class V2X(FileModel):
         self._require(channel.persistence == "first" or sent, "persistence", right)
         if channel.hears == "none":
             self._leave_out(
-                ("link_latency_s", "lost", "vehicles", "tells", *_OF_MESSAGES), "with hears: none nobody gets messages"
+                ("link_latency_s", "lost", "vehicles", "tells", *_OF_MESSAGES),
+                "hears: none means that no vehicle gets messages",
             )
         elif channel.timing == "fixed":
             later = _OF_LATER if channel.persistence == "periodic" else ()
             parts = tuple(name for name in _OF_MESSAGES if name not in later)
-            self._leave_out(parts, "with link_latency_s the delay of a message is fixed")
+            self._leave_out(parts, "link_latency_s fixes the delay of messages")
         elif channel.timing == "latency":
             self._leave_out((*_OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
         if channel.senses == "none":
-            self._leave_out(("sensing_s",), "with senses: none no vehicle is in sight")
+            self._leave_out(("sensing_s",), "senses: none means that no vehicle is in sight")
         low, high = channel.sensing_s
         self._require(low <= high, "sensing_s", "low must not be above high")
         silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
@@ -295,7 +296,7 @@ class V2X(FileModel):
         ``why``: reason, for the error message.
         """
         for name in names:
-            self._require(getattr(self, name) is None, name, f"has no effect: {why}; leave {name} out")
+            self._require(getattr(self, name) is None, name, f"has no effect, because {why}; leave it out")
 
     def _require(self, holds: bool, name: str, right: str) -> None:
         value = getattr(self, name)

@@ -68,7 +68,7 @@ class ScriptSpec(NamedTuple):
         deceleration = parse_numeral(self.argument or "")
         if deceleration is None or not math.isfinite(deceleration):
             raise InvalidInput(
-                f"agent {str(self)!r}: after constant: must follow a finite deceleration in m/s2, for instance"
+                f"agent {str(self)!r}: constant needs a finite deceleration in m/s2 after the colon, for instance"
                 " constant:3.5"
             )
         return deceleration

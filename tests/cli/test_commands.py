@@ -298,7 +298,9 @@ def test_command__of_the_users_cannot_take_the_place_of_a_built_in_one(ethbrake,
         """Another one."""
 
     answer = ethbrake("evaluate", "--episodes", "3")
-    check_refused(answer, "command 'evaluate' is there already; give yours another name: app.command('my-evaluate')")
+    check_refused(
+        answer, "command 'evaluate' already exists; give your command another name: app.command('my-evaluate')"
+    )
 
 
 def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, monkeypatch):
@@ -336,7 +338,7 @@ def test_agent__that_raises_no_exception_is_told_in_one_line(ethbrake: Command, 
     (tmp_path / "bad.py").write_text(BAD)
     check_refused(
         ethbrake("evaluate", "--episodes", "2", "--agents", f"{tmp_path}/bad.py:Leaves"),
-        "code of yours ended the process: GeneratorExit: enough (bad.py, line 6)",
+        "your own code ended the process: GeneratorExit: enough (bad.py, line 6)",
     )
 
 

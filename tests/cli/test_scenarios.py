@@ -87,7 +87,7 @@ def test_explain__tells_every_quantity_that_is_declared(ethbrake: Command) -> No
         scenario = load_scenario(entry.name)
         keys = set(scenario.declared()) & set(QUANTITY.declared)
         assert all(QUANTITY.declared[key].meaning in told for key in keys), entry.name
-        assert scenario.title in told and f"cut off after {scenario.horizon_s:g} s" in told
+        assert scenario.title in told and f"truncated after {scenario.horizon_s:g} s" in told
     assert "Time gaps (s): 0.19 to 1.75 (normal, mean 0.97, sd 0.26), drawn for each pair" in " ".join(
         ethbrake("scenario", "explain", "realistic-motorway").out.split()
     )

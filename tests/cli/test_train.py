@@ -252,7 +252,7 @@ def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Pa
     graph = onnx.load(str(tmp_path / "policy.onnx")).graph
     assert [output.name for output in graph.output] == ["action", "acceleration_mps2"]
     monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
-    check_refused(ethbrake(*line), "is there already")
+    check_refused(ethbrake(*line), "already exists")
 
 
 # ---------------------------------------------------------------- parts of a report
