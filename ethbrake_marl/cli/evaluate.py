@@ -120,7 +120,7 @@ def evaluate_command(
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
             for option in (name for name, value in other.items() if value):
                 raise InvalidInput(
-                    f"{option}: cannot be used for {scenario}, a group of {len(group)} scenarios; give one scenario"
+                    f"{option}: is impossible for {scenario}, a group of {len(group)} scenarios; give one of them"
                 )
             if chosen.measures:
                 raise InvalidInput(

@@ -286,9 +286,9 @@ def scenario_new(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
-    """Write a new scenario file, NAME.yaml, with a comment for every key.
+    """Write a new scenario file, NAME.yaml, with comments.
 
-    If the scenario has a table, the rows of the table are written to NAME.csv in the same folder.
+    The file has every key. If the scenario has a table, the rows of the table are written to NAME.csv in the same folder.
     """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
@@ -357,7 +357,7 @@ def scenario_sample(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw worlds from a scenario, and show them as a table or picture.
+    """Draw worlds, and show them as a table or picture.
 
     The table has a column for each quantity that is not fixed in the scenario; `eb.read_worlds` reads such a table. The
     picture shows distributions, pairs of quantities, and three worlds. The same scenario, seed and number give the same
@@ -393,7 +393,7 @@ agent_group = typer.Typer(
 
 @agent_group.command("list", epilog=example("agent list"))
 def agent_list(as_json: JsonOption = False) -> None:
-    """List all agents, with the name, the method and the knowledge of each agent.
+    """List all agents, what they do and what they know.
 
     A name with + is appended to the name of an agent, for instance full_brake+step: first +search, then one shield.
     """

@@ -100,9 +100,17 @@ def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys,
 @pytest.mark.parametrize(
     ("loaded", "temporary", "told"),
     [
-        ([], False, "compiling the physics, once: minutes of one core; the result is stored\n"),
-        (["advance-1"], False, "compiling new parts of the physics, once; the result is stored\n"),
-        ([], True, "no folder can be written"),
+        (
+            [],
+            False,
+            "compiling the physics for the first time, which takes minutes; later commands use the stored result\n",
+        ),
+        (
+            ["advance-1"],
+            False,
+            "compiling parts of the physics for the first time; later commands use the stored result\n",
+        ),
+        ([], True, "no folder for compiled kernels is writable"),
     ],
 )
 def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, temporary, told) -> None:
@@ -321,7 +329,7 @@ def test_measures__asked_for_wrongly_are_one_line(ethbrake):
     check_refused(ethbrake("evaluate", "--set", "measures="), "--set measures: must be names with commas between them")
     check_refused(
         ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),
-        "--set measures: benchmark is a group",
+        "--set measures: is impossible for benchmark, a group",
     )
 
 
@@ -374,7 +382,7 @@ def test_sigterm__is_as_ctrl_c_while_processes_work_unless_somebody_else_answers
 
 
 def test_evaluate__says_where_the_uncertainty_of_robust_is_given_and_keeps_no_place_for_it(ethbrake: Command) -> None:
-    assert "+robust needs an uncertainty, which only Python can set" in " ".join(
+    assert "+robust needs an uncertainty, which can be set only in Python" in " ".join(
         ethbrake("evaluate", "--help").out.split()
     )
     (row,) = told_json(ethbrake("evaluate", "--episodes", "2", "--agents", "full_brake", "--json"))

@@ -75,7 +75,10 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_a_follower
     way = 0.6 * speed + 0.2 * speed + speed**2 / 18.0 - 0.75 * speed
     assert hardest == pytest.approx(3.6 * (speed**2 - 2.0 * 7.59 * way) ** 0.5, rel=1e-6)
     refused = ethbrake(*words, "--jobs", "2")
-    assert refused.status == 2 and "--jobs: standards is a group of 7 scenarios; give one of them" in refused.err
+    assert (
+        refused.status == 2
+        and "--jobs: is impossible for standards, a group of 7 scenarios; give one of them" in refused.err
+    )
 
 
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:

@@ -38,7 +38,7 @@ PARTS: dict[str, Callable[[], object]] = {
     "feature 'front_1.gap': the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a": lambda: (
         eb.register_feature("front_1.gap", TIME, **SCALED)
     ),
-    "feature 'mine': must be a function with a docstring that describes the feature": lambda: eb.register_feature(
+    "feature 'mine': must be a function with a docstring that describes the": lambda: eb.register_feature(
         "mine", 3, **SCALED
     ),
     "feature 'mine': scale = 0: must be above 0": lambda: eb.register_feature("mine", TIME, **SCALED | {"scale": 0.0}),
@@ -87,9 +87,7 @@ PARTS: dict[str, Callable[[], object]] = {
     "preset 'mine': lost = 2: must be less than or equal to 1": lambda: eb.register_preset(
         "mine", {"preset": "clear", "lost": 2.0}
     ),
-    "preset paper generates no messages; leave loss_begins out": lambda: eb.register_preset(
-        "mine", {"loss_begins": 0.1}
-    ),
+    "preset paper generates no messages; leave it out": lambda: eb.register_preset("mine", {"loss_begins": 0.1}),
     "preset 'mine': settings = 'clear': must be a mapping such as {'lost'": lambda: eb.register_preset("mine", "clear"),
     "objective 'Mine': the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a": lambda: (
         eb.register_objective("Mine", gives(0.0))
@@ -184,7 +182,7 @@ def test_name__is_unknown(message: str) -> None:
     ids=["feature", "measure by step", "objective", "measure by impacts"],
 )
 def test_part__needs_a_docstring_and_a_name_that_no_other_part_has(register: Callable[[Any], None]) -> None:
-    with refused(" 'mine': must be a function with a docstring that describes the feature"):
+    with refused(" 'mine': must be a function with a docstring that describes the"):
         register(lambda *given: given[0])
     ours = gives(lambda first: np.zeros(len(first.time_s) if hasattr(first, "time_s") else first.worlds.n))
     register(ours)
@@ -284,17 +282,17 @@ def test_policy__observes_the_features_that_it_was_trained_on(urgency: Any, mess
 
 def test_channel__of_the_user_is_checked_and_listed_as_ours() -> None:
     eb.register_preset("wired", {"preset": "nominal", "link_latency_s": 0.4})
-    with refused("v2x.radio_s = 0.1: has no effect: with link_latency_s the delay of a message is fixed; leave"):
+    with refused("v2x.radio_s = 0.1: has no effect, because link_latency_s fixes the delay of messages"):
         PAPER.replace(v2x={"preset": "wired", "radio_s": 0.1})
     with refused(
-        "v2x.preset = wierd: must be a preset: paper, clear, nominal, congested, blocked or, sensors-only or wired"
+        "v2x.preset = wierd: must be a preset: paper, clear, nominal, congested, blocked, sensors-only or wired"
     ):
         PAPER.replace(v2x="wierd")
 
 
 @pytest.mark.parametrize(
     ("few", "kind"),
-    [(lambda n: np.zeros(n, bool), "truth per world"), (lambda n: np.zeros((n, 3)), "number per vehicle")],
+    [(lambda n: np.zeros(n, bool), "truth value per world"), (lambda n: np.zeros((n, 3)), "number per vehicle")],
     ids=["truth", "number per vehicle"],
 )
 def test_measure__always_gives_what_it_gave_when_it_was_registered(few: Any, kind: str) -> None:

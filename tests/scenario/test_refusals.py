@@ -233,10 +233,10 @@ V2X: dict[str, Callable[[], object]] = {
     "line 15: v2x.radio_s = 0.1: has no effect, because link_latency_s fixes the delay of messages": lambda: given(
         v2x="{preset: clear, link_latency_s: 0.1, radio_s: 0.1}"
     ),
-    "line 15: v2x.radio_s = 0.1: has no effect: with hears: none nobody gets": lambda: given(
+    "line 15: v2x.radio_s = 0.1: has no effect, because hears: none means that no vehicle gets": lambda: given(
         v2x="{preset: clear, hears: none, radio_s: 0.1}"
     ),
-    "senses: none no vehicle is in sight; leave sensing_s out": lambda: given(v2x="{sensing_s: [0.8, 1]}"),
+    "senses: none means that no vehicle is in sight; leave it out": lambda: given(v2x="{sensing_s: [0.8, 1]}"),
     "must be a preset (paper, clear, nominal, congested, blocked, sensors-only)": lambda: given(v2x="5"),
     "v2x = {preset: blocked}: vehicle_3 may get its first news as late as 2.2 s; this time must be": lambda: given(
         v2x="blocked", horizon_s="2"
@@ -331,7 +331,7 @@ CALLS: dict[str, Callable[[], object]] = {
     "agent 'constant:-2.01': drives harder than the driving": lambda: ScriptSpec.parse("constant:-2.01").command(
         [7.0, 6.0], [3.0, 2.0]
     ),
-    "agent 'constant:nan': constant needs a finite deceleration in m/s2, for instance": lambda: ScriptSpec.parse(
+    "agent 'constant:nan': constant needs a finite deceleration in m/s2 after the colon": lambda: ScriptSpec.parse(
         "constant:nan"
     ).command([7.0, 6.0], [3.0, 2.0]),
     "agent 'full_brake:3': full_brake takes no argument": lambda: ScriptSpec.parse("full_brake:3").command(
@@ -415,5 +415,5 @@ def test_unknown_scenario__is_told_a_file_that_is_near(near: str, name: str, emp
 
 def test_file__has_the_name_of_its_scenario(empty_folder: Path) -> None:
     Path("other.yaml").write_text(new_scenario_text("mine"))
-    with refused("other.yaml, line 14: name = mine: must be the file's name without ending, other; change the name"):
+    with refused("other.yaml, line 13: name = mine: must be the file's name without ending, other; change the name"):
         load_scenario("other.yaml")

@@ -227,7 +227,10 @@ def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_piece
         ),
         ({"tells": ["mass", "mass"]}, "v2x.tells = [mass, mass]: must not list an item twice"),
         ({"tells": {"vehicle_2": "mass"}}, "v2x.tells.vehicle_2 = mass: must be a list of items from place, speed"),
-        ({"preset": "sensors-only", "tells": ["mass"]}, "v2x.tells = [mass]: has no effect: with hears: none nobody"),
+        (
+            {"preset": "sensors-only", "tells": ["mass"]},
+            "v2x.tells = [mass]: has no effect, because hears: none means that no",
+        ),
         (
             {"preset": "nominal", "tells": {"vehicle_3": []}, "vehicles": {"vehicle_3": {"sends": False}}},
             "v2x.tells.vehicle_3: has no effect, because vehicle_3 sends no messages",

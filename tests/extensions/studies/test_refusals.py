@@ -297,8 +297,8 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "scenario 'mixture-delays': is a mixture; use one of its scenarios: paper-delay-low": lambda: ranges(
         load_scenario("mixture-delays")
     ),
-    "scenario 'cooperation-2-blocked': its v2x channel has delays and losses, which a table of worlds": lambda: (
-        ranges(load_scenario("cooperation-2-blocked"))
+    "scenario 'cooperation-2-blocked': its v2x channel has delays and losses, which a table of worlds": lambda: ranges(
+        load_scenario("cooperation-2-blocked")
     ),
     "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same": lambda: ranges(
         load_scenario("paper-scenario-1")
