@@ -288,7 +288,7 @@ def scenario_new(
 ) -> None:
     """Write a new scenario file, NAME.yaml, with comments.
 
-    The file has every key. If the scenario has a table, the rows of the table are written to NAME.csv in the same folder.
+    The file has every key. If the scenario has a table, its rows are written to NAME.csv in the same folder.
     """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"

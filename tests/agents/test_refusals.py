@@ -78,7 +78,9 @@ SPECS: dict[str, Callable[[], object]] = {
     "agent 'profile:0=3,1=5+step': a profile is a role of a scenario, fixed at the alert; it is no agent": lambda: (
         make_agent("profile:0=3,1=5+step", scenario=PAPER)
     ),
-    "agent 'policy': a policy is needed: policy@PATH, where": lambda: make_agent("policy+step", scenario=PAPER),
+    "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of": lambda: make_agent(
+        "policy+step", scenario=PAPER
+    ),
 }
 
 
@@ -119,16 +121,16 @@ OWN: dict[str, Callable[[], object]] = {
     "agent 'own' of vehicle_2: act on 12 worlds at 0.50 s: ZeroDivisionError: division by zero": lambda: evaluated(
         Own(lambda worlds: 1 / 0)
     ),
-    "memory: act gave a memory of another form ((dtype('float64'),)) than it was given (None)": lambda: evaluated(
+    "memory: act got a memory of the form None and returned the form (dtype('float64'),)": lambda: evaluated(
         Remembers(lambda n: None, lambda m, n: np.zeros(n))
     ),
-    "memory: act gave a memory of another form ({'a': (dtype('float64'),), 'b': (dtype('float64'),)})": lambda: (
-        evaluated(Remembers(lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)}))
+    "and returned the form {'a': (dtype('float64'),), 'b': (dtype('float64'),)}": lambda: evaluated(
+        Remembers(lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)})
     ),
-    "memory: act gave a memory of another form ((dtype('int64'),)) than it was given": lambda: evaluated(
+    "and returned the form (dtype('int64'),); keys": lambda: evaluated(
         Remembers(np.zeros, lambda m, n: np.zeros(n, np.int64))
     ),
-    "memory: act gave a memory of another form ((dtype('float64'), 2)) than it was given": lambda: evaluated(
+    "and returned the form (dtype('float64'), 2); keys": lambda: evaluated(
         Remembers(lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)))
     ),
     "agent 'mine' of vehicle_2: memory: key 'b.c'; must be a name": lambda: evaluated(
@@ -137,7 +139,7 @@ OWN: dict[str, Callable[[], object]] = {
     "agent 'mine' of vehicle_2: memory: key 0; must be a name": lambda: evaluated(
         Remembers(lambda n: {0: np.zeros(n)}, lambda m, n: m)
     ),
-    "agent 'mine' of vehicle_2: memory: an array of objects; it must hold numbers, truths or texts": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory: an array of objects; it must contain numbers": lambda: evaluated(
         Remembers(lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m)
     ),
     "the closed form of E-V2X-BM and planner: brakes of world 0 build up (brake_rate_mps3": lambda: evaluated(
@@ -156,16 +158,20 @@ def test_agent_of_a_user__is_refused(message: str) -> None:
 
 
 FAILED: dict[str, Callable[[], object]] = {
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape (12, 1); one number per world": lambda: evaluated(
-        Own(lambda worlds: np.zeros((worlds.n, 1)))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape (12, 1); one number per world": lambda: (
+        evaluated(Own(lambda worlds: np.zeros((worlds.n, 1))))
     ),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape ()": lambda: evaluated(Own(lambda worlds: 1.0)),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave object of shape ()": lambda: evaluated(Own(lambda worlds: None)),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave <U1 of shape (12,); one number per world is needed": lambda: (
-        evaluated(Own(lambda worlds: ["x"] * worlds.n))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape ()": lambda: evaluated(
+        Own(lambda worlds: 1.0)
     ),
-    "agent 'own', world 7, vehicle_2 at 0.50 s: gave float64 of shape (7,); one number per world": lambda: evaluated(
-        Own(lambda worlds: np.zeros(7))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned object of shape ()": lambda: evaluated(
+        Own(lambda worlds: None)
+    ),
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned <U1 of shape (12,); one": lambda: evaluated(
+        Own(lambda worlds: ["x"] * worlds.n)
+    ),
+    "agent 'own', world 7, vehicle_2 at 0.50 s: act returned float64 of shape (7,); one number per world": lambda: (
+        evaluated(Own(lambda worlds: np.zeros(7)))
     ),
     "agent 'own', world 4, vehicle_2 at 0.50 s: command nan m/s2; must be in [-7, 7]": lambda: evaluated(
         Own(lambda worlds: np.where(np.arange(worlds.n) == 4, np.nan, 0.0))
@@ -331,7 +337,7 @@ def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() ->
         def begin(self, worlds: Any) -> None:
             return None
 
-    with refused("agent 'own' of vehicle_2: has begin, and act without a memory; one that remembers has"):
+    with refused("agent 'own' of vehicle_2: the agent has begin, but act takes no memory; an agent with memory has"):
         evaluated(Begins(len))
 
 

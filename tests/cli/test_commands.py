@@ -133,7 +133,7 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     captured = capsys.readouterr()
     first, *more = captured.err.splitlines()
     assert captured.out == "" and told in f"{first}\n" and more  # each as long as it lasts
-    assert all(re.fullmatch(r"still compiling: \d+ kernels are done, after \d+ s", line) for line in more)
+    assert all(re.fullmatch(r"still compiling: \d+ kernels are done after \d+ s", line) for line in more)
     time.sleep(0.1)
     assert capsys.readouterr().err == ""  # nothing is compiled any more
 
@@ -326,7 +326,9 @@ def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, m
 
 
 def test_measures__asked_for_wrongly_are_one_line(ethbrake):
-    check_refused(ethbrake("evaluate", "--set", "measures="), "--set measures: must be names with commas between them")
+    check_refused(
+        ethbrake("evaluate", "--set", "measures="), "--set measures: must be names of measures with commas between them"
+    )
     check_refused(
         ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),
         "--set measures: is impossible for benchmark, a group",

@@ -20,8 +20,7 @@ from tests.fixtures.commands import Answer, Command, check_refused, rows_of, tol
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = (ROOT / "docs" / "first-ten-minutes.md").read_text("utf-8")
-SCENARIOS = (ROOT / "docs" / "scenarios.md").read_text("utf-8")
-ADD, OWN_DATA = SCENARIOS.partition("\n## From Python\n")[0], SCENARIOS.partition("\n## Your own vehicle data\n")[2]
+OWN_DATA = (ROOT / "docs" / "scenarios.md").read_text("utf-8").partition("\n## Your own vehicle data\n")[2]
 
 
 SCRIPTS = """

@@ -173,7 +173,7 @@ def test_compare__difference_is_paired_by_world_where_every_world_is_there(resul
     both = [found.differences[1].harms["total_harm"].value for found in (paired, apart)]
     assert both[0] == pytest.approx(both[1])
     assert [found.to_json()["intervals"] for found in (paired, apart)] == ["paired", "unpaired"]
-    assert "alone.json has none" in str(apart.unpaired_because)
+    assert "alone.json was written without such a file" in str(apart.unpaired_because)
 
 
 def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command, results: Path) -> None:
@@ -196,8 +196,8 @@ def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command,
     ("wrong", "says"),
     [
         ({"horizon_ends": -1}, "horizon_ends = -1: must be 0 to "),
-        ({"horizon_ends": "3"}, "horizon_ends is missing or no int"),
-        ({"vehicle_1_shoved_m": "far"}, "vehicle_1_shoved_m = 'far': must be metres, or null"),
+        ({"horizon_ends": "3"}, "horizon_ends is missing or not of type int"),
+        ({"vehicle_1_shoved_m": "far"}, "vehicle_1_shoved_m = 'far': must be a number of metres, or null"),
     ],
 )
 def test_compare__refuses_what_no_evaluation_wrote(results: Path, wrong: dict[str, Any], says: str) -> None:
@@ -281,7 +281,7 @@ def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
 
 def check_extra(ethbrake: Command, package: str, extra: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    missing = f"needs the package {package}, which is not installed: {sys.executable} -m pip install"
+    missing = f"needs the package {package}, which is not installed; install it with: {sys.executable} -m pip install"
     check_refused(ethbrake(*line.split()), f"{missing} 'ethbrake-marl[{extra}]'\n")
     assert list(Path().iterdir()) == []
 

@@ -274,7 +274,9 @@ def test_action__as_a_number_or_one_float32_step_beyond_1_is_the_same(name: str)
 def test_options__an_unknown_one_warns_and_is_ignored(name: str) -> None:
     interface = make(name)
     expected = interface.reset(5)
-    with pytest.warns(UnknownResetOption, match="reset: unknown option colour, ignored; known: initial_state") as seen:
+    with pytest.warns(
+        UnknownResetOption, match="unknown keys colour, which are ignored; known keys: initial_state"
+    ) as seen:
         given = interface.reset(5, {"colour": "red"})
     assert len(seen) == 1 and np.array_equal(given, expected)
 

@@ -35,8 +35,9 @@ This page is made from the code: `python -m tests.docs.layout`.
 | How do I add a column to every evaluation? | [a set of measures](../extend.md#a-set-of-measures) |
 """
 END = """
-`scenarios/` has one YAML file per scenario, `train/` the training recipes; those of an extension
-are in a folder of its name. The wheel contains both. [How the code is tested](tests.md).
+`scenarios/` has one YAML file per scenario, and `train/` one per training recipe. The files of an
+extension are in a folder with the extension's name. The wheel contains both folders. Another page
+explains [how the code is tested](tests.md).
 """
 
 

@@ -1,6 +1,7 @@
 """A random sample of sentences for a new reader to judge: ``python -m tests.docs.sentences --seed 62``.
 
-It prints as many sentences of docstrings as of pages and of messages, each with the place where it stands.
+It prints as many sentences of docstrings as of pages and of messages, each with its place and the sentence before it.
+The description of an argument is printed with the argument's name.
 """
 
 import argparse
@@ -12,7 +13,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "ethbrake_marl"
-END = re.compile(r"(?<=[.?!:])\s+(?=[A-Z`*\[])")
+END = re.compile(r"(?<=[.?!])\s+(?=[A-Z`*])")
+SECTION = re.compile(r"(?m)^(?:Args|Returns|Raises|Yields|Attributes):\n")
+ENTRY = re.compile(r"\n(?= {4}\*{0,2}\w+(?:, \w+)*: )")  # before an argument's name
+
+Found = tuple[str, str, str]  # place, sentence, and the sentence before it in the same paragraph
 
 
 def main() -> None:
@@ -24,21 +29,23 @@ def main() -> None:
     draw = random.Random(asked.seed)
     for kind, source in (("Docstrings", docstrings()), ("Pages", pages()), ("Messages", messages())):
         print(f"\n## {kind}\n")
-        for number, (place, sentence) in enumerate(draw.sample(sorted(set(source)), asked.each), 1):
-            print(f"{number}. {sentence}\n   ({place})")
+        for number, (place, sentence, before) in enumerate(draw.sample(sorted(set(source)), asked.each), 1):
+            print(f"{number}. {sentence}\n   ({place}{f'; before it: {before}' if before else ''})")
 
 
-def docstrings() -> Iterator[tuple[str, str]]:
+def docstrings() -> Iterator[Found]:
     """Each sentence of the package's docstrings, with file and name."""
     for path, tree in _modules():
         for node in ast.walk(tree):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
                 name = getattr(node, "name", "module")
                 for paragraph in re.split(r"\n\s*\n", text.partition(">>>")[0]):
-                    yield from _sentences(paragraph, f"{path}, {name}")
+                    about, *entries = SECTION.split(paragraph)
+                    for part in [about, *(entry for section in entries for entry in ENTRY.split(f"\n{section}"))]:
+                        yield from _sentences(part, f"{path}, {name}")
 
 
-def pages() -> Iterator[tuple[str, str]]:
+def pages() -> Iterator[Found]:
     """Each sentence of README and docs, without code, tables, headings, decisions and what is generated."""
     for path in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
         place = path.relative_to(ROOT).as_posix()
@@ -50,7 +57,7 @@ def pages() -> Iterator[tuple[str, str]]:
                 yield from _sentences(re.sub(r"^\s*(-|\d+\.) ", "", paragraph), place)
 
 
-def messages() -> Iterator[tuple[str, str]]:
+def messages() -> Iterator[Found]:
     """Each text of an exception, a warning or a ``help=`` in the package; ``{...}`` stands for a value."""
     for path, tree in _modules():
         for node in ast.walk(tree):
@@ -63,7 +70,7 @@ def messages() -> Iterator[tuple[str, str]]:
             for text in texts:
                 written = _written(text)
                 if len(written.split()) > 3:
-                    yield f"{path}:{text.lineno}", written
+                    yield f"{path}:{text.lineno}", written, ""
 
 
 def _written(node: ast.expr) -> str:
@@ -85,10 +92,12 @@ def _modules() -> Iterator[tuple[str, ast.Module]]:
         yield path.relative_to(ROOT).as_posix(), ast.parse(path.read_text("utf-8"))
 
 
-def _sentences(paragraph: str, place: str) -> Iterator[tuple[str, str]]:
+def _sentences(paragraph: str, place: str) -> Iterator[Found]:
+    before = ""
     for sentence in END.split(" ".join(paragraph.split())):
         if len(sentence.split()) > 3:
-            yield place, sentence
+            yield place, sentence, before
+        before = sentence
 
 
 if __name__ == "__main__":

@@ -165,12 +165,14 @@ def test_objective__is_refused(message: str) -> None:
 
 
 ENGINE: dict[str, Callable[[], object]] = {
-    "engine: deciders (3,) must be from 0 to 2": lambda: Engine(PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)),
-    "engine snapshot: state is (6, 20); (7, 20) is needed": lambda: make_engine(PAPER, 7).restore(
-        make_engine(PAPER, 6).snapshot()
+    "engine: deciders = (3,): must be vehicle indices": lambda: Engine(
+        PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)
     ),
-    "renew: rows [1, 9]; must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
-    "observe: vehicle index 'vehicle_2'; must be in 0..2": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
+    "engine snapshot: the array state has the shape (6, 20); the shape (7, 20) is": lambda: make_engine(
+        PAPER, 7
+    ).restore(make_engine(PAPER, 6).snapshot()),
+    "renew: rows = [1, 9]: must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
+    "observe: vehicle = 'vehicle_2': must be a vehicle index": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
     "since: the earlier ledger is not of the same episodes; call since before a": lambda: make_engine(
         PAPER, 6
     ).ledger.since(make_engine(PAPER, 1).ledger),
@@ -209,14 +211,14 @@ def test_episode__starts_at_the_alert_without_an_impact() -> None:
 
 def test_branch__has_an_end_and_no_shaping() -> None:
     shaped = make_engine(PAPER, 2, reward={"harm": 1.0, "shaping": 0.1})
-    with refused("branches: reward: shaping = 0.1: must be 0; a branch has an end"):
+    with refused("branches: the reward has shaping = 0.1; it must be 0 for branches"):
         shaped.branch(shaped.moment())
 
 
 def test_snapshot__of_another_engine_is_refused() -> None:
     kept = make_engine(PAPER, 6).snapshot()
-    with refused("engine snapshot: params is (6, 25); (6, 37) is needed"):
+    with refused("engine snapshot: the array params has the shape (6, 25); the shape (6, 37) is needed"):
         make_engine(load_scenario("cooperation-2-blocked"), 6).restore(kept)
     del kept["params"]
-    with refused("engine snapshot: params is nothing; (6, 25) is needed"):
+    with refused("engine snapshot: the array params is missing; the shape (6, 25) is needed"):
         make_engine(PAPER, 6).restore(kept)

@@ -192,7 +192,9 @@ def test_number_of_actions__is_at_least_2(name: str, count: Any) -> None:
 
 
 def test_number_of_actions__is_refused_where_nobody_learns() -> None:
-    with pytest.raises(InvalidInput, match="actions = 9: nobody learns in 'paper-random'; leave it out"):
+    with pytest.raises(
+        InvalidInput, match="actions = 9: scenario 'paper-random' has no learner; omit actions, or pass"
+    ):
         eb.parallel_env(learners=[], actions=9)
 
 

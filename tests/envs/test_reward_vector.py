@@ -114,9 +114,9 @@ def test_component__that_is_none_is_refused_by_name(name: str, known: str) -> No
 
 
 def test_number__where_a_vector_is_asked_for() -> None:
-    with pytest.raises(InvalidInput, match="reward_space: rewards are numbers here"):
+    with pytest.raises(InvalidInput, match="reward_space: the rewards of this environment are numbers"):
         eb.parallel_env().reward_space("vehicle_2")
-    with pytest.raises(InvalidInput, match="LinearReward makes one of a vector"):
+    with pytest.raises(InvalidInput, match="wrap the environment in mo_gymnasium's LinearReward"):
         env = eb.CostEnv(eb.EthBrakeEnv(reward_vector="vehicles"))
         env.reset(seed=0)
         env.step(np.zeros(1))
@@ -157,5 +157,5 @@ def test_turns__with_numbers_have_no_space_of_vectors() -> None:
     turns = eb.env()
     turns.reset(seed=1)
     assert turns.rewards["vehicle_1"] == 0 and not hasattr(turns, "reward_spaces")
-    with pytest.raises(InvalidInput, match="reward_space: rewards are numbers here"):
+    with pytest.raises(InvalidInput, match="reward_space: the rewards of this environment are numbers"):
         turns.reward_space("vehicle_1")

@@ -210,7 +210,7 @@ def test_step__that_a_guard_rolls_back_leaves_the_impacts_as_they_were() -> None
 
 def test_place__is_refused_as_nobody_knows_the_impacts() -> None:
     engine = eb.make_engine(CRASH, 1, reward=INJURY)
-    with refused("place: reward: injury_lr4s needs every impact"):
+    with refused("place: the reward injury_lr4s needs every impact"):
         engine.place(engine.worlds)
 
 
@@ -334,7 +334,7 @@ def test_weights__of_measures_may_be_negative_and_of_built_in_terms_not() -> Non
         "reward: harm: must be given together with injury_lr4s, because its default weight is 1; write harm: 1"
     ):
         reward_params({"injury_lr4s": -1.0})
-    with refused("measure 'injury': stands for several of other names"):
+    with refused("measure 'injury' is an entry point that defines parts with other names"):
         reward_params({"harm": 1.0, "injury": -1.0})
 
 

@@ -42,9 +42,9 @@ POLICIES: dict[str, Callable[[], object]] = {
     "observation[1, 2] = nan: must be finite": lambda: actor()(np.array([[0, 0, 0, 0], [0, 0, np.nan, 0]], np.float32)),
     "observation[0, 1] = inf: must be finite": lambda: actor()(np.array([[0, np.inf, 0, 0]], np.float32)),
     "agent 'universal@runs/x': universal takes no policy": lambda: make_lineup(["universal@runs/x"], PAPER),
-    "': that policy was trained by sac; write sac@": lambda: make_lineup([f"ppo@{shipped_policies()['sac']}"], PAPER),
+    "': the policy was trained by sac; write sac@": lambda: make_lineup([f"ppo@{shipped_policies()['sac']}"], PAPER),
     "agent 'ppo@': a path is needed after '@'": lambda: make_lineup(["ppo@"], PAPER),
-    "agent 'policy': a policy is needed: policy@PATH, where PATH is a run": lambda: make_lineup(["policy"], PAPER),
+    "agent 'policy' needs a policy: write policy@PATH": lambda: make_lineup(["policy"], PAPER),
     "unknown shipped policy 'ppo-paper-random-obstacle'; it is now called 'ppo-obstacle'": lambda: load_shipped(
         "ppo-paper-random-obstacle"
     ),

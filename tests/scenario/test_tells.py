@@ -261,7 +261,7 @@ def test_agents__who_looks_ahead_refuses_to_do_without_a_piece(spec: str, refuse
         assert evaluation().hidden.all()  # as over a channel that hides something
         return
     with pytest.raises(
-        InvalidInput, match=r"vehicle_3 does not tell its mass \(v2x: tells\), .*latency, mass of others are needed"
+        InvalidInput, match=r"vehicle_3 do not contain its mass \(v2x: tells\), .*, mass of the other vehicles are"
     ):
         evaluation()
 
@@ -276,14 +276,14 @@ def test_agents__of_its_own_vehicle_nobody_needs_a_message() -> None:
 def test_e_v2x_bm_pairwise__needs_no_mass_and_every_other_piece() -> None:
     for piece in ("place", "speed", "braking_capacity", "latency"):
         lacking = PAPER.replace(v2x={"tells": [each for each in USUAL_PIECES if each != piece]})
-        with pytest.raises(InvalidInput, match=f"vehicle_1 does not tell its {piece}"):
+        with pytest.raises(InvalidInput, match=f"vehicle_1 do not contain its {piece}"):
             eb.evaluate(lacking.sample(2, 7), {"e": eb.make_agent("e_v2x_bm:pairwise")}, scenario=lacking)
 
 
 def test_shield__stands_before_a_team_only_if_all_its_vehicles_tell_all() -> None:
     team = eb.load_scenario("cooperation-3-pair")
     lacking = team.replace(v2x={**team.v2x.model_dump(exclude_none=True), "tells": {"vehicle_2": ["place", "speed"]}})
-    with pytest.raises(InvalidInput, match="shield: vehicle_2 does not tell its braking_capacity"):
+    with pytest.raises(InvalidInput, match="shield: messages of vehicle_2 do not contain its braking_capacity"):
         eb.shield(eb.parallel_env(lacking)).reset(seed=7)
     alone = lacking.with_learners(["vehicle_2"])  # what it tells, its own shield does not need
     eb.shield(eb.parallel_env(alone)).reset(seed=7)
@@ -318,7 +318,7 @@ def test_own_features__say_what_they_read_or_are_refused() -> None:
 
 
 def test_run__refuses_before_it_trains_because_its_baseline_and_its_shield_would(tmp_path: Path) -> None:
-    where = r"run, with the baseline e_v2x_bm and a shield: vehicle_3 does not tell its mass \(v2x: tells\)"
+    where = r"run, with the baseline e_v2x_bm and a shield: messages of vehicle_3 do not contain its mass"
     with pytest.raises(InvalidInput, match=where):
         run_experiment(LIGHT, tmp_path / "run", recipe=eb.load_recipe("ppo"), episodes=5)
     assert not (tmp_path / "run").exists()

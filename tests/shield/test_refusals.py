@@ -220,7 +220,7 @@ def test_second_shield__is_refused_because_a_bound_holds_for_one_alone(interface
     ("actions", "message"),
     [
         ({}, "shield: no action was given, and there is no policy that could propose one"),
-        ([0.0], "step: actions = [0.0]: must be a mapping such as {'vehicle_2': [-1.0]}"),
+        ([0.0], "step: actions = [0.0]: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}"),
         ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full"),
         ({"vehicle_2": np.array([1.5])}, "action of vehicle_2: 1.5; must be from -1 (full braking) to 1 (full"),
         ({"vehicle_2": np.array([1j])}, "action of vehicle_2: array([0.+1.j]) is not a number"),
@@ -263,7 +263,7 @@ def test_closed_shield__is_refused_and_cannot_be_used() -> None:
 def test_snapshot__is_restored_before_the_shield_is_put_around() -> None:
     env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
     env.reset()
-    with refused("engine snapshot: a shield stands in this engine; restore first, then put the shield around"):
+    with refused("engine snapshot: this engine has a shield, whose memory a snapshot does not contain"):
         env.env_method("restore", env.venv.snapshot())
 
 
@@ -279,7 +279,7 @@ def test_step_wait__needs_a_step() -> None:
 def test_episode_that_began_before_the_shield__is_not_certified() -> None:
     plain = EthBrakeEnv()
     plain.reset(seed=3)
-    with refused("shield: this episode began before the shield was put around it; reset first", UncertifiedStep):
+    with refused("shield: this episode began before the shield was added; call reset first", UncertifiedStep):
         ShieldedEnv(plain).step([1.0])
 
 

@@ -121,7 +121,7 @@ def test_old_news__are_moved_on_until_their_sender_stands() -> None:
 
 
 def test_agent__that_is_made_for_another_time_step_is_refused() -> None:
-    with refused("agent 'cacc' was made for decisions every 0.1 s; scenario 'two' has one every 0.4 s"):
+    with refused("agent 'cacc' was made for decisions every 0.1 s; scenario 'two' has a decision every 0.4 s"):
         eb.evaluate(agents={"cacc": eb.make_agent("cacc")}, scenario=TWO.replace(time_step_s=0.4), episodes=2)
 
 

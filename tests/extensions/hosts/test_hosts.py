@@ -546,7 +546,7 @@ def test_running__worlds_that_cannot_be_are_refused():
     alert, engine = PAPER.sample(3, 7).worlds, eb.make_engine(PAPER, 2)
     with pytest.raises(eb.EthBrakeError, match=r"gaps_m\[0, 1\] = -1: must be finite and in \[0, inf\]"):
         alert.running(1.0, [1.0, -1.0], 3.0)
-    with pytest.raises(eb.EthBrakeError, match="place: 3 worlds of 3 vehicles; 2 of 3 needed"):
+    with pytest.raises(eb.EthBrakeError, match="place: got 3 worlds of 3 vehicles; 2 worlds of 3"):
         engine.place(alert)
 
 

@@ -94,7 +94,7 @@ def test_training__starts_from_nothing_where_no_policy_ships_and_says_so(tmp_pat
     result = train(SHIPPED.replace(**SMALL, **STILL), name, tmp_path / "run", on_progress=tell)
     told = f"random weights, as no ppo ships for scenario {name!r}"
     assert json.loads((tmp_path / "run" / "run.json").read_text())["start"] == result.training.begins == told
-    assert notes[0] == f"begins with {told}"
+    assert notes[0] == f"initial weights: {told}"
     assert result.policy.tensors["policy.output.bias"] == pytest.approx(-0.9, abs=1e-3)
     seen = np.random.default_rng(0).uniform(0, 1, (50, result.policy.observation.size)).astype(np.float32)
     np.testing.assert_allclose(result.policy(seen), -0.9, atol=0.1)

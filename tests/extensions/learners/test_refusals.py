@@ -74,7 +74,9 @@ REFUSED: dict[str, Callable[[], object]] = {
         start="sac@x"
     ),
     "'ppo@shipped' is now written ppo": lambda: TINY_VINE.replace(start="ppo@shipped"),
-    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_VINE.replace(n_envs=2**22),
+    "n_envs x n_steps = 16777216 decisions per update are too many (at most 4194304)": lambda: TINY_VINE.replace(
+        n_envs=2**22
+    ),
     "must be single, shared, independent or centralised": lambda: TINY_VINE.replace(scheme="centralized"),
     "memory = 15: must be at least tried = 16": lambda: TINY_ROLLOUTS.replace(memory=15),
     "must hold a range if there are neither fixed": lambda: TINY_ROLLOUTS.replace(near=[], fixed=[], drawn=0),

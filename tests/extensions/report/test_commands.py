@@ -40,7 +40,7 @@ def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finishe
     assert told["intervals"] == "paired" and policies["trained policy"] == "same"
     assert all(each["total_harm_difference_interval"] == [0.0, 0.0] for each in told["agents"])
     tests = ethbrake("compare", results, finished_run / "other_tests.json")
-    check_refused(tests, "each test needs a file of its own")
+    check_refused(tests, "write the results of each test to its own file")
     page = (finished_run / "report.html").read_text()
     assert all(json.loads(results.read_text())[0][name] in page for name in ("worlds_sha256", "scenario_sha256"))
     for count in ("first", "total"):
@@ -49,7 +49,7 @@ def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finishe
     told = told_json(ethbrake("compare", tmp_path / "first.json", tmp_path / "first.json", "--json"))
     found = {each["agent"]: each["harm_difference"] for each in told["agents"]}
     assert found == {f"full_brake ({mode})": 0.0 for mode in ("none", "episode", "step", "step-alert")}
-    check_refused(ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json"), "is about another harm than")
+    check_refused(ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json"), "their counts of harm differ")
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -67,7 +67,7 @@ FIGURES: dict[str, Callable[[], object]] = {
     "harm_against_total_gap: bins = 0; at least 1 is needed": lambda: harm_against_total_gap(
         eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), bins=0
     ),
-    "agent 'ppo' was not evaluated; evaluated: full_brake": lambda: harm_against_total_gap(
+    "agent 'ppo' was not evaluated; evaluated agents: full_brake": lambda: harm_against_total_gap(
         eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), agents=["ppo"]
     ),
     "map.png.eps: pictures are written as PNG, SVG or PDF": lambda: picture_ending("map.png.eps"),

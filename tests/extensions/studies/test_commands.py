@@ -59,10 +59,7 @@ FALSIFIED = [
         "study falsify --agent coast --budget 10 --measure difference",
         "--measure difference: compares two agents; say which is the other one, --against AGENT",
     ),
-    (
-        "study falsify --agent coast --against coast --budget 10",
-        "agent 'coast' is listed twice; each agent drives every world once",
-    ),
+    ("study falsify --agent coast --against coast --budget 10", "agent 'coast' is listed twice; list each agent once"),
     (
         "study falsify --agent full_brake --measure harm --against coast --budget 10",
         "--against coast: --measure harm compares with nobody; use regret or difference",

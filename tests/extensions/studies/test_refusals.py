@@ -107,7 +107,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 2: measure.world: unknown key; did you mean worlds?": lambda: plan(measure={"world": 10}),
     "t.yaml, line 2: prune.after_trials = -1: must be greater than or equal": lambda: plan(prune={"after_trials": -1}),
     "t.yaml, line 3: sampler.name = grid: must be tpe or random": lambda: plan(sampler={"name": "grid"}),
-    "t.yaml, line 2: scenario 'cooperation-0-sensors': no vehicle learns; give at least one the role": lambda: plan(
+    "t.yaml, line 2: scenario 'cooperation-0-sensors' has no learner; give at least one vehicle the role": lambda: plan(
         WRITTEN.replace("paper-random", "cooperation-0-sensors", 1)
     ),
     "t.yaml, line 6: recipe 'ppo': vf_coef = -0.5: must be greater than or equal to 0": lambda: plan(
@@ -207,7 +207,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "jobs[1] (paper-random, ppo, seed 0, gamma=0.995): is the same training as jobs[0] (paper-random": lambda: sweep(
         {"jobs": [GRID, {**GRID, "set": {"gamma": 0.995}}]}
     ),
-    "scenario 'cooperation-0-sensors': no vehicle learns; give at least one the role learner": lambda: sweep(
+    "scenario 'cooperation-0-sensors' has no learner; give at least one vehicle the role learner": lambda: sweep(
         {"jobs": [{"scenario": "cooperation-0-sensors", "recipe": "ppo"}]}
     ),
     "--set network.policy.9: '9' must be an index from 0 to 1": lambda: sweep(
@@ -272,8 +272,8 @@ LEVELS: dict[str, Callable[[], object]] = {
     ),
     "level 'mine': its latency_s differs from that of 'cooperation-2-paper'": lambda: compare(latency_s=[0, 0.5, 0.9]),
     "level 'mine': its observation differs from that of 'cooperation-2-paper'": lambda: compare(observation=["own"]),
-    "recipe 'cooperation-ppo': turns = 5: is for scheme: independent only; leave it out": lambda: with_scheme(
-        eb.load_recipe("cooperation-ppo").replace(scheme="independent", turns=5), "shared"
+    "recipe 'cooperation-ppo': turns = 5: is allowed with scheme: independent only; remove the key turns": lambda: (
+        with_scheme(eb.load_recipe("cooperation-ppo").replace(scheme="independent", turns=5), "shared")
     ),
 }
 
@@ -309,7 +309,7 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "--measure difference: compares two agents; say which is the other one, --against AGENT": lambda: Measure.of(
         "difference", "full_brake", None, PAPER, "first"
     ),
-    "agent 'full_brake' is listed twice; each agent drives every world once": lambda: Measure.of(
+    "agent 'full_brake' is listed twice; list each agent once": lambda: Measure.of(
         "regret", "full_brake", "full_brake", PAPER, "first"
     ),
     "agent 'full_brake': tells no bound; --measure bound is for an agent behind a shield": lambda: Measure.of(
