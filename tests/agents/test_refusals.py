@@ -74,7 +74,7 @@ SPECS: dict[str, Callable[[], object]] = {
     "harm_count 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
     "horizon_s = 0.0: must be a positive number of seconds": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
     "agent name 'mine:x': must be a plain name without argument": lambda: register_agent("mine:x", Own),
-    "file 'nowhere/none.py': there is no such file": lambda: make_agent("nowhere/none.py:make_agent"),
+    "file 'nowhere/none.py': does not exist": lambda: make_agent("nowhere/none.py:make_agent"),
     "agent 'profile:0=3,1=5+step': a profile can only be a role in a scenario, not an agent": lambda: make_agent(
         "profile:0=3,1=5+step", scenario=PAPER
     ),
@@ -91,10 +91,10 @@ def test_agent__is_refused(message: str) -> None:
 
 
 SEARCHES: dict[str, Callable[[], object]] = {
-    "agent 'constant:7.5': above the braking capacity 7 m/s2": lambda: (
+    "agent 'constant:7.5': brakes harder than the braking capacity of 7 m/s2": lambda: (
         Asked(make_agent("constant:7.5")).begin(WORLDS, 1).act(WORLDS, 1)
     ),
-    "agent 'constant:-7.5': above the driving capacity 7 m/s2": lambda: (
+    "agent 'constant:-7.5': drives harder than the driving capacity of 7": lambda: (
         Asked(make_agent("constant:-7.5")).begin(WORLDS, 1).act(WORLDS, 1)
     ),
     "vehicle = 3: must be an index from 0 to 2": lambda: optimise_pairwise(WORLDS, 3),
@@ -102,7 +102,7 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "team 't': key 'vehicle_2': must be the index of a vehicle, 0 or more": lambda: Team({"vehicle_2": BRAKE}, "t"),
     "team 't': 'coast' of vehicle_2: must be an agent, for instance": lambda: Team({1: "coast"}, "t"),
     "team 't': drives vehicle_2; must drive exactly vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
-    "scenario 'cooperation-3-pair': needs one controlled vehicle; controlled are: vehicle_2, vehicle_3": lambda: (
+    "scenario 'cooperation-3-pair': exactly one vehicle must be controlled here; the controlled vehicles are": lambda: (
         eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle
     ),
     "agent 'coast' drives vehicle_3, but vehicle_2 of scenario 'cooperation-3-pair'": lambda: eb.evaluate(
@@ -267,7 +267,7 @@ def raising(): raise KeyError("weights")"""
         ("My+File.py:make_agent:3", "the function make_agent has no parameters; leave out argument"),
         ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is not an agent, because it has no name and no act"),
         ("My+File.py:raising", "agent 'My+File.py:raising': KeyError: 'weights' (My+File.py, line 4)"),
-        ("My+File.py:nobody", "file 'My+File.py': has no 'nobody'; name what it defines: My+File.py:NAME"),
+        ("My+File.py:nobody", "file 'My+File.py': does not define 'nobody'; after the colon, give a name that it"),
     ],
 )
 def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Path) -> None:
@@ -280,13 +280,15 @@ def test_file_of_an_agent__is_the_same_as_long_as_the_process_lives(empty_folder
     Path("mine.py").write_text(FILE)
     make_agent("mine.py:make_agent")
     Path("mine.py").write_text(f"{FILE}# changed")
-    with refused("file 'mine.py': was changed since it was loaded; begin a new process"):
+    with refused("file 'mine.py': has changed since it was loaded; start a new Python process"):
         make_agent("mine.py:make_agent")
 
 
 def test_file_of_an_agent__is_not_run_for_a_role(empty_folder: Path) -> None:
     Path("half.py").write_text("raise SystemExit('this ran')")
-    with refused("agent 'half.py:make_agent': is a function of a Python file, and those are loaded only where"):
+    with refused(
+        "agent 'half.py:make_agent': is a function in a Python file; a scenario cannot use one, only the option"
+    ):
         PAPER.replace(roles={"vehicle_1": "half.py:make_agent"})
 
 

@@ -42,11 +42,14 @@ SCENARIOS = [
         "scenario name 'Not Good': must be 1 to 64 lower case letters, digits, - and _, beginning",
     ),
     ("scenario new mine --based-on paper-randm", "unknown scenario 'paper-randm'; did you mean 'paper-random'?"),
-    ("scenario new mine --output nowhere", "nowhere/mine.yaml: there is no folder nowhere; make it first"),
+    ("scenario new mine --output nowhere", "nowhere/mine.yaml: the folder nowhere does not exist; create it first"),
     ("scenario new mine --output /proc", "/proc/mine.yaml: cannot be written (No such file or directory)"),
     ("scenario sample paper-random --episodes 0", "number of worlds = 0: must be a whole number, at least 1"),
-    ("scenario sample paper-random --output x.txt", "x.txt: worlds must end in .csv or .png or .svg or .pdf"),
-    ("evaluate --scenario nowhere/mine.yaml", "nowhere/mine.yaml: no such file"),
+    (
+        "scenario sample paper-random --output x.txt",
+        "x.txt: the name of a file with worlds must end in .csv or .png or .svg",
+    ),
+    ("evaluate --scenario nowhere/mine.yaml", "nowhere/mine.yaml: the file does not exist"),
 ]
 
 
@@ -65,9 +68,9 @@ EVALUATIONS = [
     ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; list each agent once"),
     (
         "evaluate --agents coast,",
-        "agent '': must be name or name:argument, the name in lower case letters, digits and _ @ . -",
+        "agent '': must be name or name:argument, for instance full_brake or constant:3.5; a name begins with a",
     ),
-    ("evaluate --agents constant:7.5", "agent 'constant:7.5': above the braking capacity 7 m/s2"),
+    ("evaluate --agents constant:7.5", "agent 'constant:7.5': brakes harder than the braking capacity of 7 m/s2"),
     (
         "evaluate --agents policy",
         "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of a run or a policy bundle,",
@@ -88,8 +91,8 @@ EVALUATIONS = [
     ("evaluate --agents ppo@shipped/ppo", "'ppo@shipped/ppo' is now written ppo"),
     ("agent export shipped/ppo --onnx policy.onnx", "'shipped/ppo' is now written ppo"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
-    ("evaluate --per-world csv", "--per-world: needs a folder for it: --output FOLDER"),
-    ("evaluate --report", "--report: needs a folder for it: --output FOLDER"),
+    ("evaluate --per-world csv", "--per-world: can be used only with a folder; add --output FOLDER"),
+    ("evaluate --report", "--report: can be used only with a folder; add --output FOLDER"),
 ]
 
 
@@ -101,7 +104,7 @@ def test_evaluation__is_refused(line: str, message: str, refuse: Refuse) -> None
 TRAININGS = [
     ("run --recipe pp", "unknown recipe 'pp'; did you mean 'ppo'?"),
     ("run --list-seed -1", "seed of the list = -1: must be a whole number, at least 0"),
-    ("train --recipe nowhere/ppo.yaml", "nowhere/ppo.yaml: no such file"),
+    ("train --recipe nowhere/ppo.yaml", "nowhere/ppo.yaml: the file does not exist"),
     ("train --steps 0", "recipe 'ppo': total_steps = 0: must be greater than or equal to 1"),
     ("train --output /proc/x", "/proc/x: No such file or directory"),
     (
@@ -113,7 +116,7 @@ TRAININGS = [
         "recipe 'ppo': scheme = centralized: must be single, shared, independent or centralised",
     ),
     ("train --resume .", ".: is not the folder of a run; name the folder of a run, for instance"),
-    ("agent export ppo --onnx none/policy.onnx", "none/policy.onnx: there is no folder none; make it first"),
+    ("agent export ppo --onnx none/policy.onnx", "none/policy.onnx: the folder none does not exist; create it first"),
     (
         "shield --agents ppo+episode",
         "agent 'ppo+episode' already has a shield, and this command adds its own; name the agent without a",
@@ -143,7 +146,11 @@ def write_scenario(old: str, new: str) -> None:
             "mine.yaml, line 76: restitution = .nan: must be a finite number",
         ),
         ("vehicle_3: full_brake\n", "vehicle_3: ful_brake\n", "unknown agent 'ful_brake'; did you mean 'full_brake'?"),
-        ("\nname: mine", "\nname: mine\nname: mine", "line 14, column 1: key 'name' is given twice, first on line 13"),
+        (
+            "\nname: mine",
+            "\nname: mine\nname: mine",
+            "line 14, column 1: key 'name' occurs twice; the first is on line 13",
+        ),
         ("vehicle_3: full_brake\n", "vehicle_3: coast:4\n", "agent 'coast:4': coast takes no argument"),
     ],
 )
@@ -175,13 +182,13 @@ def test_run__needs_a_learner(refuse: Refuse) -> None:
 def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refuse: Refuse) -> None:
     Path(file).parent.mkdir(exist_ok=True)
     Path(file).write_text("precious")
-    refuse(line, f"{file}: is there already; give another name or use force (--force)")
+    refuse(line, f"{file}: already exists; give another name, or replace the file with force")
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("evaluate --output file/x", "is no folder; give a folder of its own (--output)"),
+        ("evaluate --output file/x", "file/x"),
         ("run --output file/x", "file: Not a directory"),
         ("train --output . --force", ".: already exists and is not the folder of a run; choose another name"),
     ],
@@ -210,7 +217,11 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
             "--agents bad.py:make",
             "file 'bad.py', line 2: file 'bad.py': loads itself",
         ),
-        ("worst = 3\n", "--set measures=bad.py:worst", "measure 'worst': needs a function with a docstring"),
+        (
+            "worst = 3\n",
+            "--set measures=bad.py:worst",
+            "measure 'worst': must be a function with a docstring that describes the",
+        ),
         (
             "worst = 3\n",
             "--agents bad.py:worst",
@@ -220,7 +231,7 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
         (
             "import ethbrake_marl as eb\ndef slow(): return eb.policy_agent(lambda seen: exit(0))\n",
             "--agents bad.py:slow --episodes 3",
-            "code of yours ended the process: SystemExit: 0",
+            "your own code ended the process: SystemExit: 0",
         ),
     ],
     ids=["fails", "exits", "takes a name", "loads itself", "no function", "no maker", "unknown measure", "exits later"],

@@ -75,7 +75,10 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_a_follower
     way = 0.6 * speed + 0.2 * speed + speed**2 / 18.0 - 0.75 * speed
     assert hardest == pytest.approx(3.6 * (speed**2 - 2.0 * 7.59 * way) ** 0.5, rel=1e-6)
     refused = ethbrake(*words, "--jobs", "2")
-    assert refused.status == 2 and "--jobs: standards is a group of 7 scenarios; give one of them" in refused.err
+    assert (
+        refused.status == 2
+        and "--jobs: is impossible for standards, a group of 7 scenarios; give one of them" in refused.err
+    )
 
 
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
@@ -91,7 +94,7 @@ def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(eth
 def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch) -> None:
     monkeypatch.setattr("ethbrake_marl.evaluation.chunks.evaluate_held", lambda *args, **kwargs: pytest.fail("worked"))
     refused = ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5")
-    check_refused(refused, "agent 'constant:99': above the braking capacity 7 m/s2")
+    check_refused(refused, "agent 'constant:99': brakes harder than the braking capacity of 7 m/s2")
 
 
 # Lists of agents and worlds
@@ -118,7 +121,7 @@ def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and
     assert vars(lineup["e_v2x_bm"]) == before
     capacity = worlds.vehicles.braking_capacity_mps2[:, 1]
     between = (capacity[0] + capacity.min()) / 2  # the first world could, another could not
-    with pytest.raises(InvalidInput, match="above the braking capacity"):
+    with pytest.raises(InvalidInput, match="brakes harder than the braking capacity"):
         check_agents(make_lineup([f"constant:{between}"], scenario), worlds, scenario)
 
 

@@ -40,7 +40,9 @@ MADE: dict[str, Callable[[], object]] = {
     "observation = 'x': must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields": lambda: (
         parallel_env(observation="x")
     ),
-    "observation: front = 'two'; must be a whole number in 0..64": lambda: parallel_env(observation={"front": "two"}),
+    "observation: front = 'two'; must be a whole number from 0 to 64": lambda: parallel_env(
+        observation={"front": "two"}
+    ),
     "observation: chosen = 3; must be a list of features": lambda: parallel_env(observation={"chosen": 3}),
     "agents = 'scripted': must be 'all' or 'learners'": lambda: parallel_env(agents="scripted"),
     "agents = 'learners': scenario 'paper-random' has no learner; pass": lambda: parallel_env(
@@ -79,7 +81,7 @@ MADE: dict[str, Callable[[], object]] = {
         eb.make_sb3_vec_env(PAPER, 3).set_attr("label", 8, indices=0)
     ),
     "must be an environment made by gymnasium.make_vec('EthBrake-v0')": lambda: eb.ShieldedVectorEnv(parallel_env()),
-    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, here learners": lambda: (
+    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, but here all learners": lambda: (
         eb.make_sb3_vec_env(FIVE, 3, learners=PAIR, observation={"vehicle_3": ["own"]})
     ),
     "observe_all: vehicle_2, vehicle_3 observe different features; use observe for each": lambda: eb.make_engine(
@@ -92,7 +94,7 @@ MADE: dict[str, Callable[[], object]] = {
         PAPER.replace(observation={"vehicle_2": ["own", "own.speed"]})
     ),
     "scenario 'paper-random': observation = {}: must be a list of groups": lambda: PAPER.replace(observation={}),
-    "observe different features, here learners must observe the same: give one list for all": lambda: eb.train(
+    "observe different features, but here all learners must observe the same features; give one list": lambda: eb.train(
         "cooperation-ppo", FIVE.with_learners(PAIR).replace(observation={"vehicle_2": ["own"]}), "run", scheme="shared"
     ),
 }
@@ -108,10 +110,10 @@ STEPS: dict[str, Callable[[], object]] = {
     "step: the action of learner vehicle_2 is missing": lambda: started(parallel_env(FIVE, learners=PAIR)).step(
         {"vehicle_3": [0.0]}
     ),
-    "action of vehicle_3: nan; must be in [-1, 1], from full braking to full driving": lambda: started(
+    "action of vehicle_3: nan; must be from -1 (full braking) to 1 (full driving)": lambda: started(
         parallel_env(FIVE, learners=PAIR)
     ).step({"vehicle_2": [0.0], "vehicle_3": [np.nan]}),
-    "action of vehicle_3: -1.01; must be in [-1, 1], from full braking to full driving": lambda: started(
+    "action of vehicle_3: -1.01; must be from -1 (full braking) to 1 (full driving)": lambda: started(
         parallel_env(FIVE, learners=PAIR)
     ).step({"vehicle_2": [0.0], "vehicle_3": [-1.01]}),
     "step: actions = None: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}": lambda: started(
@@ -136,10 +138,10 @@ STEPS: dict[str, Callable[[], object]] = {
     "scenario 'paper-random' has 2 learners (vehicle_2, vehicle_3); this environment needs exactly one": lambda: (
         eb.EthBrakeEnv(PAPER, learners=PAIR)
     ),
-    "action of the learners: shape (3, 2); (3, 1) is needed": lambda: started(eb.EthBrakeVectorEnv(3)).step(
+    "action of the learners: has shape (3, 2); must have shape (3, 1)": lambda: started(eb.EthBrakeVectorEnv(3)).step(
         np.zeros((3, 2), np.float32)
     ),
-    "action of vehicle_2: nan; must be in [-1, 1], from full braking to full driving": lambda: started(
+    "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full driving)": lambda: started(
         eb.EthBrakeVectorEnv(2)
     ).step(np.full((2, 1), np.nan)),
     "env_method: indices = [1]: must not be passed, because all rows belong to one environment": lambda: (
@@ -219,5 +221,5 @@ def test_world__that_was_left_out_is_not_described() -> None:
 
 def test_action__is_compared_after_the_rounding_of_float32() -> None:
     beyond = np.nextafter(np.float32(1), np.float32(2))
-    with refused("action of vehicle_2: 1.000000238418579; must be in [-1, 1], from full braking to full driving"):
+    with refused("action of vehicle_2: 1.000000238418579; must be from -1 (full braking) to 1 (full driving)"):
         started(eb.EthBrakeVectorEnv(2)).step(np.full((2, 1), np.nextafter(beyond, np.float32(2))))

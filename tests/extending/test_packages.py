@@ -131,7 +131,7 @@ def test_package__that_pip_installs_drives_measures_pays_and_commands(tmp_path: 
         return done.stdout
 
     assert (
-        "hello      From the installed package hills." in told("--help")
+        "hello      Command of the installed package hills." in told("--help")
         and told("hello", "you", "--loud") == "hello you!\n"
     )
     assert "gentle[:ARGUMENT]" in told("agent", "list") and "+softer[:ARGUMENT]" in told("agent", "list")
@@ -162,7 +162,7 @@ def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: 
     install(
         "hills", HILLS, agents=AGENTS, objectives={"front-first": "hills:front_first"}, commands={"hi": "hills:hello"}
     )
-    assert run_command(["--help"]) == 0 and "From the installed package hills." in capsys.readouterr().out
+    assert run_command(["--help"]) == 0 and "Command of the installed package hills." in capsys.readouterr().out
     assert "gentle" in eb.agent_names()
     assert eb.make_agent("full_brake").name == "full_brake" and "hills" not in sys.modules and not versions_used()
     assert eb.make_agent("gentle:0.8").share == 0.8  # type: ignore[union-attr]
@@ -233,7 +233,10 @@ def test_name__that_two_packages_give_is_told_with_both(install: Install, capsys
     with pytest.raises(InvalidInput, match=r"agent 'coast' is defined by several .*, ethbrake-marl and valleys"):
         eb.make_agent("coast")
     assert eb.make_agent("full_brake").name == "full_brake"
-    assert run_command(["--help"]) == 0 and "From the installed packages hills and valleys." in capsys.readouterr().out
+    assert (
+        run_command(["--help"]) == 0
+        and "Command of the installed packages hills and valleys." in capsys.readouterr().out
+    )
     assert run_command(["evaluate", "--episodes", "3"]) == 2
     assert (
         "command 'evaluate' is defined by several installed packages, ethbrake-marl and hills"

@@ -110,11 +110,11 @@ SETTINGS: dict[str, Callable[[], object]] = {
     "--set gamma, line 1, column 2: not valid YAML: expected the node content, but found '<stream end>'": lambda: (
         read_settings(["gamma=["], [PPO])
     ),
-    "--set gamma: is given twice": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
+    "--set gamma: this setting is given twice; give it once": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
     "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(
         ["reward.terminl=1"], [PPO]
     ).change(PPO),
-    "--set gamma.x: there is nothing inside 0.995; set the whole value": lambda: read_settings(
+    "--set gamma.x: 'x' cannot be set, because 0.995 is neither a mapping nor a": lambda: read_settings(
         ["gamma.x=1"], [PPO]
     ).change(PPO),
     "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable(
@@ -271,13 +271,13 @@ def test_folder__of_another_training_is_refused(
             '{"format": "ethbrake',
             "run/run.json: is damaged: Unterminated string starting at: line 1 column 12 (char 11)",
         ),
-        ("[]", "run/run.json: is damaged: holds no JSON object"),
+        ("[]", "run/run.json: is damaged: the content is not a JSON object"),
         ("{}", "run/run.json: format = None: must be ethbrake-run"),
         (
             '{"format": "ethbrake-run", "status": "done"}',
             "run/run.json: status = 'done': must be running or finished or",
         ),
-        (None, "run/run.json: is missing; nothing goes on without it"),
+        (None, "run/run.json: is missing, but the run cannot be used without it"),
     ],
     ids=["cut off", "a list", "empty", "other status", "missing"],
 )
@@ -318,7 +318,10 @@ def test_training_that_has_finished__says_how_to_measure_it(run: RunDirectory) -
 
 def test_lock__is_held_by_one_and_is_a_file(empty_folder: Path) -> None:
     Path("some.lock").mkdir()
-    with refused("some.lock: cannot be used as a lock (Is a directory); delete it"), hold_lock(Path("some.lock"), ""):
+    with (
+        refused("some.lock: cannot be used as a lock (Is a directory); delete this file"),
+        hold_lock(Path("some.lock"), ""),
+    ):
         pass
     with (
         hold_lock(Path("other.lock"), "somebody works here"),

@@ -331,7 +331,7 @@ def test_new_folder__is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "a" / "bad") as partial:
         (partial / "x").touch()
         raise KeyboardInterrupt
-    with pytest.raises(AlreadyExists, match="taken: is there already"), new_folder(tmp_path / "a" / "taken"):
+    with pytest.raises(AlreadyExists, match="taken: already exists"), new_folder(tmp_path / "a" / "taken"):
         (tmp_path / "a" / "taken").mkdir()  # meanwhile, by somebody else
     assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["a", "a/good", "a/good/x", "a/taken"]
 

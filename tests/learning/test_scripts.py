@@ -119,7 +119,7 @@ def test_single_file__advantages_by_hand(script: str) -> None:
         (["--copies", "0"], "copies = 0: must be a whole number, at least 1"),
         (["--minibatch", "0"], "minibatch = 0: must be a whole number, at least 1"),
         (["--seed", "-1"], "seed"),
-        (["--output", "there"], "there: is there already"),
+        (["--output", "there"], "there: already exists"),
         (["--harm-count", "all"], "harm_count"),
         (["--scenario", "cooperation-0-sensors"], "has no learner"),
     ],

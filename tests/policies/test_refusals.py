@@ -80,7 +80,7 @@ def test_folder_of_a_policy__is_a_plain_folder(make: Callable[[Path], None], emp
 def test_files_of_a_policy__are_plain_files(empty_folder: Path) -> None:
     listen(Path("manifest.json"))
     Path("weights.safetensors").touch()
-    with refused("manifest.json: is not a plain file but a device, a pipe or a socket", CorruptBundle):
+    with refused("manifest.json: is a device, a pipe or a socket; must be a plain file", CorruptBundle):
         load_policy(".")
 
 
@@ -88,7 +88,7 @@ def test_folder_of_a_policy__holds_one_and_replaces_none(empty_folder: Path) -> 
     Path("empty").mkdir()
     with refused("empty: contains no policy; give the folder of a policy bundle"):
         load_policy("empty")
-    with refused("empty: is there already; give another name", AlreadyExists):
+    with refused("empty: already exists; give another name", AlreadyExists):
         SHIPPED.save(Path("empty"))
 
 

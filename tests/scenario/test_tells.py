@@ -209,7 +209,7 @@ def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_piece
     lacks = Messages.of(mixture.sample(60, 7).worlds).withhold_from(1)
     assert lacks.any() and not lacks.all()
     entries[1]["scenario"] = PAPER.replace(name="part-1").declared()
-    with pytest.raises(InvalidInput, match=r"mixture: part-0 has v2x\.tells and part-1 has none: give it in each"):
+    with pytest.raises(InvalidInput, match=r"mixture: part-0 has v2x\.tells, but part-1 does not; write"):
         eb.Scenario(name="both", mixture=entries)
 
 
@@ -223,14 +223,17 @@ def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_piece
         ),
         (
             {"tells": {}},
-            "v2x.tells = {}: must be a list of place, speed, acceleration, braking_capacity, latency, mass",
+            "v2x.tells = {}: must be a list of items from place, speed, acceleration, braking_capacity, latency",
         ),
-        ({"tells": ["mass", "mass"]}, "v2x.tells = [mass, mass]: names a piece twice"),
-        ({"tells": {"vehicle_2": "mass"}}, "v2x.tells.vehicle_2 = mass: must be a list of place"),
-        ({"preset": "sensors-only", "tells": ["mass"]}, "v2x.tells = [mass]: hears none has no messages; leave it out"),
+        ({"tells": ["mass", "mass"]}, "v2x.tells = [mass, mass]: must not list an item twice"),
+        ({"tells": {"vehicle_2": "mass"}}, "v2x.tells.vehicle_2 = mass: must be a list of items from place, speed"),
+        (
+            {"preset": "sensors-only", "tells": ["mass"]},
+            "v2x.tells = [mass]: has no effect, because hears: none means that no",
+        ),
         (
             {"preset": "nominal", "tells": {"vehicle_3": []}, "vehicles": {"vehicle_3": {"sends": False}}},
-            "v2x.tells.vehicle_3: sends no messages (v2x.vehicles)",
+            "v2x.tells.vehicle_3: has no effect, because vehicle_3 sends no messages",
         ),
     ],
 )
@@ -305,9 +308,9 @@ def test_own_features__say_what_they_read_or_are_refused() -> None:
         assert seen_by(engine_of(LINE, unsaid), 1) == pytest.approx({unsaid[0]: 1.18, unsaid[1]: 0.9})
         lacking = LINE.replace(v2x={"tells": {"vehicle_3": ["place"]}})
         assert seen_by(engine_of(lacking, said), 1) == pytest.approx({said[0]: 0.0, said[1]: 0.9})
-        with pytest.raises(InvalidInput, match=r"feature .double_mass.: vehicle_3 does not tell its speed .*reads="):
+        with pytest.raises(InvalidInput, match=r"feature 'double_mass': the messages of vehicle_3 do not contain its"):
             seen_by(engine_of(lacking, unsaid), 1)
-        with pytest.raises(InvalidInput, match="reads = 'mass': a neighbour's feature names some of place, speed"):
+        with pytest.raises(InvalidInput, match="reads = 'mass': must be a list of names from place, speed"):
             register_feature("double_mass_3", double_mass, **limits, reads="mass")
     finally:
         for name in ("double_mass", "double_mass_read"):

@@ -207,7 +207,9 @@ def test_interior__takes_no_script_that_it_cannot_enclose() -> None:
 def test_interior__takes_no_command_beyond_the_least_capacity() -> None:
     weak = line(3).replace(braking_capacity_mps2=[6.0, 6.0, 5.2])  # vehicle_3 holds 5 m/s2, which 4.68 cannot
     shield = RobustShield(weak, 1, uncertainty=parse_uncertainty("braking_capacity_mps2=10%"), robust="interior")
-    with refused("uncertainty: braking_capacity_mps2=10%: agent 'constant:5': above the braking capacity 4.68 m/s2"):
+    with refused(
+        "uncertainty: braking_capacity_mps2=10%: agent 'constant:5': brakes harder than the braking capacity of 4.68"
+    ):
         shield.begin(weak.sample(1, 0).worlds, np.arange(1))
 
 

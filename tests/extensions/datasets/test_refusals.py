@@ -35,7 +35,7 @@ DATASETS: dict[str, Callable[[], object]] = {
     "a.parquet: the format minari is written to a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
     "a-v0: the format parquet is written to a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
     "brakes: a dataset of Minari is a folder called NAME-vNUMBER": lambda: dataset("brakes"),
-    "nowhere/a.parquet: there is no folder nowhere; make it first": lambda: dataset("nowhere/a.parquet"),
+    "nowhere/a.parquet: the folder nowhere does not exist; create it first": lambda: dataset("nowhere/a.parquet"),
     "nowhere/a-v0: there is no folder nowhere; make it first": lambda: dataset("nowhere/a-v0"),
     "has no learner to record: scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
     "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3)": lambda: dataset("a-v0", scenario=PAIR),
@@ -52,7 +52,7 @@ def test_dataset__is_refused(message: str) -> None:
 @pytest.mark.parametrize(("name", "make"), [("a.parquet", Path.touch), ("a-v0", Path.mkdir)])
 def test_dataset__replaces_nothing_unasked(name: str, make: Callable[[Path], None], empty_folder: Path) -> None:
     make(Path(name))
-    with refused(f"{name}: is there already; give another name or use force (--force)", AlreadyExists):
+    with refused("; give another name", AlreadyExists):
         dataset(name)
 
 

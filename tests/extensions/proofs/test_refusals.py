@@ -85,9 +85,9 @@ def test_proof__is_refused_where_nothing_exact_is_known(message: str) -> None:
 
 SEARCHES: dict[str, Callable[[], object]] = {
     "horizon_s = 0.4: must be after the first decision at 0.5 s": lambda: profile_problem(WORLDS, [1], horizon_s=0.4),
-    "task: vehicles (3,): must be indices from 0 to 2, each once": lambda: Task(PAPER, (3,)),
-    "task: vehicles (0, 0): must be indices from 0 to 2, each once": lambda: Task(PAPER, (0, 0)),
-    "scenario 'paper-random': needs one controlled vehicle; controlled are: vehicle_1": lambda: (
+    "task: vehicles (3,): must be different indices from 0 to 2": lambda: Task(PAPER, (3,)),
+    "task: vehicles (0, 0): must be different indices from 0 to 2": lambda: Task(PAPER, (0, 0)),
+    "scenario 'paper-random': exactly one vehicle must be controlled here; the controlled": lambda: (
         Task(PAPER, (0, 1)).vehicle
     ),
     "vehicles = (): must be one or more vehicle indices from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
@@ -119,7 +119,7 @@ def test_file__is_no_table(empty_folder: Path) -> None:
     with refused("t.npz: is not a table of best known harm: not a plain .npz archive", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
     Path("t.npz").write_bytes(packed({**good(), "first_harm": np.zeros(4)}))
-    with refused("array 'first_harm' is <f8 [4], should be <f8 [3]", CorruptBundle):
+    with refused("array 'first_harm' has type and shape <f8 [4]; must be <f8 [3]", CorruptBundle):
         BestHarmTable.load(Path("t.npz"))
 
 

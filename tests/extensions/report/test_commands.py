@@ -28,7 +28,7 @@ def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command,
     assert ethbrake(*line, folder, "--per-world", "csv", "--report").status == 0
     (folder / "mine.txt").write_text("mine")
     assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "report.html", "results.json", "worlds.csv"]
-    check_refused(ethbrake(*line, folder), "results.json: is there already")
+    check_refused(ethbrake(*line, folder), "results.json: already exists")
     assert ethbrake(*line, folder, "--force", "--per-world", "parquet").status == 0
     assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "results.json", "worlds.parquet"]
 
@@ -93,5 +93,5 @@ def test_film__is_refused(line: str, message: str, refuse: Refuse) -> None:
 
 def test_film__that_is_there_is_not_replaced_unasked(refuse: Refuse) -> None:
     Path("film.gif").write_text("precious")
-    told = "film.gif: is there already; give another name or use force (--force)"
+    told = "film.gif: already exists; give another name, or replace the file with force (--force)"
     refuse("watch --agents full_brake --output film.gif", told)

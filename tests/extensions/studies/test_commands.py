@@ -71,7 +71,7 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent coast --budget 10 --scenario mixture-delays",
-        "scenario 'mixture-delays': is a mixture; take one of its scenarios: paper-delay-low",
+        "scenario 'mixture-delays': is a mixture; use one of its scenarios: paper-delay-low",
     ),
     (
         "study falsify --agent coast --budget 10 --scenario cooperation-2-blocked",
@@ -85,7 +85,7 @@ FALSIFIED = [
         "study falsify --agent ladder --measure harm --budget 8",
         "agent ladder: stands for several agents; one is needed here",
     ),
-    ("study sweep nowhere.yaml --output new", "nowhere.yaml: no such file"),
+    ("study sweep nowhere.yaml --output new", "nowhere.yaml: the file does not exist"),
 ]
 
 
@@ -137,7 +137,11 @@ TUNING = "scenario: paper-random\nrecipe: ppo\nsearch: {%s: {low: 1, high: 4}}\n
         (TUNING % "n_epochs", "tune --trials 0", "Invalid value for '--trials': must be greater than or equal to 1"),
         (TUNING % "n_epochs", "tune --export best.txt", "export best.txt: must end in .yaml, as recipes do"),
         (TUNING % "n_epochs", "tune --export 'Best One.yaml'", "recipe name 'Best One': must be 1 to 64 lower case"),
-        (TUNING % "n_epochs", "tune --export plan.yaml", "plan.yaml: is there already; give another name or use force"),
+        (
+            TUNING % "n_epochs",
+            "tune --export plan.yaml",
+            "plan.yaml: already exists; give another name, or replace the file with force",
+        ),
     ],
     ids=lambda value: value[:30],
 )
@@ -150,7 +154,7 @@ def test_plan_of_a_study__is_refused(plan: str, line: str, message: str, refuse:
 def test_file_of_worlds__that_is_there_is_not_replaced_unasked(refuse: Refuse) -> None:
     Path("worst.yaml").write_text("precious")
     line = "study falsify --agent coast --budget 100000 --output worst.yaml"
-    refuse(line, "worst.yaml: is there already; give another name or use force (--force)")
+    refuse(line, "worst.yaml: already exists; give another name, or replace the file with force (--force)")
 
 
 STORY = Path(__file__).parent / "printed" / "searches.txt"

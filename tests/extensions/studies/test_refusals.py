@@ -210,13 +210,13 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "scenario 'cooperation-0-sensors' has no learner; give at least one vehicle the role learner": lambda: sweep(
         {"jobs": [{"scenario": "cooperation-0-sensors", "recipe": "ppo"}]}
     ),
-    "--set network.policy.9: '9' must be an entry from 0 to 1": lambda: sweep(
+    "--set network.policy.9: '9' must be an index from 0 to 1": lambda: sweep(
         {"jobs": [GRID, {**GRID, "set": {"network.policy.9": 4}}]}
     ),
-    "--set gamma.x: there is nothing inside 0.995; set the whole value": lambda: sweep(
+    "--set gamma.x: 'x' cannot be set, because 0.995 is neither a mapping nor a": lambda: sweep(
         {"jobs": [GRID, {**GRID, "set": {"gamma.x": 4}}]}
     ),
-    "s.yaml, line 1, column 45: key 'recipe' is given twice, first on line 1": lambda: sweep(
+    "s.yaml, line 1, column 45: key 'recipe' occurs twice; the first is on line 1": lambda: sweep(
         "grid: {scenario: paper-random, recipe: ppo, recipe: sac}\n"
     ),
     "s.yaml: must be a mapping with a grid or a list of jobs": lambda: sweep("- one\n"),
@@ -290,13 +290,13 @@ def test_levels__may_differ_in_roles_objective_obstacle_and_channel_alone() -> N
 
 
 FALSIFICATIONS: dict[str, Callable[[], object]] = {
-    "scenario 'mixture-delays': is a mixture; take one of its scenarios: paper-delay-low": lambda: ranges(
+    "scenario 'mixture-delays': is a mixture; use one of its scenarios: paper-delay-low": lambda: ranges(
         load_scenario("mixture-delays")
     ),
-    "scenario 'cooperation-2-blocked': v2x: draws delays and losses, which no table of worlds holds; give": lambda: (
-        ranges(load_scenario("cooperation-2-blocked"))
+    "scenario 'cooperation-2-blocked': its v2x channel has delays and losses, which a table of worlds": lambda: ranges(
+        load_scenario("cooperation-2-blocked")
     ),
-    "scenario 'paper-scenario-1': draws nothing: all its worlds are the same": lambda: ranges(
+    "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same": lambda: ranges(
         load_scenario("paper-scenario-1")
     ),
     "--against coast: --measure harm compares with nobody; use regret or difference": lambda: Measure.of(
