@@ -103,7 +103,7 @@ def test_vector__behind_a_shield_takes_no_penalty() -> None:
     "given", ["harm", [], ["harm_1", "harm_1"], 3, "vehicle", [["harm_1"]], np.array(["harm_1", "harm_2"])]
 )
 def test_vector__that_is_none_is_refused(given: Any) -> None:
-    with pytest.raises(InvalidInput, match=r"^reward_vector = .*: must be 'vehicles', or a list of components"):
+    with pytest.raises(InvalidInput, match=r"^reward_vector = .*: must be 'vehicles', or a list of different"):
         eb.parallel_env(reward_vector=given)
 
 

@@ -4,8 +4,10 @@ import re
 from pathlib import Path
 from textwrap import indent
 
-from tests.cli.test_scenarios import ADD, TUTORIAL, change_lines
+from tests.cli.test_scenarios import ROOT, TUTORIAL, change_lines
 from tests.fixtures.commands import Command
+
+ADD = (ROOT / "docs" / "scenarios.md").read_text("utf-8").partition("\n## From Python\n")[0]
 
 
 def test_tutorial__its_changed_scenario_is_valid_and_evaluates_to_the_printed_table(

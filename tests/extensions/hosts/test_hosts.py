@@ -388,7 +388,7 @@ SPEED = r"of world \d+ drives at \S+ m/s at \S+ s, but should drive at \S+ to \S
         (OneCoasts, "constant:-1.5", rf"vehicle_2 {SPEED}"),
         (Frozen, "full_brake", GAP),
         (Stops, "full_brake", rf"vehicle_1 .*{STEP}"),
-        (Flies, "full_brake", rf"vehicle_1 of world 0 goes from \S+ to 1e\+09 m/s within {'{dt}'} s; "),
+        (Flies, "full_brake", rf"vehicle_1 of world 0 goes from \S+ to 1e\+09 m/s within {'{dt}'} s, but"),
         (FliesOnceHit, "full_brake", r"vehicle_\d of world \d+ goes from \S+ to 1e\+09 m/s"),
         (Leaps, "full_brake", GAP),
         (Drifts, "full_brake", GAP),
