@@ -500,17 +500,17 @@ class TuningPlan:
         from ray import tune
 
         from ethbrake_marl.extensions.studies.proposals import Proposals
-        from ethbrake_marl.extensions.studies.trials import Told, run_trials
+        from ethbrake_marl.extensions.studies.trials import TrialCallback, run_trials
 
         own = self.own_values()
         first = None if own is None else {key: self.file.search[key].stored(value) for key, value in own.items()}
         search = Proposals(path / PROPOSALS, known, self.file.space(), self.file.sampler.of_trial, first)
         total, prune = max(trials, len(known)), self.file.prune
-        telling = Told("tuning", 0, total, tell)
+        callback = TrialCallback("tuning", 0, total, tell)
         if known:
-            telling.say(f"{count_of(len(known), 'trial')} begun before: what ended is kept, the rest goes on")
+            callback.say(f"{count_of(len(known), 'trial')} begun before: what ended is kept, the rest goes on")
         elif own is None:
-            telling.say("the recipe's own values are not in the space, so no trial has them")
+            callback.say("the recipe's own values are not in the space, so no trial has them")
         ends = run_trials(
             do_trial,
             {"plan": self, "path": path.absolute()},
@@ -519,7 +519,7 @@ class TuningPlan:
             {},
             jobs=jobs,
             retries=retries,
-            told=telling,
+            callback=callback,
         )
         return search.known, ends
 
