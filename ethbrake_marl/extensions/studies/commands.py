@@ -145,7 +145,7 @@ def tune_command(
                     **{"search": space, "own_values": own, "trials": trials, "begun": started, "total_steps": steps},
                     **{"scenario": plan.file.scenario, "recipe": plan.file.recipe, "example": example},
                 },
-                f"{count_of(trials, 'trial')} ({started:,} of them already begun): recipe {plan.file.recipe} in scenario"
+                f"{count_of(trials, 'trial')} ({started:,} of them begun): recipe {plan.file.recipe} in scenario"
                 f" {plan.file.scenario}; {steps:,} decisions per trial that is not pruned",
                 *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
                 f"{'the first trial' if own else 'example of a trial'}: {example}",
@@ -248,7 +248,7 @@ def falsify_command(
             }  # fmt: skip
             for option in (name for name, value in asked.items() if value is not None):
                 raise InvalidInput(
-                    f"{option} cannot be combined with --again, because the file of --again sets what is measured; leave"
+                    f"{option} cannot be combined with --again, because that file sets what is measured; leave"
                     f" {option} out (only --agent may be given)"
                 )
             _drive_again(out, again, agent)
@@ -278,8 +278,8 @@ def falsify_command(
         left_out = f" ({budget - len(good):,} of them rejected by the scenario)" if len(good) < budget else ""
         summary = (
             f"{chosen.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {task.harm_count} count: worst"
-            f" {content['worst']:.4g}, median {content['median']:.4g}; above 0 in {100 * worst.share_above:.1f} % of the"
-            f" worlds, {f'first in world {first:,}' if first else 'so in no world'}."
+            f" {content['worst']:.4g}, median {content['median']:.4g}; above 0 in {100 * worst.share_above:.1f} % of"
+            f" the worlds, {f'first in world {first:,}' if first else 'so in no world'}."
             " The search prefers bad worlds, so these numbers are no estimates for random worlds."
         )
         if worlds:

@@ -134,7 +134,7 @@ class Falsified:
 
     sample: Sample  # the worst worlds at the alert
     worlds: list[NamedWorld]  # the same worlds with names, initial states and measurements
-    # Score of every tried world, in order (m2/s2). Minus infinity: the scenario rejects the world, or the physics failed.
+    # Score of every tried world, in order (m2/s2). Minus infinity: the scenario rejects it, or the physics failed.
     scores: Floats
     first_above: int | None  # number of worlds tried until the first score above 0; None: no score is above 0
 

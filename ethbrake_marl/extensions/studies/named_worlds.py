@@ -102,13 +102,13 @@ class NamedWorlds(FileModel):
         if scenario_sha256(scenario) != self.scenario_sha256:
             raise InvalidInput(
                 f"{where}: the worlds were found in scenario {self.scenario!r}"
-                f"{''.join(f' with --set {each}' for each in self.settings)}, whose content differs from {scenario.name!r}"
-                " now; use the scenario as it was, or search again (ethbrake study falsify)"
+                f"{''.join(f' with --set {each}' for each in self.settings)}, whose content differs from"
+                f" {scenario.name!r} now; use the scenario as it was, or search again (ethbrake study falsify)"
             )
         columns = self.worlds[0].state.keys()
         for k, world in enumerate(self.worlds):
             if world.state.keys() != columns:
                 raise InvalidInput(
-                    f"{where}: worlds[{k}].state and worlds[0].state have different keys; give every world the same keys"
+                    f"{where}: worlds[{k}].state and worlds[0].state have different keys; give all worlds the same keys"
                 )
         return worlds_from_table(scenario, {name: [world.state[name] for world in self.worlds] for name in columns})

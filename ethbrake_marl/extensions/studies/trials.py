@@ -80,7 +80,7 @@ def run_trials(
 
 
 def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
-    """Run one attempt at a trial with the configuration ``config``. The other arguments are explained in ``run_trials``.
+    """Run one attempt at a trial with the configuration ``config``. ``run_trials`` explains the other arguments.
 
     An error of this package becomes a report, because Ray would try again after an exception.
     """
