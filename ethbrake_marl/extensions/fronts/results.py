@@ -177,7 +177,7 @@ def front_sheet(results: Json) -> Sheet:
         rows.append((name, *(each["value"] for each in braking[count]), *sums))
     words = {"first": "first-impact", "total": "total"}[count]
     note = (
-        f"Mean {words} harm of each vehicle, and mean first-impact and total harm of the line, m2/s2. Columns of agents:"
+        f"Mean {words} harm of each vehicle, and mean first-impact and total harm of the line, m2/s2. Agents:"
         " weighted harm of the agent divided by the weighted harm of the front"
     )
     note += f"{Conditions(recordings=results.get('recordings', 0)).by_recording}."

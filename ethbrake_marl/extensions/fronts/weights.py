@@ -37,8 +37,8 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     number = comb(steps + vehicles - 1, steps)
     if number > MOST:
         raise InvalidInput(
-            f"{steps} steps: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most {MOST:,} are"
-            " allowed; give fewer steps, or list the weights"
+            f"{steps} steps: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
+            f" {MOST:,} are allowed; give fewer steps, or list the weights"
         )
 
     def shares(number: int, left: int) -> Iterator[list[int]]:
@@ -73,8 +73,8 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
         if row.shape != (vehicles,) or not (good.all() and row.any()):
             text = ",".join(f"{weight:g}" for weight in row.ravel())
             raise InvalidInput(
-                f"weights[{k}] = {text}: the weights must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6 to"
-                " 1e6 and not all 0, for instance 1,4,1"
+                f"weights[{k}] = {text}: the weights must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6"
+                " to 1e6 and not all 0, for instance 1,4,1"
             )
     if not rows:
         raise InvalidInput("weights: there are no weights; give at least one row, for instance 1,4,1")

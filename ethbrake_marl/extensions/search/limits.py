@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.team_bound import team_bound
@@ -75,7 +76,7 @@ class Limits:
             return ""
         return (
             f"the table of best known harm contains {listed.sum():,} of the {len(known):,} worlds. The best known harm"
-            f" of {missing:,} worlds ({100.0 * missing / len(known):.1f} %) is missing; the least harm of the agents of"
+            f" of {count_of(missing, 'world')} ({100.0 * missing / len(known):.1f} %) is missing; the least harm of the agents of"
             " this evaluation replaces it. Regrets are therefore lower bounds, and the share of the possible"
             " reduction is omitted. A table is made for one list: to make a table for this list, call search_list"
         )

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.engine.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
-from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, count_of
 from ethbrake_marl.extensions.search.problem import seeded
 from ethbrake_marl.extensions.search.profiles import allowed, draw, draw_below, draw_command
 from ethbrake_marl.physics.elementary import exp
@@ -71,7 +71,7 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     low, high = problem.bounds[:, :1, 0], problem.bounds[:, :1, 1]
     if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
         raise InvalidInput(
-            f"refine: {len(problem.vehicles)} controlled vehicles, and commands of shape {commands_mps2.shape}: give"
+            f"refine: {count_of(len(problem.vehicles), 'controlled vehicle')}, and commands of shape {commands_mps2.shape}: give"
             f" one vehicle and commands of shape ({n}, {steps})"
         )
     if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():

@@ -280,7 +280,7 @@ LINE = load_scenario("paper-random")
         (LINE.with_learners([2]), 2, "vehicle_3 is controlled"),
         (LINE.replace(latency_s=[0.6, 0.5, 0.8]), 1, "vehicle_1 may brake later than vehicle_2"),
         (load_scenario("paper-random-obstacle").replace(obstacle_gap_m=30.0), 1,
-         "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"),
+         "vehicle_1 reaches the obstacle although it brakes; avoidability is proven where it stops in time"),
         (LINE, 1, None),
     ],
 )  # fmt: skip
@@ -311,7 +311,7 @@ def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp
     result = evaluate(pair.sample(2, 0), BRAKE, scenario=pair)
     row = summarise(result)[0].to_json()
     assert {row[name] for name in NULLS} == {None} and row["mean_regret_interval"] is None
-    assert row["parameters"]["no_limits_because"] == "2 vehicles; avoidability is proven for 3"
+    assert row["parameters"]["no_limits_because"] == "the line has 2 vehicles; avoidability is proven for 3 vehicles"
     columns = columns_of(result, tmp_path)
     assert columns["avoidable"] == columns["regret_total_harm"] == columns["best_known_source"] == ["", ""]
     assert regrets_of(result) is None and "proven" not in summarise(result).markdown()
