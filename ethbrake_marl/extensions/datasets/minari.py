@@ -66,11 +66,11 @@ def check_folder(path: Path, *, force: bool = False) -> None:
         raise InvalidInput(f"{path}: the folder of a Minari dataset must be named NAME-vNUMBER, for instance brakes-v0")
     if path.is_symlink() or path.exists():
         if not force:
-            raise AlreadyExists(f"{path}: exists already; give another name, or replace it with force (--force)")
+            raise AlreadyExists(f"{path}: is there already; give another name or use force (--force)")
         if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
             raise InvalidInput(f"{path}: is not a Minari dataset, so force does not replace it; give another name")
     if not path.parent.is_dir():
-        raise InvalidInput(f"{path}: there is no folder {path.parent}; create this folder first")
+        raise InvalidInput(f"{path}: there is no folder {path.parent}; make it first")
     try:
         check_writable(path.parent)
     except OSError as error:

@@ -76,8 +76,8 @@ class Limits:
             return ""
         return (
             f"the table of best known harm contains {listed.sum():,} of the {len(known):,} worlds. The best known harm"
-            f" of {count_of(missing, 'world')} ({100.0 * missing / len(known):.1f} %) is missing;"
-            " the least harm of the agents of this evaluation replaces it. Regrets are therefore lower bounds, and the share of the possible"
+            f" of {count_of(missing, 'world')} ({100.0 * missing / len(known):.1f} %) is missing; the least harm of the"
+            " agents of this evaluation replaces it. Regrets are therefore lower bounds, and the share of the possible"
             " reduction is omitted. A table is made for one list: to make a table for this list, call search_list"
         )
 

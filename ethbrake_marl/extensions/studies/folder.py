@@ -58,7 +58,7 @@ class StudyFolder:
         if self._question is None:
             if self._record.is_file():
                 raise AlreadyExists(
-                    f"{self.path}: is not the folder of {self._kind}, it contains {self._record.name} of another"
+                    f"{self.path}: is not the folder of {self._kind}: it contains {self._record.name} of another"
                     f" command; {self._advice}"
                 )
             return False

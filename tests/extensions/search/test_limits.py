@@ -251,7 +251,7 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     assert "WARNING: the table of best known harm contains 2 of the 4 worlds" in table and "≥ 0.75" in table
     assert (
         "The best known harm of 75.0 % of the worlds comes from an earlier search" in table
-        and "Less harm than the best known before: a in 1 world." in table
+        and "Less harm than the earlier best known harm: a in 1 world." in table
     )
 
 
