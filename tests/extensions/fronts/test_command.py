@@ -45,7 +45,7 @@ def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, 
         ("--weights 1,inf,1", ("numbers separated by commas",)),
         ("--agents nobody", ("unknown agent 'nobody'",)),
         ("--scenario cooperation-4-all --agents full_brake,coast", ("agents can drive only one learner",)),
-        ("--steps 50", ("1,326 sets of weights", "at most 1,000")),
+        ("--steps 50", ("1,326 choices of weights", "at most 1,000")),
         ("--set roles.vehicle_2=full_brake", ("learner",)),
     ],
 )

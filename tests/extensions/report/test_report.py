@@ -165,7 +165,7 @@ def test_report__is_well_formed_and_says_everything(html: str, report: Report) -
     page = Page(html)
     told = [
         "paper-random: 200 worlds, seed 7; d = ", "Training seed 5 Command ethbrake run", "numpy 2.4.6",
-        "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "from the alert until all vehicles are at rest.",
+        "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "until all vehicles are at rest.",
         "constant:4.5 does ", "One million steps.", "of the worlds, no command of Vehicle 2 avoids contact",
     ]  # fmt: skip
     for row in report.rows:
