@@ -27,7 +27,7 @@ def test_again__runs_no_code_that_only_a_file_names(ethbrake: Command) -> None:
     whole = Path("worst.yaml").read_text()
     for line in ("agent: coast\n", "against: full_brake\n"):
         Path("worst.yaml").write_text(whole.replace(line, f'{line.partition(" ")[0]} "mine.py:make"\n'))
-        check_refused(ethbrake("study", "falsify", "--again", "worst.yaml"), "is code")
+        check_refused(ethbrake("study", "falsify", "--again", "worst.yaml"), "is not run")
     assert not Path("ran").exists()
 
 
@@ -142,7 +142,11 @@ TUNING = "scenario: paper-random\nrecipe: ppo\nsearch: {%s: {low: 1, high: 4}}\n
         (SWEEP % "ppo", "sweep --retries -1", "Invalid value for '--retries': must be greater than or equal to 0"),
         (TUNING % "n_epoch", "tune", "plan.yaml, line 3: unknown setting 'n_epoch'; did you mean 'n_epochs'?"),
         (TUNING % "n_epochs", "tune --trials 0", "Invalid value for '--trials': must be greater than or equal to 1"),
-        (TUNING % "n_epochs", "tune --export best.txt", "export best.txt: must end in .yaml, as recipes do"),
+        (
+            TUNING % "n_epochs",
+            "tune --export best.txt",
+            "--export best.txt: the file name of a recipe must end in .yaml",
+        ),
         (TUNING % "n_epochs", "tune --export 'Best One.yaml'", "recipe name 'Best One': must be 1 to 64 lower case"),
         (TUNING % "n_epochs", "tune --export plan.yaml", "plan.yaml: is there already; give another name or use force"),
     ],
