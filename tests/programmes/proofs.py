@@ -357,7 +357,7 @@ class _Line:
         ]
 
     def take_steps(self, _: Any, __: Any, ___: Any, step: int, action: Any, after: Any, ____: Any) -> int:
-        """Take the step of one action. It fails, ends the episode or continues it, always the same for equal actions."""
+        """Take the step of one action: it fails, ends the episode or continues it. Equal actions have equal effects."""
         assert step == self.made, "a wrong step was taken"
         after[0] = np.array(action, object)
         going = self.going(*_exact(action))
