@@ -160,33 +160,34 @@ def write(levels: Sequence[Level], learned: list[list[str]], worlds: int, file: 
     sys.modules[spec.name] = results  # its data classes look up annotations here
     spec.loader.exec_module(results)
     about = f"{worlds} worlds of seed {SEED}; first-impact harm in m²/s², mean per world with 95 % intervals."
-    how = f"Best responses in turn from three starts, {BUDGET:,} candidates each, at most {ROUNDS} rounds."
+    how = f"Best responses in turn from three starts, with {BUDGET:,} candidates per response"
+    how += f" and at most {ROUNDS} rounds."
     vehicles = ["Vehicle 1", "Vehicle 2", "Vehicle 3"]
     tables = {
         "price-of-anarchy": (
-            "What it costs that each vehicle decides for itself",
+            "Cost of separate decisions",
             [
                 *("level", "objective", "ends converged", "worlds where ends differ", "joint optimum"),
                 *("best end", "worst end", "price of stability", "price of anarchy", "processor s"),
             ],
             [row for level in levels for row in price_rows(level)],
-            f"{about} {how} Ends differ if the harm of some vehicle does by more than 0.1. Best and worst are among the"
-            " ends that converged, world by world; a price is the ratio of the means.",
+            f"{about} {how} Ends differ if the harm of some vehicle differs by more than 0.1. Best and worst end are"
+            " chosen per world, among converged ends. A price is a ratio of means.",
             "a long search",
         ),
         "equilibria-borne": (
-            "Who bears what where best responses end",
+            "Harm of each vehicle where best responses end",
             ["level", "objective", "start", *vehicles, "line, first-impact", "line, total"],
             [row for level in levels for row in bearing_rows(level)],
-            f"{about} {how} All worlds, converged or not.",
+            f"{about} {how} All worlds, with and without convergence.",
             "a long search",
         ),
         "equilibria-learned": (
-            "Who bears what under teams trained for themselves and for all",
+            "Harm of each vehicle with trained teams, own and common objectives",
             ["level", "recipe, scheme", "objective", *vehicles, "line"],
             learned,
-            f"{about} Three seeds of `cooperation`, two of `cooperation-ppo`, a million decisions each; intervals for"
-            " other seeds and other worlds.",
+            f"{about} Three seeds of `cooperation`, two of `cooperation-ppo`, a million decisions each; intervals over"
+            " seeds and worlds.",
             "a training",
         ),
     }

@@ -160,7 +160,10 @@ def test_proofs__refuse_compiled_functions():
     [
         (Case("x", ("nonsense",), lambda folder: (folder / "../../x").touch()), "left a file outside its folder: x"),
         (Case("x", ("--version",), lambda folder: None), "the file was not refused"),
-        (Case("x", ("nonsense",), Path.resolve, reader=lambda: os.mkdir("/tmp/x-of-a-test")), "tried to change a file outside"),
+        (
+            Case("x", ("nonsense",), Path.resolve, reader=lambda: os.mkdir("/tmp/x-of-a-test")),
+            "tried to change a file outside",
+        ),
         (Case("x", ("nonsense",), Path.resolve, reader=lambda: os.system("true")), "executed: os.system"),
         (Case("x", ("nonsense",), Path.resolve, reader=lambda: 1), "python: no error"),
         (Case("x", ("nonsense",), Path.resolve, reader=lambda: Path("new").touch()), "changed: inside/new"),
