@@ -1,10 +1,10 @@
-"""Research environment for ethical emergency braking: exact multi-vehicle physics, shielded by a proven bound on harm.
+"""Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
-Importing the package registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo. Everything
-else is imported when its public name is first used, so torch and matplotlib are loaded only if they are needed.
+Importing the package registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo. Each public
+name is imported when it is first used, so torch and matplotlib are loaded only if they are needed.
 
-The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read it as imports. At run time the
-package reads the list from this file and imports each name on first use.
+The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read this block as imports. At run time
+the package reads the list from this file and imports each name on first use.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "ShieldedVecEnv", "TrainResult", "make_sb3_vec_
 def _usable() -> list[str]:
     """Return the public names that can be imported with the installed packages.
 
-    Importing one of the other public names raises an error that says which optional extra it needs.
+    Importing any other public name raises an error that says which optional extra to install.
     """
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]

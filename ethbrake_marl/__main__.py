@@ -1,4 +1,4 @@
-"""Entry point of ``python -m ethbrake_marl``: the command line, for when the script ``ethbrake`` is not on the path."""
+"""Entry point of ``python -m ethbrake_marl``, which runs the same command line as the script ``ethbrake``."""
 
 from ethbrake_marl.cli.app import main
 

@@ -1,7 +1,8 @@
-"""Lazy imports for a folder: its ``__init__`` lists the names that other folders use, each imported on first use.
+"""Lazy imports: the ``__init__`` of a folder lists public names, and each name is imported when it is first used.
 
-The list is a block of imports under ``if TYPE_CHECKING``. Type checkers read it as imports. At run time it is read from
-the source file, so packages that a caller does not need (torch, matplotlib, scipy) are not loaded.
+The list is a block of imports under ``if TYPE_CHECKING``. Type checkers read this block as imports. At run time this
+module reads the list from the source file, so packages that a caller does not need (torch, matplotlib, scipy) are not
+loaded.
 """
 
 from __future__ import annotations
@@ -17,20 +18,20 @@ from typing import Any
 
 @cache
 def names_behind(file: str) -> dict[str, str]:
-    """Return name -> module for every import in the ``if TYPE_CHECKING`` block of an ``__init__``.
+    """Return a dictionary name -> module of all imports in the ``if TYPE_CHECKING`` block of an ``__init__``.
 
     ``file``: path of the ``__init__`` file.
     """
-    content = ast.parse(Path(file).read_text("utf-8")).body
-    table = next(part for part in content if isinstance(part, ast.If)).body
-    lines = [line for line in table if isinstance(line, ast.ImportFrom)]
-    return {alias.name: str(line.module) for line in lines for alias in line.names}
+    statements = ast.parse(Path(file).read_text("utf-8")).body
+    block = next(statement for statement in statements if isinstance(statement, ast.If)).body
+    imports = [statement for statement in block if isinstance(statement, ast.ImportFrom)]
+    return {alias.name: str(statement.module) for statement in imports for alias in statement.names}
 
 
 def front_door(package: str, file: str) -> Callable[[str], Any]:
     """Return the ``__getattr__`` of a folder's ``__init__``, and set the folder's ``__all__`` and ``__dir__``.
 
-    The returned function raises ``AttributeError`` for a name that the folder's list does not contain.
+    The returned function raises ``AttributeError`` for a name that is not in the folder's list.
 
     Args:
         package: the folder's ``__name__``.

@@ -55,7 +55,7 @@ def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
 
     Control, direction and separator characters are escaped, except the space and the characters in ``keep``. Names,
-    keys and paths come from files and command lines: printed as they are, they could move the cursor or reverse a line.
+    keys and paths come from files and command lines. Unescaped text could move the cursor or print a line backwards.
     """
     if text.isprintable():
         return text
@@ -65,7 +65,7 @@ def plain_text(text: str, keep: str = "") -> str:
 def one_line(text: str) -> str:
     """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
 
-    The beginning of a message says what is wrong and where, its end what would be right, so both are kept.
+    The beginning of a message says what is wrong and where, and its end says what would be right. Both are kept.
     """
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
@@ -75,7 +75,7 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return the number ``n`` with its noun, as messages write it: ``1 world``, ``10,000 worlds``.
+    """Return the number ``n`` and its noun as text, for example ``1 world`` or ``10,000 worlds``.
 
     ``thing``: the noun in the singular.
     """
@@ -83,10 +83,10 @@ def count_of(n: int, thing: str) -> str:
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
-    """Describe an exception from the user's code in a few words, with the line of code that raised it.
+    """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
-    ``path``: the user's file; the line is then the last one of that file in the traceback. None: the innermost line.
-    Errors of this package are returned as their own message.
+    ``path``: the user's file. The line is then the last line of this file in the traceback. If ``path`` is None, the
+    line is the innermost line of the traceback. An error of this package is described by its message alone.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -159,9 +159,9 @@ class MissingExtra(EthBrakeError, ImportError):
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """Context manager: raise ``MissingExtra`` if an import in the block fails for want of an optional extra.
+    """Context manager: raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
 
-    Any other import error passes unchanged.
+    All other import errors pass unchanged.
     """
     try:
         yield
@@ -173,24 +173,24 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` unless ``package``, a package of an optional extra, is installed. Imports nothing."""
+    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; import nothing."""
     if find_spec(package) is None:
         raise _missing(package)
 
 
 def _missing(package: str) -> MissingExtra:
     line = f"{sys.executable} -m pip install 'ethbrake-marl[{_EXTRA_OF[package]}]'"
-    return MissingExtra(f"needs the package {package}, which is not installed: {line}")
+    return MissingExtra(f"needs the package {package}, which is not installed; install it with: {line}")
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):
-    """Some worlds of a batch could not be advanced. This is a defect of the physics kernel, never of the input.
+    """Some worlds of a batch could not be advanced. The cause is a defect of the physics kernel, never of the input.
 
-    All other worlds of the batch are valid, and a world's result does not depend on its batch, so a caller may drop the
-    failed worlds and go on (``physics.left_out.leaving_out_failed``).
+    All other worlds of the batch are valid. A world's result does not depend on its batch, so a caller may leave out
+    the failed worlds and go on (``physics.left_out.leaving_out_failed``).
 
     Args:
-        worlds: row of each failed world in the batch -> reason.
+        worlds: dictionary from the row of each failed world in the batch to the reason of its failure.
 
     """
 
@@ -204,7 +204,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         return one_line("; ".join([*named, f"and {count_of(more, 'more world')}"] if more else named))
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
-        """Return this error with rows of a larger batch: world k here is world ``rows[k]`` there."""
+        """Return this error with the row numbers of a larger batch, in which world k of this batch is ``rows[k]``."""
         return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
 
 
@@ -214,7 +214,7 @@ class AgentFailed(InvalidInput):
     Args:
         agent: name of the agent.
         row: row of the world in the batch; None if it is unknown.
-        reason: what went wrong, with the step.
+        reason: what went wrong, and at which step.
 
     """
 
@@ -227,15 +227,15 @@ class AgentFailed(InvalidInput):
         return one_line(f"agent {self.agent!r}{where}, {self.reason}")
 
     def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
-        """Return this error with the row of a larger batch: world k here is world ``rows[k]`` there."""
+        """Return this error with the row number of a larger batch, in which world k of this batch is ``rows[k]``."""
         return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
     @staticmethod
     @contextmanager
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
-        """Context manager: raise an ``AgentFailed`` from the block again under ``name``, the user's name for the agent.
+        """Context manager: replace the agent's name in an ``AgentFailed`` error by ``name``, the user's name for it.
 
-        ``others``: names of the agents of the other vehicles; an error that carries one of these passes unchanged.
+        ``others``: names of the agents of the other vehicles; an error of one of these agents passes unchanged.
         """
         try:
             yield
@@ -251,9 +251,9 @@ class Unfamiliar(UserWarning):
 
 @contextmanager
 def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
-    """Context manager: a ``PhysicsError`` or ``AgentFailed`` raised in the block is raised again with other rows.
+    """Context manager: change the row numbers in a ``PhysicsError`` or ``AgentFailed`` that is raised in the block.
 
-    For a block that works on part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
+    Use this for a block that works on a part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
     """
     try:
         yield
@@ -262,36 +262,40 @@ def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
 
 
 class UncertifiedStep(EthBrakeError):
-    """A step of the engine differs from the step that its shield certified; the step was not made."""
+    """The engine's step differs from the step that the shield certified; the engine did not make the step."""
 
 
 def new_name(name: object, known: Collection[str]) -> str | None:
-    """Return the new name of a ``name`` that was renamed, or of its words between colons; None if not in ``known``."""
+    """Return the new name if ``name`` was renamed and the new name is in ``known``; otherwise None.
+
+    Words between colons are renamed one by one.
+    """
     new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
     return new if new != name and new in known else None
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name: it gives the new name of a renamed one, a similar name, or all known names.
+    """Return the error for an unknown name, which shows its new name, a similar name, or all known names.
 
     Args:
         kind: what the name stands for, for example ``scenario``.
         name: the unknown name.
         known: the known names.
-        may_be_own: users can register names of this kind, so the message adds that theirs may not be registered yet.
+        may_be_own: true if users can register names of this kind. The message then says that a name must be
+            registered first.
 
     """
     names = sorted(known)
     if new := new_name(name, names):
         return UnknownName(f"unknown {kind} {name!r}; it is now called {new!r}")
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    own = "; one of your own must be registered or installed first (docs/extend.md)" if may_be_own else ""
+    own = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
 
 
 def refuse_shipped_path(path: str, agent: str = "") -> None:
-    """Raise ``UnknownName`` if ``path`` is ``shipped`` or ``shipped/NAME``; that was how to write a shipped policy.
+    """Raise ``UnknownName`` if ``path`` is ``shipped`` or ``shipped/NAME``, the former way to name a shipped policy.
 
     ``agent``: the name before the ``@``, in ``agent@path``; "" for a path alone.
     """
@@ -304,7 +308,7 @@ def refuse_shipped_path(path: str, agent: str = "") -> None:
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
 
-    ``what`` names the value in the message.
+    ``what``: name of the value in the message.
     """
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
@@ -317,8 +321,8 @@ def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> No
 
     Args:
         scenario: name of the scenario.
-        learners: names of its learners.
-        advice: what the user can do.
+        learners: names of the scenario's learners.
+        advice: what the user can do instead.
 
     """
     if len(learners) != 1:

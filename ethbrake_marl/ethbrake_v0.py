@@ -1,4 +1,4 @@
-"""Environment module in PettingZoo's style, with ``ethbrake_v0.parallel_env()`` and, for the AEC API, ``.env()``"""
+"""Environment module in PettingZoo's style: ``parallel_env()``, and ``env()`` for the AEC interface."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folder in which compiled kernels are cached, and callbacks for the first compilation. Does not import numba."""
+"""The folder of cached compiled kernels, and callbacks before the first compilation. Does not import numba."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of the compiled kernels: in the user's cache, or a temporary one if that is not writable."""
+    """Return the folder of the compiled kernels: the user's cache, or a temporary folder if that is not writable."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = Path(home) / "ethbrake_marl"
@@ -37,16 +37,16 @@ def is_temporary(folder: Path) -> bool:
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
     """Call ``tell(folder, was_empty)`` once, just before this process compiles its first kernel.
 
-    ``folder`` is the cache folder. ``was_empty`` is true if this process has loaded no kernel from it before. Loading a
-    cached kernel is not compiling.
+    ``folder`` is the cache folder. ``was_empty`` is true if this process has not loaded any kernel from the cache yet.
+    Loading a cached kernel does not count as compiling.
     """
     _tellers.append(tell)
 
 
 def tell_compilation(nothing_kept: bool) -> None:
-    """Call the callbacks of ``on_first_compilation``, once each: a kernel is about to be compiled.
+    """Call each callback of ``on_first_compilation`` once, before a kernel is compiled.
 
-    ``nothing_kept``: this process has loaded no kernel from the cache so far.
+    ``nothing_kept``: true if this process has not loaded any kernel from the cache yet.
     """
     while _tellers:
         _tellers.pop()(cache_folder(), nothing_kept)

@@ -1,4 +1,4 @@
-"""Independent function calls in parallel: joblib processes on this machine or on Ray, with one thread each."""
+"""Run independent function calls in parallel, in joblib's processes on this machine or on Ray, with one thread each."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
     """Run function calls in parallel and yield their results in the order of the calls.
 
     Args:
-        calls: tuples (function, argument, ...), functions of a module; each is taken from the iterable shortly before
-            it starts.
-        jobs: number of calls that run at once. None: one, or as many as Ray has cores. One call at a time runs in this
-            process.
-        ray: ``local`` for a Ray on this machine alone, or the address of a Ray cluster. None: no Ray.
+        calls: tuples (function, argument, ...) with module-level functions. A tuple is taken from the iterable shortly
+            before its call starts.
+        jobs: number of calls that run at once. None: one call without Ray, one call per core with Ray. Without Ray and
+            with one call at a time, the calls run in this process.
+        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. None: joblib without Ray.
 
-    Raises what a call raises; ``WorkerLost`` if a worker process is killed (Ray repeats a call that a node has lost);
-    ``MissingExtra`` without joblib or Ray; ``InvalidInput`` if no cluster answers at the address.
+    Raises the error of a call that fails; ``WorkerLost`` if a worker process is killed (Ray repeats the call instead);
+    ``MissingExtra`` if joblib or Ray is not installed; ``InvalidInput`` if no cluster answers at the address.
 
     """
     if ray is None and jobs in (None, 1):
@@ -74,7 +74,9 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the except clause below
                 yield result
         except BrokenProcessPool:
-            raise WorkerLost("a worker process was killed, perhaps for memory; do fewer at once (--jobs)") from None
+            raise WorkerLost(
+                "a worker process was killed, perhaps because memory ran out; run fewer calls at once (--jobs)"
+            ) from None
         finally:
             with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
                 results.close()
@@ -121,8 +123,8 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 def own_signals() -> Iterator[None]:
     """Context manager: restore the caller's handlers of Ctrl-C, SIGTERM and SIGUSR1 after the block.
 
-    Ray and Ray Tune set handlers of their own and leave them behind; Tune's would swallow the caller's next Ctrl-C.
-    Does nothing outside the main thread, where no handler can be set.
+    Ray and Ray Tune set their own handlers and do not restore the caller's. The handler of Ray Tune would swallow the
+    caller's next Ctrl-C. Outside the main thread, where no handler can be set, this function does nothing.
     """
     in_main = threading.current_thread() is threading.main_thread()
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1) if in_main else ()
@@ -131,15 +133,15 @@ def own_signals() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if handler is not None:  # None: set by C code, and unknown here
-                signal.signal(number, handler)  # even if Python knows no other: Ray sets some in C
+            if handler is not None:  # None: C code set the handler, so Python cannot restore it
+                signal.signal(number, handler)  # even if Python sees no change: Ray sets some handlers in C
 
 
 @contextmanager
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
     """Context manager: start joblib's backend; yield its settings and the number of calls that run at once.
 
-    Arguments are those of ``run_each``.
+    The arguments have the same meaning as in ``run_each``.
     """
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1
@@ -161,11 +163,12 @@ def connect_ray(address: str, cores: int | None = None) -> Any:
     """Connect to Ray and return the module ``ray``.
 
     Args:
-        address: address of a running cluster in Ray's own format, or ``local``: start a Ray on this machine, on
+        address: address of a running cluster in Ray's own format, or ``local`` to start Ray on this machine, on
             loopback sockets and without a dashboard.
-        cores: number of cores of the local Ray; None: all that this process may use.
+        cores: number of cores for ``local``; None: all cores that this process may use.
 
-    Raises ``MissingExtra`` without Ray, ``InvalidInput`` if Ray cannot be started or no cluster answers at the address.
+    Raises ``MissingExtra`` if Ray is not installed, and ``InvalidInput`` if Ray cannot be started or no cluster answers
+    at the address.
 
     """
     os.environ |= _DRIVER
@@ -184,6 +187,6 @@ def connect_ray(address: str, cores: int | None = None) -> Any:
             )
     except Exception as error:  # Ray raises a plain Exception if it cannot start
         raise InvalidInput(
-            f"ray {address!r}: cannot be started, or no cluster can be reached there ({error})"
+            f"ray {address!r}: Ray cannot be started, or no cluster answers at this address ({error})"
         ) from None
     return ray

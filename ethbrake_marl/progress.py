@@ -1,4 +1,4 @@
-"""Progress reports of a long computation, as a value and as a line on stderr."""
+"""Progress reports of a long computation, as objects and as text on stderr."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """State of a long computation: ``done`` of ``total`` units of the part called ``name``.
+    """Progress of a long computation: ``done`` of ``total`` units of work are done; ``name`` says what is computed.
 
-    In training a unit is a decision of a learner, and ``total`` is rounded up to whole updates.
+    In training, a unit is one decision of a learner, and ``total`` is rounded up to a whole number of policy updates.
 
     >>> import ethbrake_marl as eb
     >>> eb.Progress("full_brake", 500, 1000)
@@ -30,7 +30,7 @@ class Progress:
 
     @property
     def harm(self) -> str:
-        """Harm in the last evaluation, as text with its name: ``total harm 24.19``; empty without an evaluation."""
+        """Harm in the last evaluation as text, such as ``total harm 24.19``; empty if there was no evaluation yet."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
@@ -39,9 +39,9 @@ class Progress:
 
     @staticmethod
     def listener(told: Told) -> OnProgress | None:
-        """Return the function to call with each ``Progress``; None: nobody is informed.
+        """Return the function to call with each ``Progress``, or None if progress is not reported.
 
-        ``told`` is this function itself, ``"show"`` for one that prints on stderr, or None.
+        ``told`` is such a function, ``"show"`` to print progress on stderr, or None.
         """
         return ShownProgress() if told == "show" else told
 
@@ -49,13 +49,14 @@ class Progress:
 OnProgress = Callable[[Progress], None]
 
 Told = OnProgress | Literal["show"] | None
-"""Who is told how far a training is: a function, stderr (``show``), or nobody."""
+"""Receiver of progress reports: a function, ``"show"`` for text on stderr, or None for no reports."""
 
 
 class ShownProgress:
     """Prints progress on stderr.
 
-    On a terminal it rewrites one line. Otherwise it prints one line for each tenth of the work and for each evaluation.
+    On a terminal, one line of text is rewritten. Otherwise a new line is printed for each tenth of the work and for
+    each evaluation.
     """
 
     def __init__(self) -> None:

@@ -1,13 +1,13 @@
-"""Registries of parts by name: agents, shields, measures, features, objectives, algorithms, commands.
+"""Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
-There is one registry per kind of part. A running program adds a part with a ``register_...`` function. An installed
-package adds one with an entry point in its ``pyproject.toml``; this package registers its own extensions in the same
-way. The entry point is loaded, and passed to the same function, when its name is first used:
+Each registry contains the parts of one kind. A running program adds a part with a ``register_...`` function. An
+installed package adds a part with an entry point in its ``pyproject.toml``, as this package does for its extensions:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-So a part that is installed but not used is never imported, and cannot break anything.
+The entry point is loaded, and its value is passed to the ``register_...`` function, when the name is first used. A part
+that is installed but not used is never imported, so it cannot break anything.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from ethbrake_marl.errors import (
 )
 
 OURS = "ethbrake-marl"  # name of this distribution
-_VERSIONS: dict[str, str] = {}  # distribution -> version, for other packages with a part loaded in this process
+_VERSIONS: dict[str, str] = {}  # distribution -> version of the other packages whose parts this process has loaded
 
 T = TypeVar("T")
 
 
 class Part:
-    """Value of an entry point: all arguments for a ``register_...`` function but the name, which the entry point has.
+    """Value of an entry point: the arguments of a ``register_...`` function, except the name.
 
-    An entry point in the group ``ethbrake_marl.measures`` that names the part below has the effect of
-    ``register_measure(name, closing, unit="m/s")``.
+    The name is the name of the entry point. For example, an entry point in the group ``ethbrake_marl.measures`` with
+    the value ``part`` below has the same effect as ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):
@@ -52,11 +52,11 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return name -> entry points with this name in a group; a list, because several packages may use one name.
+    """Return a dictionary name -> entry points of this name in a group; several packages may use the same name.
 
     This package's own names come first.
 
-    ``group``: its name without the prefix ``ethbrake_marl.``, for example ``agents``.
+    ``group``: name of the group without the prefix ``ethbrake_marl.``, for example ``agents``.
     """
     by_name: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
@@ -71,23 +71,25 @@ def giver(point: EntryPoint) -> str:
 
 
 def versions_used() -> dict[str, str]:
-    """Return name -> version of every other installed package that has added a part, such as an agent, to this process.
+    """Return a dictionary name -> version of the other packages that have added parts, such as agents, to this process.
 
-    Parts that are registered by entry points but were not loaded do not count.
+    A package counts only if one of its entry points has been loaded.
     """
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
-    """The parts of one kind by name; each is loaded when it is first looked up.
+    """Mapping name -> part for all parts of one kind. A part is loaded when its name is first looked up.
 
-    Testing for a name and iterating over the names load nothing. Looking up a name raises ``InvalidInput`` if its part
-    cannot be loaded or two distributions define it, and ``MissingExtra`` if a package of an extra is missing.
+    Testing for a name and iterating over the names do not load any part. Looking up a name raises ``UnknownName`` if no
+    part has this name, ``InvalidInput`` if its part cannot be loaded or two distributions define it, and
+    ``MissingExtra`` if a package of an extra is missing.
 
     Args:
         kind: what the parts are called in messages, for example ``agent``.
         group: group of the entry points, without the prefix ``ethbrake_marl.``.
-        register: called with a name and the value of its entry point; it calls ``add`` on this registry.
+        register: function that is called with the name and the value of an entry point, and calls ``add`` on this
+            registry.
         built_in: name -> part, for parts that are defined in code rather than by entry points.
 
     """
@@ -114,21 +116,23 @@ class Registry(Mapping[str, T]):
     def __getitem__(self, name: str) -> T:
         self.load(name)
         if name not in self.loaded:
-            why = "is asked for while it is loaded" if name in self._loading else "stands for several of other names"
-            raise InvalidInput(f"{self.kind} {name!r}: {why}")
+            loading = "is looked up by its own module while this module is loaded"
+            why = loading if name in self._loading else "is an entry point that defines parts with other names"
+            raise InvalidInput(f"{self.kind} {name!r} {why}")
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
         """Load the part called ``name`` if it is not loaded yet, and return the names of all parts that it defines.
 
-        An entry point usually defines the one part; it may define several by a dictionary. Raises ``UnknownName`` if
-        there is none, and ``InvalidInput`` or ``MissingExtra`` if it cannot be loaded.
+        An entry point usually defines one part; a dictionary as its value defines several parts. Raises
+        ``UnknownName`` if no part has this name, and ``InvalidInput`` or ``MissingExtra`` if the part cannot be loaded.
         """
         candidates = points(self.group).get(name, [])
         givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
         if len(givers) > 1:
             raise InvalidInput(
-                f"{self.kind} {name!r}: the installed packages {' and '.join(givers)} give it; uninstall all but one"
+                f"{self.kind} {name!r} is defined by several installed packages, {' and '.join(givers)};"
+                " uninstall all but one of them"
             )
         if name in self.loaded or name in self._loading:
             return [name]
@@ -173,7 +177,7 @@ class Registry(Mapping[str, T]):
             package = next((giver(point) for point in points(self.group).get(name, ()) if giver(point) != OURS), None)
             raise AlreadyExists(
                 f"{self.kind} {name!r} is registered already; give another name"
-                + f", or none in the package {package}, whose entry point gives it" * (package is not None)
+                + f", or leave the registration to the entry point of the package {package}" * (package is not None)
             )
 
     def usable(self) -> dict[str, T]:
@@ -195,7 +199,7 @@ class Registry(Mapping[str, T]):
         """
         if not points("agents"):
             return UnknownName(
-                f"unknown {self.kind} {name!r}: of the package {OURS} no entry points are installed; install it, or"
-                " where these files are newer than its installation, install it again (make venv)"
+                f"unknown {self.kind} {name!r}: no entry points of the package {OURS} are installed; install the"
+                " package, or install it again if its files are newer than the installation (make venv)"
             )
         return unknown_name(self.kind, name, self if known is None else known, may_be_own=True)

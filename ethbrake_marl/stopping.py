@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a flag to check between two steps, instead of an exception in the middle of one."""
+"""Ctrl-C and SIGTERM set a flag that is checked between two steps; they do not raise an exception within a step."""
 
 from __future__ import annotations
 

@@ -275,7 +275,7 @@ def test_potential__of_two_learners_lets_each_choose_given_the_other_twice_round
 
 def test_reward__without_harm_says_that_the_scenarios_objective_changes_nothing() -> None:
     own = eb.load_scenario("cooperation-3-pair").replace(objective="own")
-    with pytest.warns(WithoutEffect, match="the scenario's objective, own, changes nothing"):
+    with pytest.warns(WithoutEffect, match="the scenario's objective, own, has no effect"):
         paid = make_engine(own, 2, reward="paper", seed=1)
     assert paid.reward.objective is None
     make_engine(own, 2, reward={"harm": 1.0, "risk": 0.1}, seed=1)

@@ -26,12 +26,8 @@ from ethbrake_marl.errors import (
 @pytest.mark.parametrize(
     ("known", "name", "text"),
     [
-        ([], "mine", "unknown agent 'mine'; known: none; one of your own must be registered or installed first"),
-        (
-            ["coast"],
-            "mine",
-            "unknown agent 'mine'; known: coast; one of your own must be registered or installed first",
-        ),
+        ([], "mine", "unknown agent 'mine'; known: none; your own agent must be registered or installed first"),
+        (["coast"], "mine", "unknown agent 'mine'; known: coast; your own agent must be registered or installed first"),
         (["coast"], "cost", "unknown agent 'cost'; did you mean 'coast'?"),
     ],
 )

@@ -133,7 +133,7 @@ def test_contact__failed_forecast_names_its_world(monkeypatch):
 
     monkeypatch.setattr(observations, "observe_contacts", fail)
     worlds = SCENARIO.sample(3, 1).worlds
-    with pytest.raises(PhysicsError, match="world 1: a forecast of contacts could not look 10 s ahead"):
+    with pytest.raises(PhysicsError, match="world 1: a forecast of contacts failed before the end of its 10 s"):
         observe(worlds, 1, CONTACT)
 
 

@@ -101,13 +101,13 @@ def test_manifest__a_policys_observation_is_known_again_by_its_features(name: st
 STATE = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
 REFUSED: dict[str, Callable[[], object]] = {
     "scenario 'cooperation-4-all': obstacle_gap_m = 0: must be finite and in (0": lambda: ALL.replace(obstacle_gap_m=0),
-    "has nothing to brake for without an obstacle ahead; give obstacle_gap_m too": lambda: load_scenario(
+    "vehicle_1 can learn only with an obstacle ahead; add one, for instance obstacle_gap_m: 42": lambda: load_scenario(
         "cooperation-3-pair"
     ).with_learners([0, 1]),
-    "initial_state: obstacle_gap_m is missing, and random in scenario 'cooperation-4-all'": lambda: worlds_from_state(
+    "initial_state: obstacle_gap_m is missing; scenario 'cooperation-4-all' has no": lambda: worlds_from_state(
         NEAR, STATE
     ),
-    "initial_state: obstacle_gap_m is not of this scenario: 'paper-random' has no obstacle_gap_m": lambda: (
+    "initial_state: obstacle_gap_m cannot be set, because scenario 'paper-random' does not declare it": lambda: (
         worlds_from_state(load_scenario("paper-random"), {**STATE, "obstacle_gap_m": 30})
     ),
     "initial_state: obstacle_gap_m = 0: must be finite and in (0, 10000] m (metres)": lambda: worlds_from_state(

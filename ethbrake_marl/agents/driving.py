@@ -1,4 +1,4 @@
-"""Run agents through whole episodes: the loop of every evaluation and every prediction."""
+"""Run agents through whole episodes: the loop behind evaluations and rollouts."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from ethbrake_marl.scenario.schema import Scenario
 
 @dataclass(frozen=True, slots=True)
 class Episodes:
-    """Result of running a batch of n episodes (worlds) to their ends."""
+    """Result of a batch of n whole episodes, one in each world."""
 
     ledger: Ledger  # harm and impacts of every pair of vehicles over the whole episode
-    final: Worlds  # each world at the end of its episode
-    at_rest: Bools  # [n] whether the line came to rest; otherwise the episode ended at the horizon
+    final: Worlds  # state of each world at the end of its episode
+    at_rest: Bools  # [n] whether all vehicles came to rest; otherwise the episode ended at the horizon
     guarded: Any  # memory of the shield at the end; None without a shield
     memories: Mapping[int, Memory]  # index of a controlled vehicle -> memory of its agent at the end
     terms: Mapping[str, Floats] = field(default_factory=dict)  # name of a reward term -> its sum, [n] or [n, N]
@@ -38,12 +38,12 @@ class Episodes:
         """Run an engine from the first decision to the end of every episode.
 
         Args:
-            engine: an engine made by ``episode_engine``, not stepped yet.
-            worlds: the engine's worlds at the alert; observers get them as ``before`` of the first step.
+            engine: an engine made by ``episode_engine``, before its first step.
+            worlds: worlds of the engine at the alert, with which the first call of each observer begins.
             watched_by: observers that are called after every step.
             summed: names of reward terms to sum over the episodes.
 
-        Raises ``PhysicsError`` naming the worlds that could not be advanced.
+        Raises ``PhysicsError`` naming the worlds in which the physics failed.
 
         """
         at_rest = np.zeros(worlds.n, np.bool_)
@@ -69,25 +69,27 @@ class Watch(Protocol):
     """Observer of every step of a batch of episodes."""
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Receive one step, or a part of it, of all n worlds.
+        """Receive one step of all n worlds, without changing the arguments.
 
-        The first step is from the alert to the first decision. A step within which a script decides arrives in parts.
+        The first step is from the alert to the first decision. If a script decides within a step, this method is called
+        once for each interval between decisions.
 
         Args:
-            before: the worlds at the start of the step. Do not change any of the arguments.
-            command_mps2: command of every vehicle during the step, [n, N] m/s2.
-            until_s: time of each world at the end of the step, [n] s. A world whose episode has ended keeps its time.
+            before: the worlds at the start of the interval.
+            command_mps2: command of every vehicle during the interval, [n, N] m/s2.
+            until_s: time of each world at the end of the interval, [n] s. The time of a world whose episode has ended
+                does not change.
 
         """
         ...
 
 
 def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | None = None) -> dict[int, Agent]:
-    """Return the agents of the scenario's scripts: vehicle index (0 = front) -> agent.
+    """Return the agent of each scripted vehicle of a scenario: vehicle index (0 = front) -> agent.
 
     Args:
         scenario: the scenario.
-        except_for: index or indices of vehicles to leave out; None: none.
+        except_for: index or indices of vehicles to leave out; None: leave out no vehicle.
 
     """
     left_out = (except_for,) if isinstance(except_for, int) else except_for or ()
@@ -97,21 +99,21 @@ def script_agents(scenario: Scenario, *, except_for: int | Collection[int] | Non
 def episode_engine(
     worlds: Worlds, agent: Driver, scenario: Scenario, vehicle: int | None = None, reward: Reward = "harm"
 ) -> Engine:
-    """Return an engine in which agents drive whole episodes; step it with ``engine.step({})`` until all have ended.
+    """Return an engine in which agents drive whole episodes; call ``engine.step({})`` until all episodes have ended.
 
-    The agents decide when the latency of the first of their vehicles has elapsed and every time step after that, like
-    learners; their commands are applied without rounding. Behind a shield they propose commands, and the engine treats
-    their vehicles as learners. An agent that looks ahead knows the scripts, and assumes that other controlled vehicles
-    brake fully.
+    The agents decide for the first time when the latency of any controlled vehicle has elapsed, and then at every time
+    step, like learners. Their commands are applied without rounding. Behind a shield the agents only propose commands,
+    and the engine treats the controlled vehicles as learners. An agent that looks ahead knows the scripts, and assumes
+    that other controlled vehicles brake fully.
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent for ``vehicle``, or a team, which has its own vehicles.
+        agent: an agent for ``vehicle``, or a team, which knows its vehicles.
         scenario: scenario whose scripts drive the other vehicles.
         vehicle: index of the agent's vehicle (0 = front); None for a team.
         reward: reward whose terms the engine computes.
 
-    Raises ``InvalidInput`` if one of the scenario's learners gets no agent.
+    Raises ``InvalidInput`` if a learner of the scenario has no agent.
 
     """
     team = agent if isinstance(agent, Team) else Team.of(agent, () if vehicle is None else (vehicle,))
@@ -120,9 +122,9 @@ def episode_engine(
     if undriven:
         for_one = ", ".join(f"+{name}" for name in around_one_vehicle())
         raise InvalidInput(
-            f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'nobody'}, but"
-            f" {', '.join(undriven)} of scenario {scenario.name!r} must be controlled too. An agent that rolls itself"
-            f" out ({for_one}) can drive one learner, the others need scripts"
+            f"agent {team.name!r} drives {', '.join(scenario.vehicle_names[i] for i in drivers) or 'no vehicle'}, but"
+            f" {', '.join(undriven)} of scenario {scenario.name!r} must have an agent as well. An agent with {for_one}"
+            " can drive only one learner; give the other learners scripts"
         )
     scripts = script_agents(scenario, except_for=drivers)
     shield = team.shield
@@ -149,13 +151,13 @@ def drive(
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent for ``vehicle``, or a team, which has its own vehicles.
+        agent: an agent for ``vehicle``, or a team, which knows its vehicles.
         scenario: scenario whose scripts drive the other vehicles.
         vehicle: index of the agent's vehicle (0 = front); None for a team.
         watched_by: observers that are called after every step.
         summed: names of reward terms to sum over the episodes, with the default settings of ``RewardParams``.
 
-    Raises ``PhysicsError`` naming all worlds that could not be advanced; the others can be driven without them.
+    Raises ``PhysicsError`` naming all worlds in which the physics failed; leave these worlds out to drive the others.
 
     """
     reward: Reward = {"harm": 1.0} | dict.fromkeys(summed, 1.0) if summed else "harm"
@@ -164,10 +166,10 @@ def drive(
 
 
 def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_mps2: Floats) -> Worlds:
-    """Pass the step that the engine has just made to the observers; return the worlds after it.
+    """Pass the engine's last step to the observers; return the worlds after the step.
 
     Args:
-        watched_by: the observers; without any, ``before`` is returned.
+        watched_by: the observers; if there are none, ``before`` is returned.
         before: the worlds at the start of the step.
         engine: the engine, after the step.
         command_mps2: command of every vehicle during the step, [n, N] m/s2.
@@ -175,7 +177,7 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
     """
     if not watched_by:
         return before
-    now = engine.packed.worlds(before.vehicles)  # same episodes, same vehicles
+    now = engine.packed.worlds(before.vehicles)
     for part in engine.segments(before, command_mps2):
         for watch in watched_by:
             watch.see(*part)
@@ -185,8 +187,8 @@ def _show(watched_by: Sequence[Watch], before: Worlds, engine: Engine, command_m
 def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: int, steps: int) -> Floats:
     """Return the first ``steps`` commands that ``agent`` gives ``vehicle`` (index, 0 = front), [n, steps] m/s2.
 
-    ``worlds`` are n worlds at the alert. Once an episode has ended, its last command is repeated. Raises
-    ``PhysicsError`` naming the worlds that cannot be driven to the end.
+    ``worlds`` are n worlds at the alert. After the end of an episode, its last command is repeated. Raises
+    ``PhysicsError`` naming the worlds in which the physics failed.
     """
     engine = episode_engine(worlds, agent, scenario, vehicle)
     commands = write_down(engine, steps, lambda: engine.wanted_mps2[:, [vehicle]])[:, :, 0]
@@ -201,10 +203,10 @@ def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floa
     Args:
         engine: an engine made by ``episode_engine``.
         steps: number of steps to record.
-        column: returns the present values of the engine's n worlds, [n, K].
+        column: function that returns the values to record of the engine's n worlds, [n, K].
 
-    Returns [n, steps, K], NaN after the end of an episode. Raises ``PhysicsError`` naming worlds that could not be
-    advanced.
+    Returns the recorded values, [n, steps, K], NaN after the end of an episode. Raises ``PhysicsError`` naming the
+    worlds in which the physics failed.
 
     """
     columns = np.full((steps, *column().shape), np.nan)

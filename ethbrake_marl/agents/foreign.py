@@ -1,4 +1,4 @@
-"""Policies of other libraries as agents; each becomes one function ``(observation, state) -> (action, state)``."""
+"""Agents for policies of other libraries, as functions ``(observations, state) -> (actions, state)``."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 
-State = Any  # memory of a policy: arrays whose first axis is the world, or tuples, lists and mappings of such arrays
+State = Any  # memory of a policy: arrays whose first axis counts worlds, or tuples, lists and mappings of such arrays
 
 Infer = Callable[[Observations, State], tuple[Any, State]]  # (observations [n, F], memory) -> (actions, new memory)
 
-Begin = Callable[[int], State]  # number of episodes -> memory at their start
+Begin = Callable[[int], State]  # number of episodes -> memory at the start of the episodes
 
 _KINDS = (
     "a function of observations, an object with predict, a torch module, an ONNX session or the path of an .onnx file"
@@ -41,12 +41,13 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
     """Return two functions for a policy: ``(observations, state) -> (actions, state)``, and ``n -> initial state``.
 
     Args:
-        policy: a policy of one of the kinds that ``policy_agent`` accepts.
+        policy: a policy of a kind that ``policy_agent`` accepts.
         name: name of the agent in error messages.
         features: number F of features in an observation.
-        initial_state: for a function or torch module with a memory: makes the memory of n episodes at their start.
+        initial_state: function that returns the memory at the start of n episodes, for a function or torch module with
+            a memory; None: no memory.
 
-    The second result is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is not a policy.
+    The second function is None for a policy without a memory. Raises ``InvalidInput`` if ``policy`` is not a policy.
 
     """
     if isinstance(policy, str | os.PathLike):
@@ -57,11 +58,11 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
         if callable(policy):
             call = policy if initial_state else lambda seen, _: (_without_memory(policy(seen)), None)
             return call, initial_state
-        raise InvalidInput(f"agent {name!r}: {policy!r:.80} is no policy; must be {_KINDS}")
+        raise InvalidInput(f"agent {name!r}: policy = {policy!r:.80}: must be {_KINDS}")
     if initial_state is not None:
         raise InvalidInput(
-            f"agent {name!r}: initial_state is for a function (observation, state) -> (action, state); write one"
-            " around this model"
+            f"agent {name!r}: initial_state: can only be used with a function (observation, state) -> (action, state);"
+            " write such a function around this model"
         )
     return (_ask_onnx(policy), None) if hasattr(policy, "run") else _ask_model(policy, name, features)
 
@@ -69,17 +70,17 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
 def _without_memory(action: Any) -> Any:
     if isinstance(action, tuple):
         raise InvalidInput(
-            f"gave a tuple of {len(action)} in place of an action; a policy with a memory gives (action, state), and"
-            " needs initial_state"
+            f"gave a tuple of {len(action)}; must give an action; for a policy with a memory, which gives (action,"
+            " state), pass initial_state"
         )
     return action
 
 
 def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | None]:
-    """Adapt a model with a method ``predict`` (Stable-Baselines3, sb3-contrib), as ``adapt_policy`` does.
+    """Return the same functions as ``adapt_policy``, for a model with a method ``predict`` (Stable-Baselines3).
 
-    A memory that it returns (recurrent models) is kept. Which axis of the memory counts the worlds is found by
-    predicting for two worlds and for three.
+    A recurrent model returns its memory. Predictions for two and for three worlds show which axis of each array in the
+    memory counts worlds.
 
     Args:
         model: the model.
@@ -98,7 +99,10 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
         shapes = np.shape(two), np.shape(three)
         candidates = [axis for axis, sizes in enumerate(zip(*shapes, strict=True)) if sizes == (2, 3)]
         if len(candidates) != 1:
-            raise InvalidInput(f"its state has arrays of shape {shapes[0]} for two worlds and {shapes[1]} for three")
+            raise InvalidInput(
+                f"a state array has shape {shapes[0]} for two worlds and {shapes[1]} for three; exactly one axis must"
+                " count worlds"
+            )
         return candidates[0]
 
     try:
@@ -136,8 +140,8 @@ def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
             layer, torch.nn.modules.dropout._DropoutNd | torch.nn.modules.batchnorm._NormBase
         ):
             raise InvalidInput(
-                f"agent {name!r}: {type(layer).__name__} is in training mode, where it draws, or mixes the worlds of a"
-                " batch; call eval() of the module first"
+                f"agent {name!r}: the layer {type(layer).__name__} is in training mode, in which results are random or"
+                " depend on the other worlds of a batch; call eval() of the module first"
             )
 
     def call(seen: Observations, state: State) -> tuple[Any, State]:
@@ -150,17 +154,15 @@ def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
 
 
 def _is_torch_module(policy: Any) -> bool:
-    """Return whether ``policy`` is a torch module. Never imports torch: without torch in memory, nothing is one."""
+    """Return whether ``policy`` is a torch module, without importing torch."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(policy, torch.nn.Module)
 
 
 def _open_onnx(path: Path, name: str) -> Any:
     if path.suffix != ".onnx" or not path.is_file():
-        what = (
-            "there is no such file" if path.suffix == ".onnx" else f"a path must be that of an .onnx file, not {path}"
-        )
-        raise InvalidInput(f"agent {name!r}: policy {str(path)!r}: {what}")
+        what = "there is no such file" if path.suffix == ".onnx" else "a policy given by a path must be an .onnx file"
+        raise InvalidInput(f"agent {name!r}: policy = {str(path)!r}: {what}")
     with naming_extras():
         import onnxruntime
     return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -169,8 +171,8 @@ def _open_onnx(path: Path, name: str) -> Any:
 def weights_sha256(policy: Any) -> str | None:
     """Return the SHA-256 of an .onnx file (given by its path), or of the present weights of a torch or SB3 model.
 
-    The statistics of a ``VecNormalize`` count as weights. Returns None for any other policy, whose weights cannot be
-    read.
+    The statistics of a ``VecNormalize`` count as weights. Returns None for other policies, because their weights cannot
+    be read.
     """
     if isinstance(policy, str | os.PathLike):
         return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
@@ -190,7 +192,7 @@ def weights_sha256(policy: Any) -> str | None:
 
 
 def to_array(value: Any) -> NDArray[Any]:
-    """Return an array, torch tensor or sequence as a NumPy array; masked entries become NaN."""
+    """Convert an array, torch tensor or sequence to a NumPy array; masked entries become NaN."""
     if isinstance(value, np.ma.MaskedArray):
         return np.ma.filled(value.astype(np.float64), np.nan)
     return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
@@ -214,25 +216,31 @@ def policy_agent(
     model whose ``predict`` returns a state.
 
     Args:
-        policy: a function; a model with ``predict`` (Stable-Baselines3: called deterministically, its state kept world
-            by world, its observations normalised by its ``VecNormalize``); a torch module (called without gradients);
-            an ONNX session; or the path of an ``.onnx`` file. Copies of the agent share it.
-        name: name in tables and messages; None: the name of the function or class.
-        scenario: scenario, or its name, whose learners' observation the policy takes.
-        observation: the observation instead, as for ``choose_observation``. None: the scenario's; without a scenario,
-            that of the policy itself, of a Stable-Baselines3 model's environment, or the default.
-        initial_state: makes the memory of ``n`` episodes at their start: an array whose first axis is the world, or
-            tuples and mappings of arrays. None: a function has no memory.
-        clip: clip actions to [-1, 1], and indices to the first and last; by default a value beyond is an error.
-        appended: what training appended to each observation: ``number`` (the learner's number) or ``state`` (the true
-            state of the line), as for ``make_sb3_vec_env``; needs the scenario with its learners. None: as in the
-            model's training environment, or nothing.
-        ignore_wrappers: accept a model even if wrappers of its training may have changed observations or actions, if
-            its actions have other bounds, or if the statistics of its ``VecNormalize`` are missing.
-        actions: number of discrete actions of which the policy returns the index, as in an environment with these
-            ``actions``. None: as in the model's environment, or actions in [-1, 1].
+        policy: one of the following; copies of the agent share it.
 
-    Raises ``InvalidInput`` for anything else, for a policy with another number of features, and for a model that was
+            - a function of observations;
+            - a model with ``predict``. A Stable-Baselines3 model is called deterministically, with the statistics of
+              its ``VecNormalize`` and a separate memory for each world;
+            - a torch module, called without gradients;
+            - an ONNX session, or the path of an ``.onnx`` file.
+        name: name of the agent in tables and messages; None: the name of the function or class.
+        scenario: scenario, or its name, in which the policy was trained; it defines the observation. None: unknown.
+        observation: the observation that the policy takes, in place of the scenario's (see ``choose_observation``).
+            None: the scenario's observation. Without a scenario, it is the observation of the policy, of the
+            environment of a Stable-Baselines3 model, or the default.
+        initial_state: function that returns the memory at the start of n episodes: an array whose first axis counts
+            worlds, or tuples and mappings of such arrays. None: the policy is a function without memory, or a model.
+        clip: whether actions are clipped to [-1, 1], and indices to the valid range. If False, a value outside is an
+            error.
+        appended: features that were appended to each observation in training, as for ``make_sb3_vec_env``: ``number``
+            (the learner's number) or ``state`` (the true state of the line); needs ``scenario``. None: the same as in
+            the model's training environment, or no features.
+        ignore_wrappers: whether to accept a model whose training wrappers may have changed observations or actions,
+            whose actions have other bounds, or whose ``VecNormalize`` statistics are missing.
+        actions: number of discrete actions, if the policy returns the index of one. None: the same as in the model's
+            environment, or actions in [-1, 1].
+
+    Raises ``InvalidInput`` if ``policy`` is none of these kinds, if it takes another number of features, and if it was
     trained under wrappers that may change observations or actions.
 
     >>> import ethbrake_marl as eb
@@ -252,19 +260,19 @@ def policy_agent(
     if appended is None and (appended := getattr(trained, "appended", None)) is not None:
         scenario = trained.engine.scenario if scenario is None else scenario
     if appended is not None and scenario is None:
-        raise InvalidInput(f"agent {named!r}: appended = {appended!r} needs the scenario that it was trained in")
+        raise InvalidInput(f"agent {named!r}: appended = {appended!r}: pass scenario=, the scenario of the training")
     size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
     shape = getattr(getattr(policy, "observation_space", None), "shape", None)
     if shape not in (None, (size,)):
         raise InvalidInput(
-            f"agent {named!r}: the policy takes observations of shape {shape}, here are {size} features;"
-            " give what it was trained on: scenario, observation, or appended (number or state, of make_sb3_vec_env)"
+            f"agent {named!r}: the policy takes observations of shape {shape}, but this observation has {size}"
+            " features; pass scenario, observation or appended as in the training"
         )
     seen = spec if trained is None or ignore_wrappers else trained.engine.observation
     if [f.name for f in spec.features] != [f.name for f in seen.features]:
         raise InvalidInput(
-            f"agent {named!r}: the model is trained on other features than {spec}: {seen}; leave"
-            " observation out, and give the scenario it was trained in, or none"
+            f"agent {named!r}: the model was trained with the observation {seen}, not with {spec}; leave observation"
+            " out, and pass the scenario of the training or no scenario"
         )
     actions = getattr(trained, "actions", None) if actions is None else actions
     if not ignore_wrappers:
@@ -286,22 +294,24 @@ def _check_action_space(policy: Any, name: str, actions: int | None) -> None:
     if space is None or fits:
         return
     right = "a number in [-1, 1]" if actions is None else f"an index from 0 to {actions - 1} (actions={actions})"
-    advice = "write a function around it that says what they mean"
+    advice = "write a function around the policy that converts its actions"
     if least == 0:
-        advice = f"say actions={count} if they are evenly spaced from -1 to 1, or {advice}"
+        advice = f"pass actions={count} if the actions are evenly spaced from -1 to 1, or {advice}"
     raise InvalidInput(f"agent {name!r}: the policy gives actions in {space}; must be {right}; {advice}")
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
     """Return a function ``(worlds, vehicle)`` that computes the K features appended to a vehicle's observation, [n, K].
 
-    ``appended`` is ``number`` (the vehicle's number among the scenario's learners) or ``state`` (the true state of the
-    whole line).
+    ``appended`` is ``number`` (the vehicle's position among the scenario's learners, from 0) or ``state`` (the true
+    state of the whole line).
     """
 
     def number(worlds: Worlds, vehicle: int) -> Observations:
         if vehicle not in scenario.learners:
-            raise InvalidInput(f"appended = 'number': vehicle_{vehicle + 1} is no learner of {scenario.name!r}")
+            raise InvalidInput(
+                f"appended = 'number': vehicle_{vehicle + 1} must be a learner of scenario {scenario.name!r}"
+            )
         return np.full((worlds.n, 1), scenario.learners.index(vehicle), np.float32)
 
     return number if appended == "number" else lambda worlds, _: full_state(worlds, scenario)
@@ -336,8 +346,8 @@ class PolicyAgent:
         self.weights_sha256 = weights_sha256  # hash of the policy's present weights; None if they cannot be read
         self.observation = observation
         self._infer, self._initial_state, self._clip = infer, initial_state, clip
-        self._more = more  # what follows the own observation
-        self._actions = actions  # number of discrete actions, of which the policy returns an index; None: no index
+        self._more = more  # computes the features appended to the observation; None: no such features
+        self._actions = actions  # number of discrete actions, if the policy returns an index; None: no index
 
     def policy_sha256(self) -> str | None:
         """Return the hash of the policy's present weights; None if they cannot be read."""
@@ -363,8 +373,8 @@ class PolicyAgent:
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Return the commanded acceleration of ``vehicle``, [n] m/s2, and the agent's new memory.
 
-        Raises ``AgentFailed`` naming world and step if the policy raises, or returns a wrong shape, a value that is not
-        a number, or one outside [-1, 1].
+        Raises ``AgentFailed`` naming world and step if the policy raises an error, or returns a wrong shape, a value
+        that is not a number, or a value outside [-1, 1].
         """
         seen = observe(worlds, vehicle, self.observation).astype(np.float32, copy=False)
         if self._more is not None:
@@ -386,9 +396,9 @@ class PolicyAgent:
             raise AgentFailed(self.name, k, reason) from error
 
     def _answer(self, seen: Observations, state: State, rows: Ints) -> tuple[NDArray[Any], State]:
-        """Return the policy's raw actions for the worlds with the indices ``rows``, and its new memory of these worlds.
+        """Return the policy's raw actions in the worlds with the indices ``rows``, and its new memory there.
 
-        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        ``seen`` [n, F] are the observations in all worlds, ``state`` is the policy's memory of all worlds.
         """
         if self._initial_state is None:
             return to_array(self._infer(seen[rows], None)[0]), None
@@ -396,9 +406,9 @@ class PolicyAgent:
         return to_array(action), checked_memory(state, len(rows))
 
     def _find_failing(self, seen: Observations, state: State) -> int | None:
-        """Return the index of a world for which the policy alone raises, found by bisection; None if there is none.
+        """Find, by bisection, a world for which the policy fails when called for it alone; None if there is none.
 
-        ``seen`` [n, F] and ``state`` are observations and the policy's memory of all worlds.
+        ``seen`` [n, F] are the observations in all worlds, ``state`` is the policy's memory of all worlds.
         """
 
         def fails(rows: Ints) -> bool:
@@ -420,36 +430,36 @@ class PolicyAgent:
     def _checked(self, action: NDArray[Any], seen: Observations, worlds: Worlds, steps: Ints) -> Floats:
         """Return a policy's raw actions as [n] in [-1, 1]; raise ``AgentFailed`` for wrong shapes or values.
 
-        ``seen``, ``worlds`` and ``steps`` [n] (steps taken) are used in the message only.
+        ``seen``, ``worlds`` and ``steps`` [n] (number of steps so far) are for the error message only.
         """
         n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if self._actions is not None:
             return self._checked_indices(action, self._actions, what, worlds, steps)
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
             first = len(action) if action.shape[1:] in ((), (1,)) and action.ndim and len(action) < n else 0
-            raise self._refusal(first, worlds, steps, f"{what}; one number per world is needed, shape ({n}, 1)")
+            raise self._refusal(first, worlds, steps, f"{what}; must be one number per world, shape ({n}, 1)")
         values: Floats = action[:, 0].astype(np.float64)
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values)))
-            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]}; must be in [-1, 1]")
+            raise self._refusal(k, worlds, steps, f"{what}; its action is {values[k]}; must be in [-1, 1]")
         inside = np.abs(values) <= LARGEST
         if not (self._clip or inside.all()):
             k = int(np.argmin(inside))
-            right = "must be in [-1, 1]; with clip=True the nearest is meant"
-            raise self._refusal(k, worlds, steps, f"{what}, in which stands {values[k]:g}; {right}")
+            right = "must be in [-1, 1]; clip=True clips such actions"
+            raise self._refusal(k, worlds, steps, f"{what}; its action is {values[k]:g}; {right}")
         return values.clip(-1.0, 1.0)
 
     def _checked_indices(self, indices: NDArray[Any], count: int, what: str, worlds: Worlds, steps: Ints) -> Floats:
         """Check the indices of discrete actions and return the actions as [n] in [-1, 1]."""
         n, last = worlds.n, count - 1
-        right = f"with actions={count} a whole number from 0 to {last} per world is needed, shape ({n},) or ({n}, 1)"
+        right = f"must be a whole number from 0 to {last} per world with actions={count}, shape ({n},) or ({n}, 1)"
         if indices.shape not in ((n,), (n, 1)) or indices.dtype.kind not in "iu":
             raise self._refusal(0, worlds, steps, f"{what}; {right}")
         row = indices.reshape(n).clip(0, last) if self._clip else indices.reshape(n)
         inside = (row >= 0) & (row <= last)
         if not inside.all():
             k = int(np.argmin(inside))
-            raise self._refusal(k, worlds, steps, f"{what}, in which stands {row[k]}; {right}")
+            raise self._refusal(k, worlds, steps, f"{what}; its index is {row[k]}; {right}")
         return index_to_action(row, count)
 
     def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:

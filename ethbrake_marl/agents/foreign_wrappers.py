@@ -1,7 +1,7 @@
-"""Checks for wrappers in a Stable-Baselines3 model's training environment that change observations or actions.
+"""Find wrappers in a Stable-Baselines3 model's training environment that may change observations or actions.
 
-An agent calls the model alone, without these wrappers, so their changes would be lost. Neither Stable-Baselines3 nor
-the libraries of the wrappers need to be installed.
+An agent calls the model without these wrappers, so the model would get other observations than in training, or its
+actions would have other effects. The checks work without Stable-Baselines3 and the wrappers' libraries.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from ethbrake_marl.engine.engine import Engine
 from ethbrake_marl.errors import InvalidInput
 
-# Library -> classes that pass observations and actions on unchanged. ``VecNormalize`` is applied by the agent.
+# Library -> classes that do not change observations and actions. The agent itself applies ``VecNormalize``.
 HARMLESS = {
     "gymnasium": (
         "Env", "Wrapper", "RewardWrapper", "NormalizeReward", "OrderEnforcing", "PassiveEnvChecker", "TimeLimit",
@@ -42,7 +42,7 @@ _INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attribute
 def changes(layer: type[Any]) -> bool:
     """Return whether a class of wrappers or environments may change observations or actions.
 
-    A class does not if each of its methods is defined by a class in ``HARMLESS`` or by a class of this package.
+    The result is False if a class in ``HARMLESS``, or a class of this package, defines each method in ``_METHODS``.
     """
     for method in _METHODS:
         definer = next((each for each in layer.__mro__ if method in vars(each)), object)
@@ -58,9 +58,9 @@ class _WhatChanges(type):
 
 
 class _Changing(metaclass=_WhatChanges):
-    """Stand-in class for ``env_is_wrapped``: every object whose class may change something is an instance of it.
+    """Argument for ``env_is_wrapped``: an object is an instance if its class may change observations or actions.
 
-    ``env_is_wrapped`` also runs in other processes, where ``changes`` cannot be called directly.
+    ``env_is_wrapped`` also works for environments in other processes, where ``changes`` cannot be called directly.
     """
 
 
@@ -68,20 +68,20 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
     """Return this package's environment inside the training environment of a Stable-Baselines3 model.
 
     Args:
-        model: any policy; returns None for one that has no environment, or none of this package.
+        model: any policy; the result is None for a policy without an environment of this package.
         name: name of the agent in error messages.
-        ignore_wrappers: accept everything that raises an error otherwise.
+        ignore_wrappers: whether to skip all checks.
 
-    Raises ``InvalidInput`` for a wrapper, in any copy of the environment, that may change observations or actions; for
-    copies with different features; and for missing statistics of ``VecNormalize``.
+    Raises ``InvalidInput`` if a wrapper in any parallel copy of the environment may change observations or actions, if
+    the copies observe different features, and if the statistics of ``VecNormalize`` are missing.
 
     """
     statistics = normalisation(model)
     if statistics is None and not ignore_wrappers and _was_normalised(model):
         raise InvalidInput(
-            f"agent {name!r}: the model was trained under VecNormalize, whose statistics are missing; load them,"
-            " model.set_env(VecNormalize.load(PATH, venv)), or drive without them by ignore_wrappers=True,"
-            " as is right if it normalised rewards alone"
+            f"agent {name!r}: the model was trained under VecNormalize, whose statistics are missing; load them with"
+            " model.set_env(VecNormalize.load(PATH, venv)); if VecNormalize changed rewards only, pass"
+            " ignore_wrappers=True"
         )
     env, bases = getattr(model, "get_env", lambda: None)(), list[Any]()
     for layer in [] if env is None else _layers(env):
@@ -90,20 +90,20 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
             wrapper = "VecNormalize inside another one"
         if wrapper is not None and not ignore_wrappers:
             raise InvalidInput(
-                f"agent {name!r}: the model was trained under {wrapper}, which may change what it sees or does, and"
-                " here it would drive without; write a function around the model that does the same, or say that"
-                " nothing is changed by ignore_wrappers=True"
+                f"agent {name!r}: the model was trained under {wrapper}, which may change observations or actions and"
+                " is not applied here; write a function around the model that makes the same changes, or pass"
+                " ignore_wrappers=True if there are none"
             )
         bases += inside
     features = [base.engine.observation.features for base in bases]
     if not ignore_wrappers and any(each != features[0] for each in features):
         raise InvalidInput(
-            f"agent {name!r}: the copies of the model's environment observe different features; all need the same"
+            f"agent {name!r}: the copies of the model's environment observe different features; must be the same"
         )
     counts = {getattr(base, "actions", None) for base in bases}
     if not ignore_wrappers and len(counts) > 1:
         raise InvalidInput(
-            f"agent {name!r}: the copies of the model's environment have different actions, {counts}; all need the same"
+            f"agent {name!r}: the copies of the model's environment have different actions, {counts}; must be the same"
         )
     return bases[0] if bases else None
 
@@ -116,8 +116,8 @@ def normalisation(model: Any) -> Any:
 def _was_normalised(model: Any) -> bool:
     """Return whether the saved training data of a Stable-Baselines3 model show that its observations were normalised.
 
-    They were if the last observation lies outside the observation space, or its original is saved too. Off-policy
-    algorithms always save an original, so for them only the space counts.
+    This is so if the last observation lies outside the observation space, or if the model also saved the observation
+    before normalisation. Off-policy algorithms always save the latter, so only the space is checked for them.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True
@@ -127,9 +127,9 @@ def _was_normalised(model: Any) -> bool:
 
 
 def _layers(env: Any) -> Iterator[Any]:
-    """Yield an environment, then every wrapper and environment inside it, from the outside in, in every parallel copy.
+    """Yield an environment, then all wrappers and environments inside it, including all parallel copies.
 
-    It stops at environments of this package.
+    The order is from the outside in. Nothing inside an environment of this package is yielded.
     """
     yield env
     for name in [] if _is_ours(env) else _INSIDE:
@@ -139,14 +139,14 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
-    """Return which class of a layer may change observations or actions, and this package's environments in it.
+    """Check one layer for changes of observations or actions, and for environments of this package.
 
     Args:
-        layer: one wrapper or environment, from ``_layers``.
+        layer: a wrapper or environment, from ``_layers``.
         name: name of the agent in error messages.
 
-    The first result is the name of that class; None if the layer changes nothing. The environments are the layer itself
-    or, if it runs environments in other processes, those.
+    Returns the name of the class that may change observations or actions, or None; and the environments of this
+    package: the layer itself, or environments that the layer runs in other processes.
 
     """
     if changes(type(layer)):
@@ -161,8 +161,8 @@ def _look(layer: Any, name: str) -> tuple[str | None, list[Any]]:
         return layer.env_method("__str__", indices=odd[0])[0] if odd else None, bases
     except (OSError, EOFError):
         raise InvalidInput(
-            f"agent {name!r}: the model's environment runs in other processes, which do not answer; ask before they are"
-            " closed, or load the model from its file"
+            f"agent {name!r}: the model's environment runs in other processes, which do not answer; make the agent"
+            " before you close the environment, or load the model from its file"
         ) from None
 
 
@@ -171,5 +171,5 @@ def _is_ours(env: Any) -> bool:
 
 
 def _own(layer: Any) -> dict[str, Any]:
-    """Return the attributes of a wrapper or environment itself, without those that it forwards from inside."""
+    """Return the attributes of a wrapper itself, without attributes that it forwards from the environment inside."""
     return getattr(layer, "__dict__", {})

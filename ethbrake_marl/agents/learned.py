@@ -1,4 +1,4 @@
-"""A trained policy as an agent: observe, infer, command that acceleration. Deterministic."""
+"""An agent that drives by a trained policy, without randomness."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from ethbrake_marl.game.actions import action_to_command
 from ethbrake_marl.game.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics.state import Floats, Worlds
 
-TRAINED_POLICY = "trained policy"  # name of a run's own policy in tables and figures
+TRAINED_POLICY = "trained policy"  # name of the policy that a run has trained, in tables and figures
 
-TRAINED_TEAM = "trained team"  # likewise, of several learners
+TRAINED_TEAM = "trained team"  # name of the team that a run has trained, in tables and figures
 
 
 class LearnedPolicy(Protocol):
-    """Interface of a policy that an agent needs; ``ethbrake_marl.policies.policy.Policy`` implements it."""
+    """Interface of a policy for ``LearnedAgent``; ``ethbrake_marl.policies.policy.Policy`` implements it."""
 
     @property
     def observation(self) -> ObservationSpec:
-        """The observation that the policy takes: its features and their order."""
+        """The observation that the policy takes: features in their order."""
         ...
 
     def __call__(self, observation: Observations, /) -> Observations:
-        """Return the action of each observation: [n, F] -> [n, 1] in [-1, 1]; rows do not influence each other."""
+        """Return the action for each observation: [n, F] -> [n, 1] in [-1, 1]; each row is computed independently."""
         ...
 
 
 class LearnedAgent(ByPolicy):
-    """Agent that drives one vehicle by the deterministic action of a ``policy``; it has no memory between steps.
+    """Agent that drives one vehicle by the deterministic action of a ``policy``, without a memory.
 
-    ``name`` stands in tables and error messages.
+    ``name`` is the name of the agent in tables and error messages.
 
     >>> import ethbrake_marl as eb
     >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
@@ -52,6 +52,6 @@ class LearnedAgent(ByPolicy):
         action = self.policy(observe(worlds, vehicle, self.policy.observation)).astype(np.float64)
         if action.shape != (worlds.n, 1):
             raise InvalidInput(
-                f"{self.name}: actions of shape {action.shape}; one per world is needed, ({worlds.n}, 1)"
+                f"{self.name}: shape of actions = {action.shape}: must be ({worlds.n}, 1), one action per world"
             )
         return action_to_command(action[:, 0], worlds.vehicles, vehicle)

@@ -34,17 +34,17 @@ def make_agent(
     """Make a new agent for one vehicle in one batch, or a team of agents from one training run.
 
     Args:
-        spec: ``name[:argument][@policy]`` and wrappers, for example ``constant:3.5``, ``planner:64``,
-            ``ppo+search+step``; ``ethbrake agent list`` lists all. ``my_file.py:make_agent`` runs that file,
-            which can do whatever you can: its function gets the arguments of a factory (see ``register_agent``), or
-            none.
-        scenario: scenario, its name or the path of its file; needed by teams and by wrappers.
+        spec: ``name[:argument][@policy]``, followed by wrappers, for example ``constant:3.5``, ``planner:64`` or
+            ``ppo+search+step``. ``ethbrake agent list`` lists all agents and wrappers. ``my_file.py:make_agent`` runs
+            this file with all your rights, and calls the function with the arguments of a factory (see
+            ``register_agent``), or without arguments if it has no parameters.
+        scenario: scenario, its name, or the path of its file; teams and wrappers need it.
         harm_count: impacts whose harm an optimising agent minimises: ``first`` (each pair's first) or ``total`` (all).
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: upper limit for the candidates of a search, to try an agent out quickly.
-        uncertainty: what a shield for uncertain worlds does not know, for example ``"gaps_m=0.5"``.
-        time_step_s: time between two decisions for agents that search or follow a control law; None: the scenario's, or
-            0.1 s.
+        uncertainty: uncertainty of the worlds for a shield that considers it, for example ``"gaps_m=0.5"``.
+        time_step_s: time between two decisions of agents that search or follow a control law, s; None: the scenario's
+            time step, or 0.1 s.
 
     Raises ``UnknownName`` with a suggestion for an unknown name; ``InvalidInput`` for an invalid argument, harm count
     or horizon, and for a missing scenario.
@@ -59,10 +59,10 @@ def make_agent(
     if horizon_s is None:
         horizon_s = HORIZON_S if scenario is None else scenario.horizon_s
     if not isinstance(horizon_s, int | float | np.number) or not 0.0 < horizon_s < float("inf"):
-        raise InvalidInput(f"horizon_s {horizon_s!r}: must be a positive number of seconds")
+        raise InvalidInput(f"horizon_s = {horizon_s!r}: must be a positive number of seconds")
     written = parse_spec(spec)
     if written.name == PROFILE:
-        raise InvalidInput(f"agent {spec!r}: a profile is a role of a scenario, fixed at the alert; it is no agent")
+        raise InvalidInput(f"agent {spec!r}: a profile can only be a role in a scenario, not an agent")
     settings = AgentSettings(
         written.core, written.policy, scenario, harm_count, float(horizon_s), most_candidates, uncertainty,
         time_step_s or (0.1 if scenario is None else scenario.time_step_s),
@@ -76,9 +76,9 @@ def _make_driver(written: AgentSpec, settings: AgentSettings) -> Driver:
         settings, entry = replace(settings, spec=f"{settings.spec}+{each}"), around_entry(each)
         if isinstance(driver, Team) and not entry.teams:
             raise InvalidInput(
-                f"agent {settings.spec!r}: is a team, and +{each} is for one controlled vehicle, the others following"
-                " scripts (--set roles.vehicle_3=full_brake); +step goes around a team; else name one policy of the"
-                " team (ppo@RUN/policy/vehicle_2)"
+                f"agent {settings.spec!r}: +{each} works for one controlled vehicle only, not for a team; use +step, or"
+                " one policy of the team (ppo@RUN/policy/vehicle_2) and scripts for the other vehicles"
+                " (--set roles.vehicle_3=full_brake)"
             )
         driver = _make(entry, each.partition(":")[2] or None, settings, driver)
     return driver
@@ -88,8 +88,8 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
     """Make the agent that the scenario assigns to ``vehicle`` (index, 0 = front) as its script.
 
     An optimising agent minimises first-impact harm. ``most_candidates`` is the upper limit for the candidates of a
-    search; None: no limit. Raises what ``make_agent`` raises, and ``InvalidInput`` for a script with a shield or search
-    around it, and for a team without this vehicle.
+    search; None: no limit. Raises the same errors as ``make_agent``. Raises ``InvalidInput`` for a script with a shield
+    or search around it, and for a team that does not include this vehicle.
     """
     spec = scenario.scripts[vehicle]
     name, _, argument = spec.partition(":")
@@ -101,17 +101,17 @@ def make_role(scenario: Scenario, vehicle: int, *, most_candidates: int | None =
     team = None if written.around else Team.of(_make_driver(written, settings), (vehicle,))
     if team is None or team.shield is not None:
         raise InvalidInput(
-            f"agent {spec!r}: a search or a shield goes around a driver, never around a role; let"
-            f" {scenario.vehicle_names[vehicle]} follow {written.core}, or drive it"
+            f"agent {spec!r}: a role cannot have a search or a shield; give {scenario.vehicle_names[vehicle]} the role"
+            f" {written.core}, or make it a learner"
         )
     return team.drivers[vehicle]
 
 
 def find_entry(spec: AgentSpec | str) -> Entry:
-    """Return the registry's entry of an agent.
+    """Return the registry entry of an agent.
 
-    ``spec`` is a specification such as ``planner:64`` or ``ppo``, as a text or parsed. Raises ``UnknownName``
-    with a suggestion for an unknown agent; ``InvalidInput`` for an argument or a policy that the agent does not take.
+    ``spec`` is a specification such as ``planner:64`` or ``ppo``, as a text or parsed. Raises ``UnknownName`` with a
+    suggestion for an unknown agent, and ``InvalidInput`` for an argument or a policy that the agent does not take.
     """
     written = parse_spec(spec) if isinstance(spec, str) else spec
     if written.file is not None:
@@ -119,7 +119,7 @@ def find_entry(spec: AgentSpec | str) -> Entry:
         return Entry(written.name, form, "your own", Source.UNSTATED, make_from_file)
     if written.name not in AGENTS:
         if written.name in group_names():
-            raise InvalidInput(f"agent {written.core!r}: stands for several agents in --agents; here one is needed")
+            raise InvalidInput(f"agent {written.core!r}: is the name of a group of agents; must be a single agent")
         raise AGENTS.unknown(written.name, {*agent_names(), *group_names()})
     entry = AGENTS[written.name]
     if written.argument is not None and ":" not in entry.whole_form:
@@ -128,21 +128,21 @@ def find_entry(spec: AgentSpec | str) -> Entry:
     if RENAMED.get(word) in variants_of(written.name):
         raise unknown_name(f"variant of {written.name}", word, variants_of(written.name))
     if written.policy is not None and "@" not in entry.form:
-        own = "" if entry.is_ours else "; register_agent(..., takes_policy=True) says that it does"
+        own = "" if entry.is_ours else "; to allow one, register the agent with register_agent(..., takes_policy=True)"
         raise InvalidInput(f"agent {written.core!r}: {written.name} takes no policy{own}")
     return entry
 
 
 def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: Driver) -> Driver:
-    """Make an agent or a team from its registry entry, and check it.
+    """Make an agent or a team from its registry entry, and check the result.
 
-    Errors of agents from outside this package become ``InvalidInput``.
+    An error in a factory outside this package becomes an ``InvalidInput``.
 
     Args:
-        entry: the entry.
-        argument: text after the colon in the specification; None without one.
-        settings: passed on.
-        inside: for a shield or a search, the agent or team that it goes around.
+        entry: the registry entry.
+        argument: text after the colon in the specification; None if there is no colon.
+        settings: settings for the factory.
+        inside: agent or team that a shield or a search wraps; empty for an agent.
 
     """
     try:
@@ -159,20 +159,22 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
 def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     """Call the function in a Python file that ``settings.spec`` names (``FILE.py:FUNCTION``), and return its result.
 
-    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``; a function
-    without parameters is called without arguments. Raises ``InvalidInput`` if such a function is given an argument or a
-    policy, and if the file cannot be loaded.
+    The function is called with ``argument`` (the text after the second colon, or None) and ``settings``. If it has no
+    parameters, it is called without arguments; an argument or a policy in the specification is then an error. Raises
+    ``InvalidInput`` for this error, and if the file cannot be loaded.
     """
     named = parse_spec(settings.spec).file
     assert named is not None
     function = load_from_file(*named, reads=settings.policy)
     if not callable(function):
-        raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is no function; name the one that makes the agent")
+        raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is not a function; name the function that makes the agent")
     arguments: tuple[Any, ...] = (argument, settings)
     with suppress(TypeError, ValueError):  # a built-in function may have no signature
         if not inspect.signature(function).parameters:
             arguments = ()
     if not arguments and (argument, settings.policy) != (None, None):
-        raise InvalidInput(f"agent {settings.spec!r}: {named[1]} has no parameters, so it takes no argument")
+        raise InvalidInput(
+            f"agent {settings.spec!r}: the function {named[1]} has no parameters; leave out argument and policy"
+        )
     driver: Driver = function(*arguments)
     return driver

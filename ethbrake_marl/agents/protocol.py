@@ -1,7 +1,7 @@
-"""The interfaces of agents, teams and shielded drivers, and the terms for what they know about the line.
+"""The interfaces of agents, teams and shielded drivers, and the names of their sources of knowledge.
 
-An agent states its knowledge in an attribute ``knows``: a ``Source``, its name, or several if its parts know different
-things (a shield around a policy). A channel (``v2x``) hides information from the first three sources only.
+The attribute ``knows`` of an agent states its sources of knowledge: a ``Source``, its text, or several of them, for
+example for a policy behind a shield. A lossy or slow channel (``v2x``) limits only the first three sources.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Source(StrEnum):
-    """Source of knowledge, from least to most; each includes the sources before it."""
+    """Source of an agent's knowledge, in increasing order; each source includes the sources before it."""
 
     SENSORS = "own sensors"  # the own vehicle, and the neighbours that its sensors see
-    MESSAGES = "messages"  # the messages that have reached it
+    MESSAGES = "messages"  # also the messages that the vehicle has received
     ESTIMATES = "estimated model"  # also the scenario's ranges, scripts and physics, but no hidden values
-    STATE = "true state"  # the other vehicles' true states, capacities and latencies, received or not
-    MODEL = "true model"  # also masses, restitution, scripts: all that an exact simulation of the line needs
+    STATE = "true state"  # the true states, capacities and latencies of all vehicles, whether received or not
+    MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
     UNSTATED = "not stated"  # the agent does not state its knowledge
 
 
 class Knowledge(tuple[Source, ...]):
-    """Set of sources of knowledge: a tuple of ``Source`` values in increasing order, each once."""
+    """Sources of knowledge of one or several agents: a tuple of different ``Source`` values in increasing order."""
 
     @classmethod
     def of(cls, *agents: object, also: Source | None = None) -> Knowledge:
         """Return the combined knowledge of several agents or teams.
 
         Args:
-            agents: agents or teams; one without an attribute ``knows`` counts as ``UNSTATED``.
-            also: knowledge that a shield or search around them adds; None: none.
+            agents: agents or teams; an agent without an attribute ``knows`` counts as ``UNSTATED``.
+            also: knowledge that a shield or search around the agents adds; None: no further knowledge.
 
         Raises ``InvalidInput`` for an unknown source.
 
@@ -61,21 +61,21 @@ class Knowledge(tuple[Source, ...]):
 
     @property
     def text(self) -> str:
-        """The sources as one text, such as ``messages + true model``; a dash if there are none."""
+        """All sources as one text, such as ``messages + true model``; a dash if there are no sources."""
         return " + ".join(self) or "–"
 
     @property
     def sees_through(self) -> bool:
-        """Whether the true state or the true model, which no message or sensor delivers, is among the sources."""
+        """Whether the agent is omniscient: it knows the true state or the true model, which no message delivers."""
         return Source.STATE in self or Source.MODEL in self
 
 
 @runtime_checkable
 class Agent(Script, Protocol):
-    """A ``Script`` with a name: drives one vehicle in every world of a batch of ``n``.
+    """Interface of an agent: a ``Script`` with a name, which drives one vehicle in every world of a batch of n worlds.
 
-    Its attribute ``knows`` states what it knows about the line (``Source``); without it tables say "not stated".
-    An agent without a memory has only ``act(worlds, vehicle)``:
+    The attribute ``knows`` may state the agent's sources of knowledge (``Source``); without it tables show "not
+    stated". An agent without a memory has one method, ``act(worlds, vehicle)``:
 
     >>> import ethbrake_marl as eb
     >>> class HalfBrake:
@@ -85,7 +85,8 @@ class Agent(Script, Protocol):
     >>> isinstance(HalfBrake(), eb.Agent)
     True
 
-    The memory of an agent is a value that ``begin`` creates and ``act`` takes and returns, never an attribute:
+    An agent must not store its memory in attributes. ``begin`` returns the first memory; ``act`` takes the memory and
+    returns a new one:
 
     >>> class OnceHit:
     ...     name = "once_hit"
@@ -100,7 +101,7 @@ class Agent(Script, Protocol):
 
     """
 
-    name: str  # name in tables and messages
+    name: str  # name of the agent in tables and messages
 
 
 def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
@@ -109,19 +110,20 @@ def check_agent(agent: object, where: str, *, alone: bool = True) -> None:
     Args:
         agent: any object.
         where: beginning of the error message, for example ``agent 'mine'``.
-        alone: accept only an agent for one vehicle; if False, also a team or a driver behind a shield.
+        alone: whether only an agent for one vehicle is accepted. If False, a team and a driver behind a shield are
+            accepted as well.
 
     """
     if not isinstance(agent, Agent) and (alone or not isinstance(agent, Team | Shielding)):
         missing = [what for what in ("name", "act") if not hasattr(agent, what)]
         raise InvalidInput(
-            f"{where}: {type(agent).__name__!r} is no agent: it has no {' and no '.join(missing)};"
-            " make_agent(name) makes one, policy_agent(policy) one of a function or a model, and"
-            " LearnedAgent(load_policy(path)) one of a policy bundle"
+            f"{where}: {type(agent).__name__!r} is not an agent, because it has no {' and no '.join(missing)}; to make"
+            " an agent, use make_agent(name), policy_agent(policy) for a function or a model, or"
+            " LearnedAgent(load_policy(path)) for a policy bundle"
         )
 
 
-ADVICE = "; looking ahead needs full_brake, coast or constant:a"
+ADVICE = "; to look ahead, the script must be full_brake, coast or constant:a"
 
 
 def fixed_commands(
@@ -138,13 +140,13 @@ def fixed_commands(
     Args:
         scripts: index of each scripted vehicle -> its script; vehicles without a script brake fully.
         worlds: n worlds at the alert.
-        who: name of the agent that looks ahead; errors begin with it.
-        vehicle: index of the vehicle that this agent drives, whose script is ignored; None: none.
-        is_fixed: whether the command of a script is fixed at the alert.
+        who: name of the agent that looks ahead, with which error messages begin.
+        vehicle: index of the vehicle that this agent drives, whose script is ignored; None: no script is ignored.
+        is_fixed: function that returns whether the command of a script is fixed at the alert.
         advice: end of the error message.
 
-    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, for worlds whose braking profiles are
-    not those of the scripts, and where messages lack a piece that looking ahead needs.
+    Raises ``InvalidInput`` for a script whose command is not fixed at the alert, for worlds whose braking profiles
+    differ from the scripts' profiles, and if the messages lack a quantity that the agent needs to look ahead.
 
     """
     if vehicle is not None:
@@ -162,8 +164,8 @@ def fixed_commands(
     pieces = {i: getattr(script, "braking_pieces", ()) for i, script in scripts.items() if i != vehicle}
     if not np.array_equal(worlds.play_pieces(pieces).vehicles.pieces, worlds.vehicles.pieces):
         raise InvalidInput(
-            f"{who}: a profile: the pieces in which vehicles brake in these worlds are not those of its scripts; draw"
-            " or read the worlds with the same scenario"
+            f"{who}: the braking profiles in these worlds differ from the profiles of the scripts; draw or read the"
+            " worlds with the same scenario"
         )
     return command
 
@@ -171,26 +173,26 @@ def fixed_commands(
 class ByPolicy:
     """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps.
 
-    It derives the hash and the manifest from ``policy``, which a subclass sets; nothing has to be overridden.
+    A subclass sets ``policy``; hash and manifest are read from it.
     """
 
     policy: Any  # the trained policy, or the wrapped agent
 
     def policy_sha256(self) -> str | None:
-        """Return the SHA-256 of the policy; None without a policy, or if the policy has no hash."""
+        """Return the SHA-256 of the policy; None if there is no policy, or if the policy has no hash."""
         return policy_sha256(self.policy)
 
     @property
     def manifest(self) -> Any:
-        """Manifest of the policy's bundle (its origin, network and hashes); None for a policy without a bundle."""
+        """Manifest of the policy's bundle (origin, network and hashes); None for a policy without a bundle."""
         return getattr(self.policy, "manifest", None)
 
 
 def policy_sha256(agent: object) -> str | None:
     """Return the SHA-256 of the policy that an agent uses, also inside shields and searches; None without a policy.
 
-    For a policy bundle it is the hash in its manifest, which covers names, network and weights. For a policy of another
-    library it is the hash of its weights.
+    The hash of a policy bundle is the hash in its manifest, which covers names, network and weights. The hash of a
+    policy of another library covers its weights.
     """
     ask = getattr(agent, "policy_sha256", None)
     return None if ask is None else ask()
@@ -199,9 +201,14 @@ def policy_sha256(agent: object) -> str | None:
 class AgentAround(ByPolicy):
     """Base class of agents that wrap another agent, called ``policy``.
 
-    By default everything is passed to the wrapped agent. A subclass overrides ``begin``, ``act`` or both. The class
-    attribute ``adds`` is the knowledge that it has beyond the wrapped agent's, for example ``Source.MODEL``; None: no
-    more. ``name`` is the new agent's name; None: the wrapped agent's name.
+    By default ``begin`` and ``act`` call the wrapped agent. A subclass overrides ``begin``, ``act`` or both. The class
+    attribute ``adds`` is knowledge that the subclass uses in addition to the wrapped agent's, for example
+    ``Source.MODEL``, or None.
+
+    Args:
+        policy: the agent to wrap.
+        name: name of the new agent; None: the name of the wrapped agent.
+
     """
 
     adds: ClassVar[Source | None] = None
@@ -217,7 +224,7 @@ class AgentAround(ByPolicy):
 
     @property
     def time_step_s(self) -> float | None:
-        """Time between two decisions that the wrapped agent requires (s); None: any."""
+        """Time between two decisions that the wrapped agent requires, s; None: any time."""
         return getattr(self.policy, "time_step_s", None)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
@@ -238,28 +245,34 @@ class AgentAround(ByPolicy):
 
 @runtime_checkable
 class Shielding(Protocol):
-    """Interface of an agent or team behind a shield, before it is known which vehicles it drives."""
+    """Interface of an agent or team behind a shield, before its vehicles are chosen."""
 
-    name: str  # name in tables and messages
+    name: str  # name of the agent or team in tables and messages
 
     @property
     def knows(self) -> Knowledge:
         """Combined knowledge of the agents and the shield."""
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return the team, with this shield, that drives the vehicles with these indices (0 = front)."""
+        """Return a team behind this shield that drives ``vehicles`` (indices, 0 = front)."""
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """Return the shield's part that checks commands in ``engine``.
+        """Return the guard, the object with which the shield checks commands in ``engine``.
 
         ``policies`` maps the index of each learner to the agent that proposes its commands.
         """
 
 
 class Team:
-    """One agent per controlled vehicle (index, 0 = front); each decides from what its own vehicle knows.
+    """Agents that drive several vehicles together. Each agent decides from the knowledge of its own vehicle.
 
-    Behind a ``shield`` the agents only propose. One agent may drive several vehicles, with a separate memory for each.
+    The same agent may drive several vehicles, with a separate memory for each.
+
+    Args:
+        drivers: index of each controlled vehicle (0 = front) -> its agent.
+        name: name of the team in tables and messages.
+        shield: shield that decides on the commands, so that the agents only propose them; None: no shield.
+
     Raises ``InvalidInput`` for an invalid agent or index.
 
     >>> import ethbrake_marl as eb
@@ -272,10 +285,10 @@ class Team:
     def __init__(self, drivers: Mapping[int, Agent], name: str, shield: Shielding | None = None) -> None:
         for vehicle, agent in drivers.items():
             if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not vehicle >= 0:
-                raise InvalidInput(f"team {name!r}: {vehicle!r}: must be the index of a vehicle, 0 or more")
+                raise InvalidInput(f"team {name!r}: key {vehicle!r}: must be the index of a vehicle, 0 or more")
             if not isinstance(agent, Agent):
                 raise InvalidInput(
-                    f"team {name!r}: vehicle_{vehicle + 1} is controlled by {agent!r}, which is no agent"
+                    f"team {name!r}: {agent!r} of vehicle_{vehicle + 1}: must be an agent, for instance from make_agent"
                 )
         self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
         self.name, self.shield = name, shield
@@ -289,7 +302,7 @@ class Team:
     def of(driver: Driver, vehicles: Collection[int]) -> Team:
         """Return the team in which ``driver`` drives the vehicles with the indices ``vehicles`` (0 = front).
 
-        A single agent drives all of them. Raises ``InvalidInput`` for a team that drives other vehicles.
+        A single agent drives all these vehicles. Raises ``InvalidInput`` for a team that drives other vehicles.
         """
         if isinstance(driver, Shielding):
             return driver.on(vehicles)
@@ -299,8 +312,8 @@ class Team:
             theirs, wanted = (
                 ", ".join(f"vehicle_{i + 1}" for i in sorted(each)) or "none" for each in (driver.drivers, vehicles)
             )
-            raise InvalidInput(f"team {driver.name!r} drives {theirs}; the vehicles to drive are {wanted}")
+            raise InvalidInput(f"team {driver.name!r}: drives {theirs}; must drive exactly {wanted}")
         return driver
 
 
-Driver = Team | Agent | Shielding  # a single agent drives every learner
+Driver = Team | Agent | Shielding  # an Agent alone drives every learner

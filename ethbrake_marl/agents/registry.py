@@ -1,7 +1,7 @@
-"""Registries of agents, of the shields and searches around them, of their variants, and of groups of agents.
+"""Registries of agents, of shields and searches, of variants, and of groups of agents.
 
-Names are entry points (``pyproject.toml``), loaded when they are first used (``ethbrake_marl.registry``). So policies,
-searches and shields, which belong to layers above this folder, have names without being imported here.
+Names are entry points (``pyproject.toml``), which are loaded on first use (``ethbrake_marl.registry``). This module
+therefore need not import policies, searches and shields, which depend on it.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Entry of the registry: an agent, or a wrapper, which is a shield or a search that goes around an agent.
+    """Registry entry of an agent, or of a wrapper: a shield or a search that wraps an agent.
 
-    A wrapper is written after a ``+``: ``ppo+step`` is the agent ``ppo`` inside the shield ``step``.
+    A wrapper is written after a ``+``: ``ppo+step`` is the agent ``ppo`` behind the shield ``step``.
     """
 
     name: str  # plain name, without argument
-    form: str  # how it is written, as "name[:ARGUMENT][@POLICY]"; without ":" no argument, without "@" no policy
+    form: str  # syntax, such as "name[:ARGUMENT][@POLICY]"; no argument without ":", no policy without "@"
     about: str  # description in one line
     knows: Source | Sequence[Source]  # knowledge of the agent while it drives; for a wrapper: knowledge that it adds
-    make: Factory | Wrapper  # function that makes the agent, or makes the wrapper around an agent
-    inner: bool = False  # whether a wrapper goes directly around the agent, inside a shield
-    teams: bool = False  # whether a wrapper can go around a team too
-    needs: Mapping[str, object] = field(default_factory=dict)  # name of a required ``AgentSettings`` -> an example
-    options: type | None = None  # settings class of a shield that can also go around an environment
+    make: Factory | Wrapper  # function that makes the agent or the wrapper
+    inner: bool = False  # whether a wrapper is a search, which wraps the agent itself and stands before any shield
+    teams: bool = False  # whether a wrapper can also wrap a team
+    needs: Mapping[str, object] = field(default_factory=dict)  # name of a required setting -> example of its value
+    options: type | None = None  # settings class of a shield that can also wrap an environment
 
     @property
     def is_ours(self) -> bool:
-        """Whether this package makes the agent; an error in someone else's agent is reported with the agent's name."""
+        """Whether the agent belongs to this package. Errors in other agents are reported with the agent's name."""
         is_from_file = ":" in self.name
         return str(getattr(self.make, "__module__", "")).startswith("ethbrake_marl.") and not is_from_file
 
@@ -51,9 +51,9 @@ class Entry:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Every way to write a wrapper after the ``+`` of a specification, for example ``("step", "step:estimated")``.
+        """Every text of a wrapper after the ``+`` of a specification, for example ``("step", "step:estimated")``.
 
-        Only for a wrapper whose ``form`` lists all arguments that it takes.
+        This is complete only if ``form`` lists all arguments of the wrapper.
         """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         words = [name]
@@ -62,7 +62,7 @@ class Entry:
         return tuple(words)
 
     def takes(self, argument: str) -> bool:
-        """Return whether a wrapper takes this argument, the text after the colon; an empty text means no argument."""
+        """Return whether a wrapper takes ``argument``, the text after the colon; "" means no argument."""
         name = self.words[0]
         return "[:ARGUMENT]" in self.form or (f"{name}:{argument}" if argument else name) in self.words
 
@@ -70,10 +70,10 @@ class Entry:
         """Make the agent or wrapper.
 
         Args:
-            argument: text after the first colon, such as ``pairwise``; if its last word is a registered variant
-                (``pairwise:estimated``), the variant's function is called. None: no argument.
-            settings: passed on to the function that makes it.
-            inside: for a wrapper, the one agent or team that it goes around.
+            argument: text after the first colon, such as ``pairwise``; None: no argument. If the last word is a
+                registered variant (``pairwise:estimated``), the variant's function is called.
+            settings: settings for the function that makes the agent or wrapper.
+            inside: agent or team that a wrapper wraps; empty for an agent.
 
         """
         make: Any = self.make
@@ -85,10 +85,7 @@ class Entry:
 
 
 def around_entry(each: str) -> Entry:
-    """Return the entry of a shield or search; ``each`` is its text in a specification, such as ``episode:pairwise``.
-
-    In ``ppo+episode:pairwise`` this is the text after the ``+``.
-    """
+    """Return the entry of a shield or search, given the text after the ``+``, such as ``episode:pairwise``."""
     return SHIELDS[each.partition(":")[0]]
 
 
@@ -98,7 +95,7 @@ def agent_names() -> tuple[str, ...]:
 
 
 def agent_entries() -> tuple[Entry, ...]:
-    """Return the entries of all agents, then of all shields and searches, that can be loaded.
+    """Return the loadable registry entries of all agents, then of all shields and searches.
 
     The form and description of an entry include its variants.
     """
@@ -107,10 +104,9 @@ def agent_entries() -> tuple[Entry, ...]:
 
 
 def _with_variants(entry: Entry) -> Entry:
-    """Return ``entry`` with its variants added to ``form`` and ``about``, as far as they can be loaded.
+    """Return ``entry`` with its loadable variants in ``form`` and ``about``.
 
-    A variant is a last word that selects another function: ``e_v2x_bm`` becomes ``e_v2x_bm[:estimated]``, with the
-    variant's description.
+    For example, the form ``e_v2x_bm`` becomes ``e_v2x_bm[:estimated]``, and the description of the variant is added.
     """
     usable = VARIANTS.usable()
     for word in variants_of(entry.name):
@@ -120,51 +116,48 @@ def _with_variants(entry: Entry) -> Entry:
 
 
 def agents_refused() -> list[str]:
-    """Return one sentence for each registered agent, shield or variant of one that cannot be loaded, with the reason.
-
-    The list is empty if everything can be loaded.
-    """
+    """Return one sentence with the reason for each registered agent, shield or variant that cannot be loaded."""
     reasons = [each.why_not(name) for each in (AGENTS, SHIELDS, VARIANTS) for name in each]
     return [reason for reason in reasons if reason is not None]
 
 
 def around_forms() -> tuple[str, ...]:
-    """Return every shield and search as it is written in a specification, after the ``+`` of ``ppo+episode``.
+    """Return the text of every shield and search after the ``+`` of a specification.
 
-    For example ``("search", "episode", "episode:pairwise")``: with each argument and variant that it takes.
+    Each argument and variant has a text of its own, for example ``("search", "episode", "episode:pairwise")``.
     """
     return tuple(word for entry in SHIELDS.usable().values() for word in entry.words)
 
 
 def shield_forms() -> tuple[str, ...]:
-    """Return every shield as it is written after the ``+`` of a specification: ``("episode", "robust:interior", ...)``.
+    """Return the text of every shield after the ``+`` of a specification: ``("episode", "robust:interior", ...)``.
 
-    Arguments are included, variants (last words that select another function) and searches are not.
+    Each argument has a text of its own. Variants and searches are not included.
     """
     return tuple(each for each in around_forms() if not (around_entry(each).inner or is_variant(each)))
 
 
 def around_one_vehicle() -> list[str]:
-    """Return the names of the shields and searches that cannot go around a team, searches first."""
+    """Return the names of the searches, then of the shields, that cannot wrap a team."""
     return [entry.name for inner in (True, False) for entry in SHIELDS.usable().values()
             if entry.inner is inner and not entry.teams]  # fmt: skip
 
 
 def shield_settings(name: object) -> Any:
-    """Return the settings class of the shield called ``name`` if it can also go around environments; otherwise None."""
+    """Return the settings class of the shield called ``name``; None if it cannot wrap environments or is unknown."""
     return SHIELDS[name].options if isinstance(name, str) and name in SHIELDS else None
 
 
 def shield_modes() -> dict[str, Any]:
-    """Return, for every loadable shield that can also go around environments, its name -> its settings class."""
+    """Return name -> settings class of every loadable shield that can also wrap environments."""
     return {name: entry.options for name, entry in SHIELDS.usable().items() if entry.options is not None}
 
 
 def variants_of(name: str) -> tuple[str, ...]:
     """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``.
 
-    A variant is a last word after a further colon, as in ``episode:pairwise:estimated``, that selects another function
-    to make the agent or shield.
+    A variant is written as the last word, as in ``episode:pairwise:estimated``. Another function then makes the agent
+    or shield.
     """
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
@@ -173,35 +166,35 @@ def variants_of(name: str) -> tuple[str, ...]:
 def is_variant(form: str) -> bool:
     """Return whether the last word of ``form`` is a registered variant, as in ``step:estimated``.
 
-    ``form``: an agent or shield with its argument, without ``+``.
+    ``form`` is the text of an agent or shield with its argument, without ``+``.
     """
     return form.rpartition(":")[2] in variants_of(form.partition(":")[0])
 
 
 def settings_needed(shield: str | None) -> Mapping[str, object]:
-    """Return the settings that a shield requires, each with an example: ``{"uncertainty": "gaps_m=0.5"}``.
+    """Return the settings that a shield requires: name -> example, such as ``{"uncertainty": "gaps_m=0.5"}``.
 
-    ``shield`` is a shield with its argument, such as ``robust`` or ``episode:pairwise``. The result is empty for None
-    and for a variant, such as ``robust:estimated``.
+    ``shield`` is the text of a shield with its argument, such as ``robust`` or ``episode:pairwise``. The result is
+    empty for None and for a variant, such as ``robust:estimated``.
     """
     return {} if shield is None or is_variant(shield) else around_entry(shield).needs
 
 
 def shields_with(setting: str) -> tuple[str, ...]:
-    """Return the names of the installed shields that require ``setting``, a name such as ``uncertainty``."""
+    """Return the names of the installed shields that require ``setting``, such as ``uncertainty``."""
     return tuple(entry.words[0] for entry in SHIELDS.usable().values() if setting in entry.needs)
 
 
 def group_names() -> tuple[str, ...]:
-    """Return the names that stand for several agents in the command option ``--agents``, such as ``ladder``."""
+    """Return the names of groups of agents, such as ``ladder``, which the command option ``--agents`` accepts."""
     return tuple(dict.fromkeys(name.partition(".")[0] for name in GROUPS))
 
 
 def agents_of_group(group: str) -> tuple[str, ...]:
     """Return the specifications of all agents in ``group``, a name from ``group_names``.
 
-    The group ``ladder`` also contains the agents registered under ``ladder.search``, or any other ``ladder.WORD``: its
-    own come first, then these, sorted by name.
+    A group can be extended: agents registered under ``ladder.search``, or another ``ladder.WORD``, follow the agents
+    registered under ``ladder``, in alphabetical order of these names.
     """
     return tuple(spec for name in sorted(GROUPS) if name.partition(".")[0] == group for spec in GROUPS[name])
 
@@ -215,7 +208,7 @@ def register_agent(
     form: str | None = None,
     takes_policy: bool = False,
 ) -> None:
-    """Register an agent, so that ``make_agent`` and every command know ``name`` and ``name:argument``.
+    """Register an agent, so that ``make_agent`` and every command accept ``name`` and ``name:argument``.
 
     An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``: its factory, or
     ``Part(factory, about=...)`` with arguments of this function.
@@ -225,19 +218,19 @@ def register_agent(
         factory: ``factory(argument, settings)`` makes the agent; ``argument`` is the text after the colon, or None, and
             ``settings`` an ``AgentSettings``.
         about: description in one line, for ``ethbrake agent list``.
-        knows: what the agent knows about the line while it drives, for ``ethbrake agent list``.
-        form: how the agent is written, for ``ethbrake agent list``. Without ``:`` it takes no argument, without ``@``
-            no policy. None: ``name[:ARGUMENT]``.
-        takes_policy: whether ``name@policy`` is allowed; the factory finds the policy in ``AgentSettings.policy``.
+        knows: sources of the agent's knowledge while it drives, for ``ethbrake agent list``.
+        form: syntax of the agent, for ``ethbrake agent list``; None: ``name[:ARGUMENT]``. Without ``:`` the agent takes
+            no argument, without ``@`` no policy.
+        takes_policy: whether ``name@policy`` is allowed; ``AgentSettings.policy`` is then the policy.
 
-    Registering the same factory again changes nothing. Raises ``AlreadyExists`` if the name belongs to another factory,
-    ``InvalidInput`` for a name that is not plain.
+    Registering the same factory again has no effect. Raises ``AlreadyExists`` if the name belongs to another factory,
+    and ``InvalidInput`` for a name that is not plain.
 
     """
     if ScriptSpec.parse(name) != ScriptSpec(name, None) or "@" in name:
         raise InvalidInput(f"agent name {name!r}: must be a plain name without argument")
     if name in group_names():
-        raise AlreadyExists(f"agent {name!r}: stands for several agents in --agents; give another name")
+        raise AlreadyExists(f"agent {name!r}: is the name of a group of agents; choose another name")
     form = f"{name}[:ARGUMENT]{'[@POLICY]' * takes_policy}" if form is None else form
     AGENTS.add(name, Entry(name, form, about, knows, factory), lambda entry: entry.make is factory)
 
@@ -261,19 +254,19 @@ def register_shield(
 
     Args:
         name: plain name without argument.
-        wrapper: ``wrapper(agent, argument, settings)`` makes the agent around ``agent``; ``argument`` is the text after
-            the colon, or None, and ``settings`` an ``AgentSettings``.
+        wrapper: ``wrapper(agent, argument, settings)`` returns an agent that wraps ``agent``; ``argument`` is the text
+            after the colon, or None, and ``settings`` an ``AgentSettings``.
         about: description in one line, for ``ethbrake agent list``.
-        knows: knowledge that the wrapper adds to the agent's.
-        form: how it is written, ``+name[:WORD]`` with every word that it takes; None: any argument.
-        inner: whether it is no shield and goes directly around the agent, inside a shield.
-        teams: whether it can also go around a team.
-        needs: name of each required setting of ``AgentSettings`` -> an example; None: none.
-        options: settings class of a shield, ``shield.options.ShieldOptions`` or a subclass, with which
-            ``eb.shield(env, mode=name)`` knows it too; None: it cannot go around environments.
+        knows: sources of knowledge that the wrapper adds to the agent's.
+        form: syntax of the wrapper, ``+name[:WORD]`` with every argument that it takes; None: any argument is allowed.
+        inner: whether the wrapper is a search, which wraps the agent itself and stands before any shield.
+        teams: whether the wrapper can also wrap a team.
+        needs: name of each required setting of ``AgentSettings`` -> example of its value; None: no required settings.
+        options: settings class of a shield (``shields.options.ShieldOptions`` or a subclass), which makes it available
+            as ``eb.shield(env, mode=name)``; None: the wrapper cannot wrap environments.
 
-    Registering the same wrapper again changes nothing. Raises ``AlreadyExists`` if the name belongs to another wrapper,
-    ``InvalidInput`` for a name that is not plain.
+    Registering the same wrapper again has no effect. Raises ``AlreadyExists`` if the name belongs to another wrapper,
+    and ``InvalidInput`` for a name that is not plain.
 
     """
     if not isinstance(name, str) or not _PLAIN.fullmatch(name):
@@ -289,9 +282,9 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
     An installed package registers a variant with an entry point of the group ``ethbrake_marl.variants``.
 
     Args:
-        key: ``name.variant``: ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
-        make: replaces the factory or wrapper of that name, with the same arguments; the argument does not contain the
-            variant.
+        key: ``name.variant``; for example, ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
+        make: function that replaces the factory or wrapper called ``name``, with the same arguments. Its ``argument``
+            does not contain the name of the variant.
         about: description in one line, for ``ethbrake agent list``.
 
     Raises ``AlreadyExists`` if the key belongs to another variant.

@@ -1,4 +1,4 @@
-"""Scripts as agents: full braking, coasting, a constant command, a profile; and the baseline E-V2X-BM."""
+"""Scripts (full braking, coasting, a constant command, a profile), and registry entries of scripts and E-V2X-BM."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from ethbrake_marl.scenario.roles import ScriptSpec
 class StateFree:
     """Agent with a fixed command: ``full_brake``, ``coast``, ``constant:a`` (deceleration in m/s2) or a ``profile``.
 
-    ``spec`` is one of these. A profile is a list of intervals of constant command: this agent commands the first, and
-    the engine applies the later ones (``Worlds.play_pieces``). ``full_brake`` for every vehicle is the paper's
-    non-ethical strategy. Raises ``InvalidInput`` for any other script and for a constant beyond the vehicle's capacity.
+    ``spec`` is one of these texts. A profile is a sequence of intervals with constant commands: this agent commands the
+    first interval, and the engine applies the later ones (``Worlds.play_pieces``). In the paper's non-ethical strategy
+    every vehicle follows ``full_brake``. Raises ``InvalidInput`` for any other text, and for a constant beyond the
+    vehicle's capacity.
     """
 
     state_free = True
@@ -42,24 +43,29 @@ def make_script(argument: str | None, settings: AgentSettings) -> Agent:
     return StateFree(settings.spec)
 
 
-COAST = Part(make_script, form="coast", about="nothing at all", knows=Source.SENSORS)
+COAST = Part(make_script, form="coast", about="neither brake nor drive", knows=Source.SENSORS)
 
 FULL_BRAKE = Part(
     make_script, form="full_brake", about="full braking, the paper's non-ethical strategy", knows=Source.SENSORS
 )
 
 CONSTANT = Part(
-    make_script, form="constant:A", about="this deceleration in m/s2; negative drives", knows=Source.SENSORS
+    make_script, form="constant:A", about="constant deceleration A in m/s2; a negative A drives", knows=Source.SENSORS
 )
 
-PROFILE = Part(make_script, form="profile:0=A,S=B", about="in pieces; of roles alone", knows=Source.SENSORS)
+PROFILE = Part(
+    make_script,
+    form="profile:0=A,S=B",
+    about="deceleration A at first, B after S seconds; only as a role in a scenario",
+    knows=Source.SENSORS,
+)
 
 E_V2X_BM = Part(
     make_e_v2x_bm,
     form="e_v2x_bm[:pairwise]",
-    about="the best constant deceleration in this simulation; pairwise: the paper's closed form, from the true state",
+    about="the constant deceleration of least simulated harm; pairwise: the paper's closed form, from the true state",
     knows=Source.MODEL,
 )
 
-# Agents of ``--agents ladder``, beginning without any decision; extensions add agents as ``ladder.NAME``.
+# Agents that ``--agents ladder`` stands for; extensions add agents to this group with entry points ``ladder.NAME``.
 LADDER = ("coast", "full_brake", "e_v2x_bm:pairwise", "e_v2x_bm")

@@ -1,4 +1,4 @@
-"""Settings for making an agent, and the signatures of the functions that make one."""
+"""Settings for making an agent, and the signatures of functions that make agents."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HORIZON_S = 8.0  # horizon of agents that look ahead, if there is no scenario
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """Settings for making an agent, beyond its own argument.
+    """Settings for making an agent, in addition to the argument in its specification.
 
     >>> import ethbrake_marl as eb
     >>> eb.AgentSettings("planner:64", scenario=eb.load_scenario("paper-random")).needed_scenario().name
@@ -24,36 +24,35 @@ class AgentSettings:
 
     """
 
-    spec: str  # specification of the agent, such as "planner:64", with the wrappers made so far
-    policy: str | None = None  # text after the @ of the specification; None without one
+    spec: str  # specification of the agent, such as "planner:64", with the wrappers that were already made
+    policy: str | None = None  # text after the @ of the specification; None without an @
     scenario: Scenario | None = None  # scenario in which the agent drives; None: unknown
     harm_count: HarmCount = "first"  # impacts whose harm an optimising agent minimises: each pair's first, or all
     horizon_s: float = HORIZON_S  # time after the alert until which an agent looks ahead (s)
     most_candidates: int | None = None  # upper limit for the candidates of a search; None: no limit
-    uncertainty: object = None  # what a shield does not know about the worlds, in that shield's format; None: nothing
+    uncertainty: object = None  # uncertainty of the worlds, in the format of the shield that considers it; None: none
     time_step_s: float = 0.1  # time between two decisions (s)
-    role: int | None = None  # index of the vehicle for which the scenario names this agent; None: not from a scenario
+    role: int | None = None  # index of the vehicle whose role this agent is in the scenario; None: not a role
 
     def needed_scenario(self) -> Scenario:
         """Return ``scenario``; raise ``InvalidInput`` if it is None."""
         if self.scenario is None:
             raise InvalidInput(
-                f"agent {self.spec!r}: needs a scenario: make_agent({self.spec!r}, scenario='paper-random')"
+                f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
+                " scenario='paper-random')"
             )
         return self.scenario
 
 
-# Called as (argument, settings).
 Factory = Callable[[str | None, AgentSettings], Driver]
-"""Makes the agent of an argument (what stands after the colon, or None)."""
+"""Function ``(argument, settings)`` that makes an agent; ``argument`` is the text after the colon, or None."""
 
-# Called as (agent or team, argument, settings); makes a shield or a search around the agent.
 Wrapper = Callable[[Any, str | None, AgentSettings], Driver]
-"""Makes the agent around an agent."""
+"""Function ``(agent or team, argument, settings)`` that makes a shield or a search around the agent or team."""
 
 
 class Variant(NamedTuple):
-    """Variant of an agent or a shield, selected by a last word: ``estimated`` in ``step:estimated``."""
+    """Variant of an agent or a shield, selected by its name as the last word: ``estimated`` in ``step:estimated``."""
 
-    make: Factory | Wrapper  # makes the agent or wrapper in place of the original function
+    make: Factory | Wrapper  # function that makes the agent or wrapper, in place of the original function
     about: str  # description in one line

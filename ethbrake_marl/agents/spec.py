@@ -1,9 +1,10 @@
-"""The grammar of agents: ``name[:argument][:variant][@policy]``, followed by the wrappers around the agent.
+"""The grammar of agent specifications: ``name[:argument][:variant][@policy]``, followed by wrappers.
 
-``+search`` comes first, then one shield, for example ``+episode:pairwise`` or ``+step``. Shields have variants too. A
-name may be a function in a Python file, ``my_file.py:make_agent``.
+The wrappers are at most one search (``+search``), then at most one shield, for example ``+episode:pairwise`` or
+``+step``. A shield may have a variant as well. In place of ``name``, a function in a Python file makes the agent:
+``my_file.py:make_agent``.
 
-The separators ``, + @ :`` may occur in a path. If such a path exists, they do not separate anything there.
+A path may contain the separators ``, + @ :``. If the path exists, it is not split at them.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ _BEGINS_WITH_FILE = re.compile(r"[^:@]+\.py(:.*)?")
 
 @dataclass(frozen=True, slots=True)
 class AgentSpec:
-    """Parsed agent specification, for example of ``ppo+search+step``."""
+    """Parsed agent specification, such as ``ppo+search+step``."""
 
     name: str  # plain name of the agent, or FILE.py:FUNCTION
-    argument: str | None  # text after the colon; None without one
-    policy: str | None  # text after the @: a path; None without one
-    around: tuple[str, ...]  # searches and shields with their arguments, innermost first, as ("search", "step")
+    argument: str | None  # text after the colon; None without a colon
+    policy: str | None  # path after the @; None without an @
+    around: tuple[str, ...]  # searches and shields with their arguments, innermost first, such as ("search", "step")
 
     @property
     def core(self) -> str:
@@ -46,7 +47,7 @@ class AgentSpec:
 
     @property
     def shield(self) -> str | None:
-        """The shield as it is written after the ``+``, for example ``episode:pairwise``; None without a shield."""
+        """Text of the shield after the ``+``, for example ``episode:pairwise``; None without a shield."""
         return self.around[-1] if self.around and not around_entry(self.around[-1]).inner else None
 
     def __str__(self) -> str:
@@ -54,25 +55,26 @@ class AgentSpec:
 
 
 def parse_spec(spec: str) -> AgentSpec:
-    """Return a parsed agent specification, such as ``ppo@c+step``. A path in it may contain any character.
+    """Parse an agent specification, such as ``ppo+step``. A path in it may contain any character.
 
-    ``ppo@c+step`` is the folder ``c+step`` if it exists, otherwise the folder ``c`` behind the shield; ``ppo@c/+step``
-    is always the latter. Raises ``InvalidInput`` for invalid syntax, two shields or another order; ``UnknownName`` for
-    an unknown wrapper and for ``X@shipped``, an old spelling.
+    ``ppo@c+step`` means the policy in the folder ``c+step`` if this folder exists, otherwise the policy in ``c`` behind
+    a shield. ``ppo@c/+step`` always means the policy in ``c`` behind a shield. Raises ``InvalidInput`` for invalid
+    syntax, for two shields, and for a shield before a search. Raises ``UnknownName`` for an unknown wrapper and for the
+    old spelling ``X@shipped``.
     """
     core, around = _split_around(spec)
     if file := _python_file(core):
         match = _IN_FILE.fullmatch(core, len(file))
         if match is None:
             raise InvalidInput(
-                f"agent {spec!r}: one from a file is FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"
+                f"agent {spec!r}: an agent from a file must be FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"
                 " FILE.py:FUNCTION@POLICY, for instance my_file.py:make_agent"
             )
         return AgentSpec(f"{file}:{match['function']}", match["argument"], match["policy"], around)
     head, at, path = core.partition("@")
     name, argument = ScriptSpec.parse(head if at else core)
     if at and not path:
-        raise InvalidInput(f"agent {spec!r}: a path is needed after '@'")
+        raise InvalidInput(f"agent {spec!r}: a path must follow '@'")
     refuse_shipped_path(path, name)
     return AgentSpec(name, argument, path if at else None, around)
 
@@ -80,8 +82,8 @@ def parse_spec(spec: str) -> AgentSpec:
 def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> list[str]:
     """Split a comma-separated list of names, some of which may contain commas.
 
-    Of all texts that begin at the same place, the longest one that ``is_one`` accepts counts as one name; if it accepts
-    none, the name ends at the next comma. By default ``is_one`` tests whether a file or folder of that name exists.
+    ``is_one`` tests whether a text with commas is a single name; by default, whether a file or folder of this name
+    exists. The longest such text becomes a name; without one, the name ends at the next comma.
     """
     parts, names = text.split(","), list[str]()
     while parts:
@@ -93,10 +95,7 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a comma-separated list of agent specifications, such as ``coast,ppo``.
-
-    Commas in paths that exist do not split.
-    """
+    """Split a comma-separated list of agent specifications, such as ``coast,ppo``; existing paths are not split."""
     return split_names(text, _is_one_spec)
 
 
@@ -107,13 +106,13 @@ def _is_one_spec(text: str) -> bool:
 
 
 def _existing_file(core: str) -> str:
-    """Return the longest path of an existing Python file with which the specification ``core`` begins, or ""."""
+    """Return the longest path of an existing Python file at the beginning of ``core``, or "" without one."""
     ends = (match.start() for match in re.finditer(r"(?<=\.py):", core))
     return max((core[:end] for end in ends if os.path.isfile(core[:end])), key=len, default="")
 
 
 def _python_file(core: str) -> str:
-    """Return the path of the Python file, existing or not, with which ``core`` begins, or "" without one."""
+    """Return the path of a Python file, existing or not, at the beginning of ``core``, or "" without one."""
     return _existing_file(core) or (core.partition(":")[0] if _BEGINS_WITH_FILE.fullmatch(core) else "")
 
 
@@ -124,7 +123,7 @@ def _policy_path(core: str) -> str:
 def _strip_around(spec: str) -> tuple[str, list[str]]:
     """Split a specification into the agent and the list of its searches and shields.
 
-    A ``+`` in the path of an existing policy does not split.
+    The path of an existing policy is not split at a ``+``.
     """
     core, around = spec, list[str]()
     while True:
@@ -148,20 +147,20 @@ def _split_around(spec: str) -> tuple[str, tuple[str, ...]]:
     if len(shields) > 1 or any(each not in shields for each in around[1:]):
         searches = [each for each in around_forms() if around_entry(each).inner]
         raise InvalidInput(
-            f"agent {spec!r}: +{', +'.join(searches)} comes first and once, then one shield of"
-            f" +{', +'.join(shield_forms())}; for instance ppo+search+step"
+            f"agent {spec!r}: must have at most one +{', +'.join(searches)}, then at most one shield"
+            f" (+{', +'.join(shield_forms())}), for instance ppo+search+step"
         )
     return core, tuple(around)
 
 
 def _is_meant_around(before: str, core: str, last: str) -> bool:
-    """Return whether an unknown word after a ``+`` was probably meant as a search or shield, but misspelt.
+    """Return whether an unknown word after a ``+`` is probably a misspelt search or shield.
 
-    If not, the word is part of an argument or a path.
+    Otherwise the word is part of an argument or a path.
 
     Args:
-        before: specification up to the ``+``.
-        core: specification up to the end of the word.
+        before: text of the specification before the ``+``.
+        core: text of the specification up to the end of the unknown word.
         last: the unknown word.
 
     """

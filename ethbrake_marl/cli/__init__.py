@@ -1,1 +1,1 @@
-"""The command ``ethbrake``: parse arguments, call the package, print the results."""
+"""The command-line program ``ethbrake``: parse arguments, call the package, and print the results."""

@@ -1,4 +1,4 @@
-"""The command ``ethbrake``: parse, call, print. Results as JSON go to stdout, everything else goes to stderr."""
+"""The program ``ethbrake`` with all its commands: set up streams, run the command, and turn errors into messages."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    help="Ethical emergency braking: train, shield, evaluate. Every command has its own --help with an example.",
+    help="Ethical emergency braking: train, shield and evaluate agents. Every command has a --help with an example.",
     epilog=example("run", "evaluate --agents full_brake,e_v2x_bm --episodes 1000"),
 )
-_NAMES = "What --set, recipes and scenarios may name: ethbrake scenario parts"
+_NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario parts"
 for name, command, shown in (
     ("run", train.run_command, "run --steps 200000 --seed 1"),
     ("train", train.train_command, "train --recipe sac --output runs/sac"),
@@ -63,8 +63,8 @@ def _about(
 
 
 def main() -> None:
-    """Run the command line of this process, and exit with its status; the entry point of the program ``ethbrake``."""
-    gc.set_threshold(20_000)  # Python's 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
+    """Run the command line of this process, and exit with its status. Entry point of the program ``ethbrake``."""
+    gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
     sys.exit(run_command(sys.argv[1:]))
 
@@ -72,12 +72,13 @@ def main() -> None:
 def run_command(arguments: Sequence[str]) -> int:
     """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    It is 0 for success, and 2, with one line on stderr, for bad input, bad usage or a file error. Other errors are
-    defects, and are raised.
+    The status is 0 for success. For invalid input, wrong usage or a file error it is 2, and the reason is printed in
+    one line on stderr. It is 1 if the reader of the output has closed the pipe. Other errors are defects of the program
+    and are raised.
     """
     asked = _shell_asks(os.environ)
     try:
-        variable = None if asked else ""  # the usual variable, or one with which no shell can request completion
+        variable = None if asked else ""  # None: the default variable; "": shell completion is off
         with naming_extras():
             status = whole_command()(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
         sys.stdout.flush()
@@ -86,7 +87,7 @@ def run_command(arguments: Sequence[str]) -> int:
             raise
         if isinstance(stop.__context__, BrokenPipeError):  # the reader of the output has closed the pipe
             return 1
-        return _refuse(f"code of yours ended the process: SystemExit: {stop.code}")
+        return _refuse(f"your own code ended the process: SystemExit: {stop.code}")
     except TyperException as error:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "ethbrake"
@@ -99,19 +100,19 @@ def run_command(arguments: Sequence[str]) -> int:
         abandon_output()
         return _refuse(f"{error.filename or 'output'!s:.200}: {error.strerror or error}")
     except MemoryError as error:
-        return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; ask for fewer worlds at once")
+        return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
     except (Exception, KeyboardInterrupt):
         raise
     except BaseException as error:  # GeneratorExit and similar, which this package never raises
-        return _refuse(f"code of yours ended the process: {describe_error(error)}")
+        return _refuse(f"your own code ended the process: {describe_error(error)}")
     return status if isinstance(status, int) else 0
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Return whether a shell runs this command to complete a line, as the script from ``--show-completion`` does.
+    """Return whether a shell runs this command to complete a command line (see ``--show-completion``).
 
-    ``environment`` are the environment variables. The completion variable is ignored if the other variables of such a
-    script are missing, so that a command never fails because of it.
+    ``environment``: environment variables. The variable that requests a completion is ignored if other variables of the
+    completion script are missing, so a command never fails because of it.
     """
     if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -120,7 +121,7 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
-    """Print the reason in one line on stderr, and return 2, the exit status for an error."""
+    """Print the reason of an error in one line on stderr, and return 2, the exit status for an error."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
@@ -128,9 +129,9 @@ def _refuse(reason: str) -> int:
 def prepare_streams() -> None:
     """Set up stdout, stderr and warnings for the command line.
 
-    Characters that stdout's encoding lacks (m², box lines in Latin-1) are shown as ``?`` instead of failing. Output
-    that bypasses Python and goes to file descriptor 1, in this process or a child, goes to stderr. The package's own
-    warnings are one line each. The first compilation of kernels is announced.
+    A character that the encoding of stdout does not have (m², lines of boxes) is printed as ``?`` instead of raising an
+    error. Output that bypasses Python's stdout, such as that of a library or child process, goes to stderr. Warnings of
+    this package are printed in one line. The first compilation of kernels is announced.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
@@ -151,19 +152,22 @@ def prepare_streams() -> None:
 
 
 def tell_compilation(folder: Path, empty: bool) -> None:
-    """Announce that kernels are being compiled, and report their number every ten seconds while this continues.
+    """Announce that kernels are being compiled, and print every ten seconds how many are done.
 
-    The report comes from a thread, because a single kernel may take a minute.
+    A thread prints these reports, because compiling a single kernel may take a minute.
 
     Args:
-        folder: the cache folder of compiled kernels; a temporary one is deleted at the end.
-        empty: whether nothing was in that folder yet.
+        folder: folder in which compiled kernels are stored; a temporary folder is deleted at the end.
+        empty: whether the folder was empty before.
 
     """
-    once = "the physics, once: minutes of one core" if empty else "new parts of the physics, once"
-    always = "the physics; no folder can be written to store it, so every command compiles it again (ethbrake doctor)"
-    Out().note(f"compiling {always if is_temporary(folder) else f'{once}; the result is stored'}")
-    from numba.core import event  # imported here, because commands that compile nothing do not load numba
+    once = "the physics for the first time, which takes minutes" if empty else "parts of the physics for the first time"
+    always = (
+        "the physics; no folder for compiled kernels is writable, so every command compiles it again (for help:"
+        " ethbrake doctor)"
+    )
+    Out().note(f"compiling {always if is_temporary(folder) else f'{once}; later commands use the stored result'}")
+    from numba.core import event  # imported here because commands that compile nothing do not need numba
 
     events: Any = event  # numba has no types for it
     begun, done, running = time.monotonic(), 0, 0
@@ -181,14 +185,14 @@ def tell_compilation(folder: Path, empty: bool) -> None:
         while True:
             time.sleep(EVERY_S)
             if running:
-                Out().note(f"still compiling: {done} kernels are done, after {time.monotonic() - begun:.0f} s")
+                Out().note(f"still compiling: {done} kernels are done after {time.monotonic() - begun:.0f} s")
 
     events.register("numba:compile", Count())
     Thread(target=tell, daemon=True).start()
 
 
 def abandon_output() -> None:
-    """Discard what stdout still holds but cannot write (full disk), so that Python does not fail again at exit."""
+    """Discard buffered output that cannot be written (full disk), so that Python does not fail again at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -198,12 +202,12 @@ def abandon_output() -> None:
 def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog: str | None = None) -> None:
     """Add the command ``ethbrake NAME``.
 
-    An installed package or an extension does the same with an entry point of the group ``ethbrake_marl.commands``.
+    An installed package adds a command with an entry point of the group ``ethbrake_marl.commands``.
 
     Args:
         name: name of the command; ``GROUP.NAME`` for a command inside an existing group of commands.
-        command: a function, as ``app.command`` of Typer takes it, or a Typer with commands of its own.
-        epilog: text at the end of the help page of a function.
+        command: a function such as ``app.command`` of Typer takes, or a ``Typer`` object with several commands.
+        epilog: text at the end of the help page, if ``command`` is a function.
 
     """
     if isinstance(command, typer.Typer):
@@ -216,7 +220,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
 
 def _names() -> list[str]:
-    """Return the names of the commands and command groups of ``app``, without those of extensions."""
+    """Return the names of the commands and command groups in ``app``, without the commands of extensions."""
     return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),
@@ -228,40 +232,40 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an extension or an installed package, which is imported only when it is called.
+    """A command of an extension or installed package, which is imported only when the command is called.
 
-    ``entry`` is the name of its entry point, ``NAME`` or ``GROUP.NAME``.
+    ``entry``: name of the command's entry point, ``NAME`` or ``GROUP.NAME``.
     """
 
     def __init__(self, entry: str) -> None:
         givers = [giver(point) for point in points(COMMANDS.group)[entry]]
         packages = f"package{'s' if len(givers) > 1 else ''} {' and '.join(givers)}"
-        super().__init__(entry.rpartition(".")[2], help=f"From the installed {packages}.", rich_markup_mode=None)
+        super().__init__(entry.rpartition(".")[2], help=f"Command of the installed {packages}.", rich_markup_mode=None)
         self.entry, self.is_ours = entry, givers == [OURS]
 
     def command(self) -> Any:
-        """Import the actual command of the entry point, and return it as a Typer (click) command."""
+        """Import the command of the entry point, and return it as a Typer (click) command."""
         command = COMMANDS[self.entry]
         command.name = self.name
         return with_installed(command, self.entry)
 
     def make_context(self, *arguments: Any, **settings: Any) -> Any:
-        """Return the context in which the actual command runs; the arguments are those of Typer's own method."""
+        """Return the context in which the imported command runs. The arguments are those of Typer's method."""
         return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """Return the command's line, of at most ``limit`` characters, in the list of commands.
+        """Return the description of the command in the list of commands, of at most ``limit`` characters.
 
-        For a command of another package, the line names the package, so that the package need not be imported.
+        For a command of another package this is the name of the package, so the package need not be imported.
         """
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Add the commands of the entry points ``NAME.COMMAND`` to the command group called ``name``, and return it.
+    """Add the commands of the entry points ``NAME.COMMAND`` to the command group ``name``; return the group.
 
     Args:
-        group: the group, a Typer (click) command with subcommands. It is changed.
+        group: the command group, a Typer (click) command with subcommands; it is changed.
         name: name of the group.
 
     """
@@ -273,16 +277,18 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """Return the command ``ethbrake`` as a Typer (click) group.
+    """Return the program ``ethbrake`` as a Typer (click) group of commands.
 
-    It has the commands of the core, of extensions and installed packages, and those that a program added with
-    ``add_command``. Raises ``AlreadyExists`` if two commands have the same name.
+    The group has the commands of the core, of extensions and installed packages, and of ``add_command``. Raises
+    ``AlreadyExists`` if two commands have the same name.
     """
     added = [name for name in COMMANDS if name not in _OURS and "." not in name]
     names = [*_names(), *added]
     for k, name in enumerate(names):
         if name in names[:k]:
-            raise AlreadyExists(f"command {name!r} is there already; give yours another name: app.command('my-{name}')")
+            raise AlreadyExists(
+                f"command {name!r} already exists; give your command another name: app.command('my-{name}')"
+            )
     whole: Any = get_command(app)
     for name in _OURS:
         with_installed(whole.commands[name], name)

@@ -1,4 +1,4 @@
-"""Options that several commands share, and the output of a command."""
+"""Options that several commands share, and ``Out``, the output of a command."""
 
 from __future__ import annotations
 
@@ -21,48 +21,51 @@ from ethbrake_marl.envs.registration import register_environments
 from ethbrake_marl.errors import InvalidInput, one_line, plain_text
 from ethbrake_marl.progress import Progress as PartProgress
 
-_KEPT = "\n\t\N{NO-BREAK SPACE}"  # special characters allowed in results; the last stands between number and unit
+# special characters allowed in results; the no-break space is used between a number and its unit
+_KEPT = "\n\t\N{NO-BREAK SPACE}"
 
-EVERY_S = 10.0  # time between two lines of progress if stderr is not a terminal
+EVERY_S = 10.0  # time between two lines of progress (s) if stderr is not a terminal
 
 ScenarioOption = Annotated[
-    str, typer.Option(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
+    str, typer.Option(metavar="NAME|PATH", help="Name of a shipped or registered scenario, or path of a YAML file.")
 ]
 
 SettingsOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set a key to another value: mass_t=40. Repeatable."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting: mass_t=40. Can be given several times."),
 ]
 
 StepsOption = Annotated[
     int | None,
-    typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="the recipe's"),
+    typer.Option(help="Training steps (decisions), rounded up to whole updates.", show_default="as in the recipe"),
 ]
 
 AgentsOption = Annotated[
-    str, typer.Option(metavar="A,B,...", help="Agents, separated by commas; `ethbrake agent list` shows all.")
+    str, typer.Option(metavar="A,B,...", help="Agents, separated by commas; `ethbrake agent list` shows all agents.")
 ]
 
 SeedOption = Annotated[int, typer.Option(help="Seed of the evaluation list.")]
 
-JobsOption = Annotated[int | None, typer.Option(help="Processes at once; changes no result.", min=1, max=64)]
-
-RayOption = Annotated[
-    str | None, typer.Option(metavar="local|ADDRESS", help="Work on Ray: on this machine, or on a running cluster.")
+JobsOption = Annotated[
+    int | None, typer.Option(help="Number of parallel processes; does not change results.", min=1, max=64)
 ]
 
-ForceOption = Annotated[bool, typer.Option("--force", help="Replace what is already there.")]
+RayOption = Annotated[
+    str | None, typer.Option(metavar="local|ADDRESS", help="Compute with Ray, on this machine or a running cluster.")
+]
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the results as JSON, and nothing else, on stdout.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on stdout as JSON.")]
 
 
 def schema_option(module: str, model: str, kind: str) -> Any:
     """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
 
     Args:
-        module: name of the module with the model, which is imported only when needed.
+        module: name of the module with the model; it is imported only when the option is used.
         model: name of the model's class, which has a method ``json_schema``.
-        kind: kind of files, for the help text: ``recipe``.
+        kind: kind of file, for the help text, such as ``recipe``.
 
     """
 
@@ -76,7 +79,7 @@ def schema_option(module: str, model: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Return the end of a help page, one example for each of ``lines``: ``run --seed 1`` (without ``ethbrake``)."""
+    """Return the examples at the end of a help page. ``lines``: command lines without ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
@@ -86,15 +89,15 @@ def say(text: str) -> None:
 
 
 class Out:
-    """Output of one command of ``ethbrake``, used as ``with Out() as out``.
+    """Output of a command of ``ethbrake``, used as ``with Out() as out``.
 
-    Inside ``with``, only results go to stdout; everything else that is printed, for instance by a user's agent, goes to
-    stderr. Ctrl-C ends the command with one line and status 130.
+    Inside the block only results go to stdout. All other output, for instance of a user's agent, goes to stderr. Ctrl-C
+    ends the command with a message of one line and status 130.
 
     Args:
-        as_json: print results as JSON.
-        force: replace existing files.
-        remains: sentence, without its capital, that says after Ctrl-C what remains.
+        as_json: whether to print results as JSON.
+        force: whether to replace existing files.
+        remains: end of the message after Ctrl-C, which says what has been written.
 
     """
 
@@ -104,8 +107,8 @@ class Out:
         self._stderr: Console = _PlainConsole(sys.stderr)
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
-        self._said_s = -EVERY_S  # time of the last line of progress, if stderr is not a terminal
-        self._begun: dict[str, tuple[float, int]] = {}  # time and progress at the first report of each part
+        self._said_s = -EVERY_S  # time of the last line of progress (s), if stderr is not a terminal
+        self._begun: dict[str, tuple[float, int]] = {}  # time and progress at the first report of each task
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
@@ -117,9 +120,9 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout, and after Ctrl-C print what remains and end the command with status 130.
+        """Stop redirecting stdout; after Ctrl-C, print a message and end the command with status 130.
 
-        The arguments describe the exception that ended the block, if there is one, as for every context manager.
+        The arguments describe the exception that ended the block, as for every context manager.
         """
         self._turned.__exit__(kind, error, trace)
         self.end_progress()
@@ -130,9 +133,9 @@ class Out:
         """Print the result of the command on stdout.
 
         Args:
-            content: plain data to print if JSON is requested.
-            shown: texts and tables to print otherwise.
-            end: characters after each text.
+            content: plain data, printed if JSON is requested.
+            shown: texts and tables, printed otherwise.
+            end: characters printed after each text.
 
         """
         if self.as_json:
@@ -141,14 +144,14 @@ class Out:
             self.show(*shown, end=end)
 
     def print_json(self, content: Any) -> None:
-        """Print ``content`` (plain data) as JSON on stdout, whether or not ``--json`` was passed."""
+        """Print ``content`` (plain data) as JSON on stdout, even without ``--json``."""
         self.end_progress()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
     def show(self, *shown: RenderableType, end: str = "\n") -> None:
-        """Print texts and tables (of rich) on stdout, each text followed by ``end``.
+        """Print texts, each followed by ``end``, and tables (of rich) on stdout.
 
-        Control characters in texts are replaced, except line ends and tabs.
+        Control characters in texts are escaped, except line ends and tabs.
         """
         self.end_progress()
         for each in shown:
@@ -163,18 +166,18 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput``, before any work, if a file cannot be written.
+        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written. Commands call this before any work.
 
         Args:
-            path: the file; None: no file was requested, so nothing is checked.
-            endings: allowed endings of the name, such as ``.csv``; none: any.
-            what: name of the content, for the message.
+            path: path of the file; None: no file was requested, and nothing is checked.
+            endings: allowed endings of the name, such as ``.csv``; without endings, all are allowed.
+            what: name of the content, for the error message.
 
         """
         if path is None:
             return
         if endings and path.suffix.lower() not in endings:
-            raise InvalidInput(f"{path}: {what} must end in {' or '.join(endings)}")
+            raise InvalidInput(f"{path}: the name of a file with {what} must end in {' or '.join(endings)}")
         from ethbrake_marl.files.store import check_target
 
         check_target(path, force=self.force)
@@ -182,7 +185,7 @@ class Out:
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
         """Write ``content`` to a file, completely or not at all, and print ``WHAT: PATH`` on stderr.
 
-        ``what`` None: print nothing.
+        ``what``: word for the content; None: print nothing.
         """
         from ethbrake_marl.files.store import write_output
 
@@ -191,21 +194,21 @@ class Out:
             self.note(f"{what}: {path}")
 
     def interrupted(self, text: str) -> NoReturn:
-        """Print ``text`` as one line on stderr, and end the command with status 130, as after Ctrl-C."""
+        """Print ``text`` as one line on stderr, and end the command with status 130, the status after Ctrl-C."""
         self.note(text)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:
-        """Show that one part of the command's work has reached ``done`` of ``total`` units.
+        """Show the progress of a task of the command: ``done`` of ``total`` units.
 
-        On a terminal there is one bar per part; otherwise one line at the beginning and every ten seconds.
+        A terminal shows one progress bar per task. Otherwise a line is printed at the beginning and every ten seconds.
 
         Args:
-            name: name of the part; ``PART: STAGE`` shares the bar of ``PART``.
-            done: number of units done.
+            name: name of the task; a task ``TASK: STAGE`` has the same bar as ``TASK``.
+            done: number of units that are done.
             total: number of all units.
-            harm: latest result, shown behind the name.
-            note: message that is printed once, above the bars.
+            harm: latest result, shown after the name.
+            note: message to print once, above the bars.
 
         """
         label = one_line(f"{name}, {harm}" if harm else name)
@@ -234,29 +237,29 @@ class Out:
             self._said_s = now
 
     def show_progress(self, progress: PartProgress) -> None:
-        """Show the progress that a function of the package reported to its ``on_progress``."""
+        """Show the progress that a function of the package reports to its argument ``on_progress``."""
         self.progress(progress.name, progress.done, progress.total, progress.harm, progress.note)
 
     def end_progress(self) -> None:
-        """Stop updating the progress bars; they stay on the screen, and later output stands below them."""
+        """Stop updating the progress bars. They stay on the screen, and later output is printed below them."""
         if self._bars is not None:
             self._bars.stop()
             self._bars, self._tasks = None, {}
 
 
 class _PlainConsole(Console):
-    """Console of rich that prints text literally: no markup in names of agents and paths, and no control characters.
+    """Console of rich that prints texts literally, without interpreting markup, and escapes control characters.
 
-    ``width`` is the number of columns; None: the terminal's.
+    ``width``: number of columns; None: width of the terminal.
     """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """Yield the styled segments of ``renderable`` (a text or table) as rich does, without control characters.
+        """Yield the styled segments of ``renderable`` (a text or table), with control characters escaped.
 
-        ``options`` are rich's options of this output.
+        ``options``: options of rich for this output.
         """
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)

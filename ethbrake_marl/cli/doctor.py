@@ -1,6 +1,6 @@
-"""The command ``doctor``: check this installation.
+"""The command ``doctor``: check the versions and folders of this installation, and the physics on known results.
 
-It checks versions, folders, and the physics on worlds with a known result.
+With ``--compile`` the command also compiles the physics.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluati
 
 _LINEUP = "ladder,ppo,ppo+search+episode,full_brake+step"
 
-# Small calls of the usual commands, to compile what they use. A single world has another memory layout.
+# Small calls of the usual commands, which compile the kernels that they use. The call with a single world compiles
+# kernels for another memory layout.
 _DOORS = (
     ("run", "--steps", "128", "--episodes", "20", "--output", "run", *_TINY),
     ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
@@ -44,7 +45,7 @@ _DOORS = (
     ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
 
-# Uses the kernels of `ethbrake run`, except for three small ones, and no others; needs no torch.
+# A command that uses exactly the kernels of `ethbrake run`, except for three small kernels, but does not need torch.
 _FOR_A_RUN = (
     *("-m", "ethbrake_marl", "evaluate", "--episodes", "20", "--output", "page", "--report"),
     *("--agents", "full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo,ppo+episode"),
@@ -62,23 +63,23 @@ eb.evaluate(agents={"robust": robust}, scenario="paper-random", episodes=20)
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
-_CHECKOUT = _PACKAGE.parent  # of an installed package: the folder of packages, without a pyproject.toml
+_CHECKOUT = _PACKAGE.parent  # if the package is installed, this is the folder of packages, without a pyproject.toml
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
     """Result of one check of the installation."""
 
-    name: str  # name of what was checked
-    ok: bool  # whether it is in order
+    name: str  # name of the checked item, such as a package
+    ok: bool  # whether the check succeeded
     detail: str  # version, folder or error, for the user
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Check the installation, and return all results in the order in which problems should be fixed.
+    """Run all checks of the installation; return the results in the order in which problems should be solved.
 
-    No check raises. ``compile_all``: also call the usual commands on a few worlds, so that all kernels that they use
-    are compiled and stored.
+    A check that raises an error is reported as failed. ``compile_all``: also call the usual commands on a few worlds,
+    which compiles and stores all kernels that they use.
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -95,7 +96,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """Return the check ``name`` with the result (ok, detail) of ``look()``; an exception becomes a failed check."""
+    """Return the check ``name`` with the result (ok, detail) of ``look()``; if it raises an error, the check failed."""
     try:
         return Check(name, *look())
     except Exception as error:
@@ -103,9 +104,9 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Yield one check per dependency: whether it is installed in a required version.
+    """Yield one check per dependency, which succeeds if a required version is installed.
 
-    A missing package of an extra counts as in order.
+    A missing package that only an extra needs does not count as a failure.
     """
     from packaging.version import Version
 
@@ -116,7 +117,7 @@ def _dependencies() -> Iterator[Check]:
         try:
             installed = version(name)
         except PackageNotFoundError:
-            what = f"is not installed; the extra {extra} brings it" if extra else f"is not installed; {wanted}"
+            what = f"is not installed; the extra {extra} installs it" if extra else f"is not installed; {wanted}"
             yield Check(name, bool(extra), what)
             continue
         tested = pinned.get(name.lower())
@@ -126,9 +127,9 @@ def _dependencies() -> Iterator[Check]:
 
 
 def _requirements() -> list[tuple[str, Requirement]]:
-    """Return the package's dependencies as pairs (extra, requirement); the extra is "" if it is always needed.
+    """Return the dependencies of the package as pairs (extra, requirement); the extra is "" for a core dependency.
 
-    They come from the checkout's ``pyproject.toml``, or else from the metadata of the installed package.
+    They are read from ``pyproject.toml`` in a checkout, otherwise from the metadata of the installed package.
     """
     from packaging.requirements import Requirement
 
@@ -144,7 +145,7 @@ def _requirements() -> list[tuple[str, Requirement]]:
 
 
 def _pinned_versions(constraints: Path) -> dict[str, str]:
-    """Return the versions in a pip constraints file: lower-case package -> version; empty if there is no file."""
+    """Return the versions in a pip constraints file by lower-case package name; empty if the file does not exist."""
     text = constraints.read_text("utf-8") if constraints.is_file() else ""
     return {name.lower(): pin for name, pin in re.findall(r"^([^\s#=]+)==([^\s#]+)", text, re.MULTILINE)}
 
@@ -157,7 +158,7 @@ def _processor() -> tuple[bool, str]:
 
 def _kernel_cache() -> tuple[bool, str]:
     folder = cache_folder()
-    note = "temporary: kernels are compiled anew in every process; set NUMBA_CACHE_DIR to a writable folder"
+    note = "temporary, so every process compiles the kernels again; set NUMBA_CACHE_DIR to a writable folder"
     return True, f"{folder} ({note})" if is_temporary(folder) else str(folder)
 
 
@@ -169,9 +170,9 @@ def _scenarios() -> tuple[bool, str]:
 
 
 def _golden_impact() -> tuple[bool, str]:
-    """Check the physics on a car at 10 m/s that brakes with 5 m/s2, 8 m behind a parked car.
+    """Check the physics: a car at 10 m/s brakes with 5 m/s2, 8 m behind a standing car.
 
-    The exact harm is ``10^2 - 2 * 5 * 8 = 20``. Returns whether it is right, and a text.
+    The exact harm is ``10^2 - 2 * 5 * 8 = 20`` m2/s2. Returns whether the computed harm is correct, and a text.
     """
     import numpy as np
 
@@ -184,13 +185,15 @@ def _golden_impact() -> tuple[bool, str]:
     )  # fmt: skip
     _, impacts = advance(world, np.array([[0.0, -5.0]]), 4.0)
     harm = float(impacts.total_harm[0, 0])
-    return abs(harm - 20.0) < 1e-9, f"8 m behind a standing car, 10 m/s, braking 5 m/s2: harm {harm:.9g} (exact: 20)"
+    text = f"car at 10 m/s, braking with 5 m/s2, 8 m behind a standing car: harm {harm:.9g} (exact: 20)"
+    return abs(harm - 20.0) < 1e-9, text
 
 
 def _golden_baseline() -> tuple[bool, str]:
     """Check the baseline E-V2X-BM in the paper's distance scenario with gaps of 7 m and 7 m.
 
-    It must brake with 5.17021 m/s2, at harm 4.03447 m2/s2. Returns whether it does, and a text.
+    The known result is a deceleration of 5.17021 m/s2 and a harm of 4.03447 m2/s2. Returns whether the computed result
+    is the same, and a text.
     """
     import numpy as np
 
@@ -205,21 +208,22 @@ def _golden_baseline() -> tuple[bool, str]:
     best = optimise_pairwise(world, 1)
     computed = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
     wanted = "5.17021 m/s2, harm 4.03447"
-    return computed == wanted, f"E-V2X-BM at gaps 7 and 7 m: {computed} (known: {wanted})"
+    return computed == wanted, f"E-V2X-BM with gaps of 7 m and 7 m: {computed} (known result: {wanted})"
 
 
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
     """Compile and store the kernels that the usual commands use, by calling these commands on a few worlds.
 
-    The commands run in parallel on all cores; the progress is printed. Returns whether all succeeded, and a message.
+    The commands run in parallel on all cores, and the progress is printed. Returns whether all commands succeeded, and
+    a message.
 
     Args:
-        training: include ``ethbrake run``, which needs torch.
-        run_alone: instead, call a single command that compiles nearly all kernels of ``ethbrake run``.
+        training: whether to call also ``ethbrake run``, which needs torch.
+        run_alone: True: call only one command, which compiles nearly all kernels of ``ethbrake run``.
 
     """
     if is_temporary(cache_folder()):
-        return False, "no folder can be written to store what is compiled; set NUMBA_CACHE_DIR to a writable folder"
+        return False, "no folder for compiled kernels is writable; set NUMBA_CACHE_DIR to a writable folder"
     begun, failed = perf_counter(), []
     doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
     doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _IN_PYTHON, "in Python")]
@@ -231,31 +235,29 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
             failed += [f"{called[future]} failed: {future.result()}" for future in done if future.result()]
             files = sum(1 for _ in cache_folder().iterdir())
             Out().note(
-                f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {files} files in the cache"
+                f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {files} files in the kernel"
+                " cache"
             )
     for failure in failed:
         Out().note(f"compile: {failure}")
-    return not failed, "; ".join(failed) or f"what these commands use is compiled, after {perf_counter() - begun:.0f} s"
+    return not failed, "; ".join(failed) or f"all kernels compiled in {perf_counter() - begun:.0f} s"
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """Run Python with these arguments in ``folder``.
-
-    Returns the last line that it prints on stderr if it fails; empty if it succeeds.
-    """
+    """Run Python with these arguments in ``folder``; return the last line on stderr if it fails, else an empty text."""
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 
 
 def doctor_command(
     compile_all: Annotated[
-        bool, typer.Option("--compile", help="Compile the physics now, on all cores, so that no later command waits.")
+        bool, typer.Option("--compile", help="Compile the physics now, so that no later command has to wait for it.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check this installation: versions, folders, physics.
 
-    Prints one line per check, OK or FAIL. The exit status is 1 if a check failed.
+    Prints one line per check, with OK or FAIL. The exit status is 1 if a check failed.
     """
     with Out(as_json=as_json) as out:
         checks = diagnose(compile_all=compile_all)

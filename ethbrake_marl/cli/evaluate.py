@@ -1,4 +1,4 @@
-"""The commands that measure agents: ``evaluate``, ``compare`` and ``shield``."""
+"""The commands that compare agents: ``evaluate``, ``compare`` and ``shield``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.scenario.task import Task
     from ethbrake_marl.training.settings import Settings
 
-GROUP_EPISODES = 400  # worlds of each scenario of a group; the tables of best known harm of `benchmark` contain them
+# default number of worlds of each scenario in a group; best known harms exist for these worlds of `benchmark`
+GROUP_EPISODES = 400
 
 RESULTS, WORLDS, REPORT = "results.json", "worlds", "report.html"  # names of files in the folder of an evaluation
 
@@ -44,13 +45,13 @@ _POLICIES = {"same": "the same", "other": "another", "none": ""}
 
 
 def read_task(scenario: str, settings: Sequence[str] | None) -> Task:
-    """Load a scenario with settings, and return the task of controlling its learners.
+    """Load a scenario, change its settings, and return the task of controlling its learners.
 
     Args:
-        scenario: name or path.
-        settings: ``KEY=VALUE`` overrides of the scenario, and ``harm_count=total``; None: none.
+        scenario: name of a scenario, or path of its file.
+        settings: settings ``KEY=VALUE`` of the scenario, and ``harm_count=total``; None: no settings.
 
-    Raises ``InvalidInput`` for a scenario without a learner.
+    Raises ``InvalidInput`` for a scenario without learners.
 
     """
     return _task_of(scenario, training.read_settings(settings, of_agents=("harm_count",)))
@@ -64,12 +65,12 @@ def _task_of(scenario: str, chosen_settings: Settings) -> Task:
 
 
 def make_drivers(agents: str | Sequence[str], task: Task, *, bare: bool = False) -> dict[str, Any]:
-    """Return the agents of a command line by spec (``make_lineup``).
+    """Return the agents named on a command line, by name; see ``make_lineup``.
 
     Args:
-        agents: specs, as a list or with commas between them.
-        task: the scenario, and the harm that the agents minimise.
-        bare: refuse agents with a shield, because the command adds its own.
+        agents: names of agents, as a list or as a text with commas.
+        task: the scenario, and the count of harm that the agents minimise.
+        bare: whether to raise ``InvalidInput`` for an agent with a shield, because the command adds shields itself.
 
     """
     return evaluation.make_lineup(agents, task.scenario, harm_count=task.harm_count, bare=bare)
@@ -84,16 +85,16 @@ def evaluate_command(
     seed: Annotated[int | None, typer.Option(help="Seed of the evaluation list.", show_default="7")] = None,
     settings: SettingsOption = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Also write the results to this folder: results.json.")
+        Path | None, typer.Option(metavar="FOLDER", help="Also write the results to FOLDER/results.json.")
     ] = None,
     per_world: Annotated[
         Literal["csv", "parquet"] | None,
-        typer.Option(help="With --output: also write a row per world and agent, worlds.csv or worlds.parquet."),
+        typer.Option(help="With --output: also write worlds.csv or worlds.parquet, with one row per world and agent."),
     ] = None,
     report: Annotated[
         bool,
         typer.Option(
-            "--report", help="With --output: also write a page with tables, figures and episodes, report.html."
+            "--report", help="With --output: also write report.html, a page with tables, figures and episodes."
         ),
     ] = False,
     jobs: JobsOption = None,
@@ -103,11 +104,11 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    `ethbrake agent list` shows all agents; ladder stands for all of them from coast to best_harm. Behind any agent:
-    +search, then one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode.
-    PATH is a run or a policy bundle. +robust needs an uncertainty, which only Python can set;
-    +robust:estimated needs none. With --set harm_count=total agents minimise the harm of all impacts, not only of first
-    impacts. --set measures=injury,my_file.py:worst adds these measures to the usual ones.
+    `ethbrake agent list` shows all agents; ladder stands for all agents from coast to best_harm. A name can be followed
+    by +search and by one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode, where
+    PATH is a run or a policy bundle. The shield +robust needs an uncertainty, which can be set only in Python;
+    +robust:estimated does not need one. With --set harm_count=total, agents minimise total harm instead of first-impact
+    harm. --set measures=injury,my_file.py:worst adds these measures to the results.
     """
     from ethbrake_marl.agents.spec import split_specs
 
@@ -118,9 +119,13 @@ def evaluate_command(
         if group := scenarios.group_of_scenarios(scenario):
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
             for option in (name for name, value in other.items() if value):
-                raise InvalidInput(f"{option}: {scenario} is a group of {len(group)} scenarios; give one of them")
+                raise InvalidInput(
+                    f"{option}: is impossible for {scenario}, a group of {len(group)} scenarios; give one of them"
+                )
             if chosen.measures:
-                raise InvalidInput(f"--set measures: {scenario} is a group of {len(group)} scenarios; give one of them")
+                raise InvalidInput(
+                    f"--set measures: is impossible for {scenario}, a group of {len(group)} scenarios; give one of them"
+                )
             _evaluate_group(out, output, [_task_of(name, chosen) for name in group], agents, episodes, seed)
             return
         task = _task_of(scenario, chosen)
@@ -156,9 +161,16 @@ def evaluate_command(
 def _evaluate_long_list(
     out: Out, lineup: evaluation.Lineup, episodes: int, seed: int, jobs: int | None, ray: str | None
 ) -> evaluation.SummaryTable:
-    """Evaluate the agents on a list that is too long to hold in memory, and return the results table.
+    """Evaluate the agents on an evaluation list that is too long for the memory; return the results table.
 
-    The list is ``episodes`` worlds of ``seed``; ``jobs`` processes or the Ray cluster ``ray`` do the work.
+    Args:
+        out: output of the command.
+        lineup: the agents and the scenario.
+        episodes: number of worlds in the list.
+        seed: seed of the list.
+        jobs: number of parallel processes; None: one process.
+        ray: address of a Ray cluster, or ``local``; None: without Ray.
+
     """
     scenario = lineup.scenario
     evaluation.check_agents(lineup.make(), scenario.sample(1_000, seed).worlds, scenario, warn=True)
@@ -176,17 +188,17 @@ def _tell_worlds(out: Out, worlds: int) -> Callable[[int], None]:
 def _evaluate_group(
     out: Out, output: Path | None, group: Sequence[Task], agents: str, episodes: int | None, seed: int | None
 ) -> None:
-    """Evaluate each agent in each scenario of a group, and print one table with a row for each of them.
+    """Evaluate each agent in each scenario of a group, and print a table with a row per agent and scenario.
 
-    It shows whether vehicles collide, how hard the worst impact is, and harm.
+    The table shows the collision rate, the hardest impact, and mean harm.
 
     Args:
         out: output of the command.
-        output: folder that also gets the results as JSON; None: no folder.
+        output: folder for the results as JSON; None: do not write them.
         group: the scenarios, each with its controlled vehicles.
-        agents: specs with commas between them.
-        episodes: number of worlds of each scenario; None: 400.
-        seed: seed of the worlds; None: the standard seed.
+        agents: names of agents, with commas between them.
+        episodes: number of worlds of each scenario; None: ``GROUP_EPISODES``.
+        seed: seed of the evaluation lists; None: the default seed.
 
     """
     objects: list[dict[str, Any]] = []
@@ -226,22 +238,22 @@ def _evaluate_group(
     ]
     counted = "first-impact" if group[0].harm_count == "first" else "total"
     note = (
-        f"{result.worlds.n:,} worlds of each, seed {seed}; `ethbrake scenario explain` shows their parameters."
-        " Passed: no vehicle collides in any world. Harms: means per world in m²/s². Hardest: the largest"
-        " closing speed of a pair." + "".join(f" {each.note.format(harm=counted)}" for each in more)
+        f"{result.worlds.n:,} worlds of each scenario, seed {seed}; `ethbrake scenario explain` describes a scenario."
+        " Passed: no vehicle collides in any world. Harm: mean per world in m²/s². Hardest: largest closing speed of"
+        " any first impact." + "".join(f" {each.note.format(harm=counted)}" for each in more)
     )
     _write_results(out, output, objects)
     out.result(objects, Sheet("", columns, rows, note))
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Raise ``InvalidInput``, before any work, if the folder ``output`` cannot be written or holds other files.
+    """Raise an error, before any work, if the folder ``output`` is not writable or contains results already.
 
     ``per_world`` (``csv``, ``parquet`` or None) and ``report`` say which files are requested; they need a folder.
     """
     if output is None:
         for option in (name for name, value in (("--per-world", per_world), ("--report", report)) if value):
-            raise InvalidInput(f"{option}: needs a folder for it: --output FOLDER")
+            raise InvalidInput(f"{option}: can be used only with a folder; add --output FOLDER")
         return
     if per_world == "parquet":
         need("pyarrow")
@@ -251,21 +263,22 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
 def _write_worlds(out: Out, output: Path | None, result: evaluation.Evaluation, per_world: str | None) -> Path | None:
     """Write the file with one row per world and agent into the folder ``output``, and return its path.
 
-    ``per_world`` is the format, ``csv`` or ``parquet``. If it or ``output`` is None, return None.
+    ``per_world``: format of the file, ``csv`` or ``parquet``. If ``per_world`` or ``output`` is None, write nothing and
+    return None.
     """
     if output is None or per_world is None:
         return None
     file = output / f"{WORLDS}.{per_world}"
     output.mkdir(parents=True, exist_ok=True)
     evaluation.write_per_world(file, result, force=out.force)
-    out.note(f"every world: {file}")
+    out.note(f"results per world: {file}")
     return file
 
 
 def _write_results(out: Out, output: Path | None, results: object, *beside: str) -> None:
     """Write ``results.json`` into the folder ``output``, and delete files of earlier results except ``beside``.
 
-    ``output`` None: write nothing.
+    If ``output`` is None, write nothing.
     """
     if output is None:
         return
@@ -281,11 +294,11 @@ def _json_text(content: object) -> str:
 
 
 def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: float) -> None:
-    """Print in how many worlds something still moved at the horizon, if there are any.
+    """Print in how many worlds some vehicle still moves at the horizon, if there are such worlds.
 
     Args:
         out: output of the command.
-        moving: name of an agent with a shield -> number of such worlds.
+        moving: number of such worlds for each agent with a shield, by name.
         worlds: number of all worlds.
         horizon_s: time of the horizon (s).
 
@@ -293,29 +306,28 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
     text = ", ".join(f"{name} {count}" for name, count in moving.items() if count)
     if text:
         out.note(
-            f"note: bounds of the shield end at the horizon ({horizon_s:g} s) and say nothing of what comes after;"
-            f" worlds, of {worlds}, that were not at rest then: {text}"
+            f"note: the bounds of the shield do not cover harm after the horizon ({horizon_s:g} s); worlds (of"
+            f" {worlds}) in which a vehicle still moves at the horizon: {text}"
         )
 
 
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
-    """Return name of each agent behind a shield -> number of worlds in which something still moves at the horizon.
+    """Return in how many worlds some vehicle still moves at the horizon, by name of each agent behind a shield.
 
-    ``rows`` is the results table.
+    ``rows``: rows of the results table.
     """
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
-_FILE = typer.Argument(
-    metavar="RESULTS.json", help="results.json of evaluate or run, or what evaluate or shield --json printed."
-)
+_FILE = typer.Argument(metavar="RESULTS.json", help="results.json of evaluate or run, or output of evaluate --json.")
 
 
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    Shows the second minus the first, for agents of the same name. Both must come from one command, and from the same
-    worlds of the same scenario. Intervals are paired by world if the files of --per-world lie beside both results.
+    Shows the second result minus the first, for agents of the same name. Both results must come from the same command
+    and the same worlds of the same scenario. Confidence intervals are paired by world if both folders have the files of
+    --per-world.
     """
     with Out(as_json=as_json) as out:
         comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
@@ -325,18 +337,19 @@ def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE
         out.note("second minus first, mean per world in m²/s²; in brackets: 95 % intervals,")
         why = comparison.unpaired_because
         by = evaluation.Conditions(recordings=comparison.recordings).by_recording
-        how = "paired by world" if why is None else f"NOT paired, wider than they would be paired by world: {why}"
+        how = "paired by world" if why is None else f"NOT paired by world, so wider than paired intervals: {why}"
         out.note(f"{how}{by}")
         if comparison.exploits_line:
             out.note(comparison.exploits_line)
         for which, agents in zip(("first", "second"), comparison.left_over, strict=True):
             if agents:
-                out.note(f"in the {which} only: {', '.join(agents)}")
+                out.note(f"agents only in the {which} result: {', '.join(agents)}")
         for name, both in {**comparison.other_settings, **comparison.other_versions}.items():
             if "SHA-256 " in f"{both[0]}{both[1]}":  # the hash of a file, which only --json shows
-                out.note(f"note: {name} {'was read for one of the two' if None in both else 'changed between the two'}")
+                difference = "was used for only one of the results" if None in both else "differs between the results"
+                out.note(f"note: {name} {difference}")
             else:
-                out.note(f"note: {name} {both[0]} in the first, {both[1]} in the second")
+                out.note(f"note: {name}: {both[0]} in the first result, {both[1]} in the second")
 
 
 def shield_command(
@@ -348,10 +361,11 @@ def shield_command(
 ) -> None:
     """Compare agents without and behind the shield.
 
-    Each agent drives the same worlds without a shield, in episode mode and in step mode. Name agents without a shield.
-    The shield bounds first-impact harm; with --set harm_count=total, total harm. If several vehicles learn, the whole
-    team drives without a shield, in step mode, and in step mode with caps. Each decision that step mode replaced is
-    simulated again without the shield: needed (harm would have been higher), harmless (the same), costly (lower).
+    Each agent is run in the same worlds without a shield, in episode mode and in step mode. A team of several learners
+    is run without a shield, in step mode, and in step mode with caps. Give the agents without a shield. The shield
+    bounds first-impact harm, or total harm with --set harm_count=total. For each decision that step mode replaced, the
+    table shows whether the replacement was needed (harm would have been higher without it), harmless (equal) or costly
+    (lower).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)
@@ -367,9 +381,9 @@ def shield_command(
 
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
-    """Compare ``agents`` (specs with commas between them) without and behind the shield in the worlds of ``sample``.
+    """Compare agents without and behind the shield in the worlds of ``sample``, and show the progress on stderr.
 
-    The progress is shown on stderr.
+    ``agents``: names of agents without a shield, with commas between them.
     """
     lineup = make_drivers(agents, task, bare=True)
     n = sample.worlds.n
@@ -380,7 +394,7 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
-    """Print in one line on stderr which of ``whole`` worlds were left out, if there are any."""
+    """Print in one line on stderr which of ``whole`` worlds were left out of the results, if there are any."""
     if left_out:
         texts = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
         out.note(evaluation.LeftOut.line(texts, whole))

@@ -1,4 +1,4 @@
-"""Registry of the pages and pictures that commands write. The core draws none; extensions register them."""
+"""Registry of the functions that draw pages and pictures for commands. Extensions register these functions."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from ethbrake_marl.registry import Registry
 
 
 def register_page(shows: str, write: Callable[..., None]) -> None:
-    """Register the function that writes a page or picture, to be called by a command with an option for it.
+    """Register the function that a command calls to write a page or picture.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.pages``.
+    An installed package registers it with an entry point of the group ``ethbrake_marl.pages``.
 
     Args:
-        shows: what the page is about: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
-        write: the function. For ``"evaluation"`` it takes the file, the evaluation, its results table and the agents by
-            name; for ``"worlds"`` the file, the scenario and the sample. ``cli.evaluate`` and ``cli.scenario`` show the
-            keyword arguments.
+        shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
+        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, the
+            evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the scenario
+            and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show its keyword arguments.
 
     """
     PAGES.add(shows, write, lambda other: other is write)
@@ -28,10 +28,10 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """Return the function that was registered to write the page about ``shows``.
+    """Return the registered function that writes the page with the subject ``shows``.
 
-    Raises ``InvalidInput``, naming the command's ``option``, if no installed extension registered one.
+    Raises ``InvalidInput``, whose message begins with the command's ``option``, if no such function is registered.
     """
     if shows not in PAGES:
-        raise InvalidInput(f"{option}: nothing draws {shows}: the extension that does is not installed")
+        raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")
     return PAGES[shows]

@@ -1,4 +1,4 @@
-"""The commands that list and show what exists: ``scenario`` and ``agent``."""
+"""The commands ``scenario`` and ``agent``, which list, show, check and write scenarios and agents."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.yaml import flow_text
 
-TRIED_WORLDS = 200  # number of worlds that `scenario validate` tries
+TRIED_WORLDS = 200  # number of worlds in which `scenario validate` tries a scenario
 
-MOST_RANGES = 8  # largest number of ranges that `scenario validate` shows separately
+MOST_RANGES = 8  # largest number of ranges that `scenario validate` shows separately for vehicles
 
-SCREEN = 24  # lines of a screen
+SCREEN = 24  # number of lines on a terminal screen
 
-TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # default number of worlds of `scenario sample`
+TABLE_WORLDS, PICTURE_WORLDS = 10, 1000  # default numbers of worlds of `scenario sample` for a table and a picture
 
 NameArgument = Annotated[
-    str, typer.Argument(metavar="NAME|PATH", help="A shipped or registered scenario, or a path to a YAML file.")
+    str, typer.Argument(metavar="NAME|PATH", help="Name of a shipped or registered scenario, or path of a YAML file.")
 ]
 
 scenario_group = typer.Typer(
-    help="Look at scenarios, check one, start one, draw worlds.",
+    help="List, check and create scenarios, and draw worlds.",
     epilog=example("scenario show paper-random", "scenario sample paper-random --episodes 10 --output worlds.csv"),
 )
 
 
 @scenario_group.command("list", epilog=example("scenario list"))
 def scenario_list(as_json: JsonOption = False) -> None:
-    """List the scenarios that have a name.
+    """List the shipped and registered scenarios.
 
-    Shows name and title, and the folder of scenarios that a program registers.
+    Shows the name and title of each scenario, and the folder of a registered scenario.
     """
     with Out(as_json=as_json) as out:
         entries = scenarios.list_scenarios()
@@ -66,8 +66,8 @@ def scenario_show(scenario: NameArgument) -> None:
 def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
     """Check a scenario, and try it in 200 worlds.
 
-    Draws the first worlds of its list and runs them: scripts drive, learners brake fully. Shows the range of each
-    quantity and what may be a mistake, or what is wrong.
+    Draws the first 200 worlds of the evaluation list and simulates them. Learners brake fully, all other vehicles
+    follow their scripts. Shows the range of each quantity and possible mistakes.
     """
     with Out(as_json=as_json) as out:
         scenario = evaluation.load_runnable(path)
@@ -85,17 +85,19 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
             f"{'NOT OK' if beyond else 'OK'}  {scenario.name}: {scenario.vehicles} vehicles, learners:"
             f" {', '.join(names) or 'none'}; tried in {n} worlds",
             sample.count_kinds().removeprefix("; "),
-            f"early impacts: {_share(sample.rejected, sample.rejected + n, 'draws')} refused,"
+            f"early impacts: {_share(sample.rejected, sample.rejected + n, 'draws')} rejected,"
             f" {_share(trial['early_impacts'], n)} kept",
-            f"at the horizon ({scenario.horizon_s:g} s) something still moves in"
+            f"at the horizon ({scenario.horizon_s:g} s) some vehicle still moves in"
             f" {_share(trial['moving_at_horizon'], n)}"
-            + ("; what comes after counts nowhere, a longer horizon_s sees more" if trial["moving_at_horizon"] else ""),
+            + ("; later impacts are not counted unless you raise horizon_s" if trial["moving_at_horizon"] else ""),
             f"Vehicle 1, whose braking is the alert, has a latency above 0 in {_share(late, n)}"
             if late and scenario.alert_s is None
             else "",
-            "; ".join(f"{each} asks for more than it can in {_share(len(rows), n)}" for each, rows in beyond.items()),
-            f"not state-free: {', '.join(f'{each} ({script})' for each, script in odd.items())}; therefore refused by"
-            f" {', '.join(trial['refused_by']) or 'nothing'}"
+            "; ".join(
+                f"the command of {each} exceeds its capacity in {_share(len(rows), n)}" for each, rows in beyond.items()
+            ),
+            f"scripts that depend on the state: {', '.join(f'{each} ({script})' for each, script in odd.items())};"
+            f" not accepted by: {', '.join(trial['refused_by']) or 'none'}"
             if odd
             else "",
         )
@@ -104,16 +106,16 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
         if beyond:
             (vehicle, rows), *_ = beyond.items()
             raise InvalidInput(
-                f"scenario {scenario.name!r}: roles.{vehicle} = {scenario.roles[vehicle]}: asks for more than its"
-                f" vehicle can in {_share(len(rows), n)}; {next(iter(rows.values()))}"
+                f"scenario {scenario.name!r}: roles.{vehicle} = {scenario.roles[vehicle]}: the command exceeds the"
+                f" vehicle's capacity in {_share(len(rows), n)}; {next(iter(rows.values()))}"
             )
 
 
 def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tuple[list[str], str, dict[str, Any]]:
-    """Return three descriptions of the quantities of the worlds in ``sample``: (lines, text, columns).
+    """Return three descriptions of the quantities in the worlds of ``sample``: (lines, text, columns).
 
-    ``lines`` are a table with the range of each varying quantity; ``text`` lists the fixed ones. ``columns`` is for
-    JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
+    ``lines`` is a table with the range of each varying quantity, and ``text`` lists the fixed quantities. ``columns``
+    is for JSON: ``{"gap_1_m": {"least": 5.0, "median": 7.0, "largest": 9.0}}``.
     """
     import numpy as np
 
@@ -141,7 +143,7 @@ def _drawn_lines(scenario: scenarios.Scenario, sample: scenarios.Sample) -> tupl
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
-    """Return the text as at most ``most`` lines of ``width`` characters; what does not fit becomes ``...``."""
+    """Return the text as at most ``most`` lines of ``width`` characters; the rest is replaced by ``...``."""
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
@@ -153,7 +155,8 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
     """Describe a scenario in plain sentences.
 
-    The sentences describe the line, how each quantity is drawn, who knows what when, and whose harm counts.
+    The sentences describe the line of vehicles, the distribution of each quantity, what each vehicle knows and when,
+    and whose harm counts.
     """
     with Out(as_json=as_json) as out:
         chosen = evaluation.load_runnable(scenario)
@@ -165,44 +168,54 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
 
 def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
-    """Yield a sentence about each part of the scenario; an empty text if there is nothing to say about a part."""
+    """Yield sentences that describe the scenario, one per aspect; an empty text for an aspect without a description."""
     from ethbrake_marl.agents.making import find_entry
     from ethbrake_marl.game.objectives import OBJECTIVES
 
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners) or "nobody"
     yield (
-        f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {_obstacle_in_words(scenario)}. Learning:"
+        f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {_obstacle_in_words(scenario)}. Learners:"
         f" {learners}."
     )
     for script in dict.fromkeys(scenario.scripts.values()):
         who = ", ".join(name for name, role in scenario.roles.items() if role == script)
-        yield f"By script {script} ({find_entry(script).about}): {who}."
+        yield f"Script {script} ({find_entry(script).about}): {who}."
     if scenario.mixture is not None:
         members = ", ".join(f"{each.scenario['name']} ({each.weight:g})" for each in scenario.mixture)
-        yield f"Each world is drawn from one of these scenarios, by weight: {members}. All of them together:"
+        yield (
+            f"Each world is drawn from one of these scenarios (weights in brackets): {members}. The following ranges"
+            " cover all of them."
+        )
     if scenario.table is not None:
         rows, columns = len(scenario.table.rows or ()), ", ".join(scenario.table.columns)
-        column, of = scenario.recordings, ""
-        if column is not None:
-            of = f" of {len({*scenarios.recording_of(column.rows).tolist()}):,} recordings, by which intervals are"
-        yield f"Each world takes one of {rows:,} rows of a table{of}: {columns}."
+        yield f"Each world takes one of the {rows:,} rows of a table with the columns {columns}."
+        if scenario.recordings is not None:
+            recordings = {*scenarios.recording_of(scenario.recordings.rows).tolist()}
+            yield (
+                f"The rows come from {len(recordings):,} recordings; confidence intervals treat worlds of one recording"
+                " as dependent."
+            )
     for name, kind in (scenario.vehicle_types or {}).items():
         own = {scenarios.QUANTITY.declared[key].label: getattr(kind, key) for key in scenarios.QUANTITY.of_a_type}
         text = "; ".join(f"{label} {_in_words(each)}" for label, each in own.items() if each is not None)
         text += f"; V2X {flow_text(kind.v2x)}" if kind.v2x is not None else ""
-        text = text.removeprefix("; ") or "as beside the types"
-        yield f"Type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {text}."
-    yield f"Types along the line: {flow_text(scenario.types or 'any')}." if scenario.vehicle_types else ""
+        text = text.removeprefix("; ") or "quantities as declared for all types"
+        yield f"Vehicle type {name}, weight {kind.weight:g}, load {_in_words(kind.load)}: {text}."
+    yield (
+        f"Possible vehicle types, front to rear: {flow_text(scenario.types or 'any')}."
+        if scenario.vehicle_types
+        else ""
+    )
     for key, rule in scenarios.QUANTITY.declared.items():
         text = _declared_in_words(scenario, key)
         yield f"{rule.label[0].upper()}{rule.label[1:]}: {text}; {rule.meaning}." if text else ""
     common = scenario.model_fields_set if scenario.members else type(scenario).model_fields  # same for all members
-    yield _news_in_words(scenario) if "v2x" in common else "Who knows what when (V2X) differs between these scenarios."
-    early = "stays in the list" if scenario.early_impacts == "keep" else f"is drawn again{_refused(scenario)}"
+    yield _news_in_words(scenario) if "v2x" in common else "The V2X channel differs between these scenarios."
+    early = "is kept" if scenario.early_impacts == "keep" else f"is rejected and drawn again{_refused(scenario)}"
     yield (
-        f"A decision every {scenario.time_step_s:g} s; an episode is cut off after {scenario.horizon_s:g} s."
-        + (f" A world with an impact before a learner may act {early}." if "early_impacts" in common else "")
+        f"Vehicles decide every {scenario.time_step_s:g} s; an episode is truncated after {scenario.horizon_s:g} s."
+        + (f" A world with an impact before a learner can act {early}." if "early_impacts" in common else "")
     )
     objectives = dict.fromkeys([scenario.objective] if isinstance(scenario.objective, str) else scenario.objective)
     aims = ", ".join(f"{each} ({OBJECTIVES[each.partition(':')[0]].about})" for each in objectives)
@@ -210,9 +223,10 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 
 
 def _refused(scenario: scenarios.Scenario, sample: scenarios.Sample | None = None) -> str:
-    """Return how many draws of a table's rows were refused for an early impact: ``: 3 of 203 draws (1.5 %)``.
+    """Return how many draws were rejected for an early impact, as a text ``: 3 of 203 draws (1.5 %)``.
 
-    ``sample``: the worlds; None: draw 200. Empty for a scenario without a table, whose rows could be misrepresented.
+    The text is empty for a scenario without a table. With a table it matters, because rejections change how often each
+    row occurs. ``sample``: worlds to count in; None: draw 200 worlds.
     """
     if all(each.table is None for each in scenario.members or (scenario,)):
         return ""
@@ -226,7 +240,7 @@ def _obstacle_in_words(scenario: scenarios.Scenario) -> str:
 
 
 def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
-    """Describe how the quantity ``key`` is drawn; empty if the scenario does not declare it."""
+    """Return a description of how the quantity ``key`` is drawn; empty if the scenario does not declare it."""
     if scenario.members:
         is_common = key in scenarios.QUANTITY.usual or (
             key == "friction" and all(each.declares(key) for each in scenario.members)
@@ -243,7 +257,7 @@ def _declared_in_words(scenario: scenarios.Scenario, key: str) -> str:
 
 
 def _in_words(quantity: Any) -> str:
-    """Describe ``quantity``, a number or a distribution of a scenario, in words: ``5 to 9 (uniform)``."""
+    """Return a description of ``quantity``, a number or distribution of a scenario: ``5 to 9 (uniform)``."""
     if isinstance(quantity, float):
         return f"{quantity:g}"
     (kind, shape), *more = quantity.model_dump(exclude_none=True).items()
@@ -254,27 +268,27 @@ def _in_words(quantity: Any) -> str:
 
 
 def _news_in_words(scenario: scenarios.Scenario) -> str:
-    """Return a sentence about the scenario's V2X channel: which vehicle knows what, and when."""
+    """Return a sentence about the scenario's V2X channel: what each vehicle knows, and when."""
     channel, about = scenario.v2x.channel._asdict(), type(scenario.v2x).model_fields
     usual = scenarios.CHANNELS["paper"]._asdict()
     other = {key: value for key, value in channel.items() if key in about and value != usual[key]}
     text = "; ".join(f"{key} {flow_text(value)} ({about[key].description})" for key, value in other.items())
     text += f"; {flow_text(scenario.v2x.vehicles)}" if scenario.v2x.vehicles else ""
-    return f"V2X preset {scenario.v2x.preset}: {text or 'from its latency on each vehicle knows the whole line'}."
+    return f"V2X preset {scenario.v2x.preset}: {text or 'each vehicle knows the whole line from its own latency on'}."
 
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
 def scenario_new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new scenario and file.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new scenario and of its file.")],
     based_on: Annotated[
-        str, typer.Option(metavar="NAME|PATH", help="Scenario whose values to start from.")
+        str, typer.Option(metavar="NAME|PATH", help="Scenario whose values the new one gets.")
     ] = "paper-random",
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
-    """Write a commented NAME.yaml with every key.
+    """Write a new scenario file, NAME.yaml, with comments.
 
-    If the scenario has a table, its rows go to NAME.csv beside it.
+    The file has every key. If the scenario has a table, its rows are written to NAME.csv in the same folder.
     """
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
@@ -284,15 +298,15 @@ def scenario_new(
         if table is not None:
             out.write(rows, scenarios.rows_text(table), what="rows")
         out.write(file, text)
-        out.note(f"written: {file}; change it, then: ethbrake scenario validate {file}")
+        out.note(f"written: {file}; change the file, then run: ethbrake scenario validate {file}")
 
 
 @scenario_group.command("parts", epilog=example("scenario parts"))
 def scenario_parts(as_json: JsonOption = False) -> None:
-    """List the names that scenarios and recipes may use.
+    """List the names that scenarios and recipes can use.
 
-    These are features of observations, V2X presets, objectives, training algorithms, recipes and measures. A reward
-    is a weighted sum of measures.
+    Lists features of observations, V2X presets, objectives, training algorithms, recipes, and measures. A reward is a
+    weighted sum of measures.
     """
     from ethbrake_marl.game.features import FEATURES
     from ethbrake_marl.game.measures import MEASURES
@@ -318,7 +332,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
 def scenario_schema() -> None:
     """Print the JSON Schema of scenario files.
 
-    Editors use it to complete and check YAML.
+    Editors use this schema to complete and check YAML files.
     """
     with Out() as out:
         out.print_json(scenarios.scenario_json_schema())
@@ -337,15 +351,16 @@ def scenario_sample(
     seed: SeedOption = 7,
     settings: SettingsOption = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write .csv, .png, .svg or .pdf.", show_default="stdout")
+        Path | None,
+        typer.Option(metavar="FILE", help="File for the worlds: .csv, .png, .svg or .pdf.", show_default="stdout"),
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw worlds of a list, as a table or a picture.
+    """Draw worlds, and show them as a table or picture.
 
-    The table has a column for each quantity that the scenario does not fix; `eb.read_worlds` reads it. The
-    picture shows distributions, pairs of quantities, and three worlds. The same list, seed and number give the same
+    The table has a column for each quantity that is not fixed in the scenario; `eb.read_worlds` reads such a table. The
+    picture shows distributions, pairs of quantities, and three worlds. The same scenario, seed and number give the same
     worlds on every machine.
     """
     with Out(as_json=as_json, force=force) as out:
@@ -367,7 +382,7 @@ def scenario_sample(
         if output is None or out.as_json:
             out.result(states, *lines)
         if chosen.early_impacts == "reject" and (refused := _refused(chosen, sample)):
-            out.note(f"refused for an impact before a learner may act, and drawn again{refused}")
+            out.note(f"rejected and drawn again because of an impact before a learner can act{refused}")
 
 
 agent_group = typer.Typer(
@@ -378,9 +393,9 @@ agent_group = typer.Typer(
 
 @agent_group.command("list", epilog=example("agent list"))
 def agent_list(as_json: JsonOption = False) -> None:
-    """List all agents: how each is written, what it does, what it knows.
+    """List all agents, what they do and what they know.
 
-    Names with + go behind any agent, for instance full_brake+step: +search first, then one shield.
+    A name with + is appended to the name of an agent, for instance full_brake+step: first +search, then one shield.
     """
     with Out(as_json=as_json) as out:
         from ethbrake_marl.agents.protocol import Knowledge
@@ -397,23 +412,25 @@ def agent_list(as_json: JsonOption = False) -> None:
             out.note(f"left out: {reason}")
         out.result(
             content,
-            Sheet("", ("Agent", "Drives by", "Knows"), rows, gap=2),
-            "† omniscient: reads what no channel brought. With :estimated behind it, it decides on what was received.",
-            "ladder stands for coast to best_harm; a typo gets a suggestion. See docs/evaluate.md and docs/shield.md.",
+            Sheet("", ("Agent", "Method", "Knows"), rows, gap=2),
+            "† omniscient: the agent reads values that no message carried. With :estimated after its name, an agent"
+            " uses only what its vehicle has received.",
+            "ladder stands for all agents from coast to best_harm. See docs/evaluate.md and docs/shield.md.",
         )
 
 
 @agent_group.command("export", epilog=example("agent export runs/early --onnx early.onnx"))
 def agent_export(
     policy: Annotated[
-        str, typer.Argument(metavar="NAME|PATH", help="A shipped policy's name, a run, or a policy bundle.")
+        str, typer.Argument(metavar="NAME|PATH", help="Name of a shipped policy, or folder of a run or policy bundle.")
     ],
-    onnx: Annotated[Path, typer.Option(metavar="FILE", help="The ONNX model to write.")],
+    onnx: Annotated[Path, typer.Option(metavar="FILE", help="File for the ONNX model.")],
     force: ForceOption = False,
 ) -> None:
-    """Write a policy as an ONNX model: observation in, acceleration out.
+    """Write a policy as an ONNX model.
 
-    Needs the package onnx, which the extra `export` installs.
+    The input of the model is an observation, the output an acceleration. Needs the package onnx, which the extra
+    `export` installs.
     """
     with Out(force=force) as out:
         from ethbrake_marl.policies.shipped import load_named_policy

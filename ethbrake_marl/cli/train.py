@@ -1,4 +1,4 @@
-"""The commands that train: ``run`` and ``train``."""
+"""The commands ``run`` and ``train``, which train policies."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.progress import Progress
 
 REMAINS = (
-    "if the training had begun, the run's folder keeps the last good policy; ethbrake train --resume FOLDER goes on"
-    " with a training that has not finished"
+    "if the training had begun, the last good policy is in the run's folder; ethbrake train --resume FOLDER continues"
+    " an unfinished training"
 )
 
 RUNS = Path("runs")
 
-QUICKEST = ("quick", "ppo")  # what `ethbrake run` trains: the first whose algorithm is installed
+QUICKEST = ("quick", "ppo")  # `ethbrake run` trains the first of these recipes whose algorithm is installed
 
-QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # likewise with several learners
+QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
 
-TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="the recipe's")]
+TrainingSeedOption = Annotated[int | None, typer.Option(help="Seed of the training.", show_default="as in the recipe")]
 
 OutputOption = Annotated[
     Path | None, typer.Option(metavar="FOLDER", help="Folder of the run.", show_default="runs/SCENARIO-RECIPE-seedSEED")
@@ -44,7 +44,8 @@ OutputOption = Annotated[
 def run_folder(scenario: scenarios.Scenario, recipe: training.TrainingRecipe, seed: int | None) -> Path:
     """Return the default folder of a run: ``runs/SCENARIO-RECIPE-seedSEED``.
 
-    If the recipe names a scheme for several learners, it follows the recipe's name. ``seed`` None: the recipe's seed.
+    If the recipe has a scheme for several learners, the name is ``runs/SCENARIO-RECIPE-SCHEME-seedSEED``. ``seed``:
+    seed of the training; None: the recipe's seed.
     """
     plan = recipe.name if recipe.scheme is None else f"{recipe.name}-{recipe.scheme}"
     return RUNS / f"{scenario.name}-{plan}-seed{recipe.seed if seed is None else seed}"
@@ -54,15 +55,15 @@ def run_command(
     scenario: ScenarioOption = "paper-random",
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
-    episodes: Annotated[int, typer.Option(help="Worlds of the evaluation list.")] = 10_000,
+    episodes: Annotated[int, typer.Option(help="Number of worlds in the evaluation list.")] = 10_000,
     list_seed: Annotated[int, typer.Option(help="Seed of the evaluation list.")] = 7,
     recipe: Annotated[
         str | None,
         typer.Option(
             metavar="NAME|PATH",
-            help="A shipped recipe, or a path to a YAML file.",
-            show_default=f"{QUICKEST[0]}, of several learners {QUICKEST_TEAM[0]}; where no extension gives its"
-            f" algorithm, {QUICKEST[1]} or {QUICKEST_TEAM[1]}",
+            help="Name of a shipped recipe, or path of a YAML file.",
+            show_default=f"{QUICKEST[0]}, or {QUICKEST_TEAM[0]} for several learners; {QUICKEST[1]} or"
+            f" {QUICKEST_TEAM[1]} if their algorithm is not installed",
         ),
     ] = None,
     settings: SettingsOption = None,
@@ -70,12 +71,14 @@ def run_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train one learner or a team, shield it, compare, and report.
+    """Train a policy, shield it, compare it, and write a report.
 
-    Writes the run's folder: policies, results as CSV and JSON, a row for every world, three figures and report.html.
-    If the scenario is one of the three tests (paper-random, -brake-only, -obstacle), the other two are evaluated too.
-    For a team, the report also shows who bears what, and what each learner and the messages add; this takes further
-    trainings. Ctrl-C ends the training early and evaluates the policy so far; a second Ctrl-C stops at once.
+    Trains a single learner or a team. Writes a run's folder with policies, results as CSV and JSON, results per
+    world, three figures and report.html. If the scenario is one of the three tests (paper-random, paper-random-
+    brake-only, paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also
+    shows the harm that each vehicle bears, and the effect of each learner and of the messages, for which further
+    policies are trained. Ctrl-C ends the training early and evaluates the policy so far; a second Ctrl-C stops at
+    once.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
@@ -107,19 +110,19 @@ def run_command(
         what = "policy" if len(chosen.learners) == 1 else f"team (scheme {trained.training.scheme})"
         headline = (
             f"Trained by recipe {plan.name}, seed {plan.seed if seed is None else seed}: {trained.steps:,} decisions in"
-            f" {trained.wall_s:.0f} s ({trained.status}). hybrid is the trained {what} behind its shield. All minimise"
-            f" {count} harm{f', but what is trained minimises {own}' if own else ''}.\n"
+            f" {trained.wall_s:.0f} s ({trained.status}). hybrid: the trained {what} behind its shield. All agents"
+            f" minimise {count} harm{f', except that the trained {what} minimises {own}' if own else ''}.\n"
         )
         out.result(result.results, Text(headline), *result.tables)
         for note in result.notes:
             out.note(note)
         if result.interrupted:
-            out.interrupted(f"interrupted: {result.interrupted}; the report is without it: {trained.directory}")
+            out.interrupted(f"interrupted: {result.interrupted}; the report does not include it: {trained.directory}")
         _end(out, trained)
 
 
 def quickest(*, several: bool = False) -> str:
-    """Return the name of the recipe that `ethbrake run` trains by default; ``several``: with several learners."""
+    """Return the name of the recipe that `ethbrake run` trains by default. ``several``: for several learners."""
     usable = training.TrainingRecipe.usable()
     return next(name for name in (QUICKEST_TEAM if several else QUICKEST) if name in usable)
 
@@ -129,25 +132,26 @@ def train_command(
         str | None,
         typer.Option(
             metavar="NAME|PATH",
-            help="A shipped or registered scenario, or a path to a YAML file.",
+            help="Name of a shipped or registered scenario, or path of a YAML file.",
             show_default="paper-random",
         ),
     ] = None,
     recipe: Annotated[
         str | None,
-        typer.Option(metavar="NAME|PATH", help="A shipped recipe, or a path to a YAML file.", show_default="ppo"),
+        typer.Option(metavar="NAME|PATH", help="Name of a shipped recipe, or path of a YAML file.", show_default="ppo"),
     ] = None,
     settings: SettingsOption = None,
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
     output: OutputOption = None,
     resume: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Go on with the training of this run's folder instead.")
+        Path | None, typer.Option(metavar="FOLDER", help="Continue the training in this run's folder.")
     ] = None,
     other_versions: Annotated[
         bool,
         typer.Option(
-            "--other-versions", help="With --resume: go on although other versions trained it; numbers may differ."
+            "--other-versions",
+            help="With --resume: continue even if the run used other package versions; numbers may differ.",
         ),
     ] = False,
     schema: schema_option("ethbrake_marl.training", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # built by a function
@@ -156,9 +160,10 @@ def train_command(
 ) -> None:
     """Train a policy, or the policies of several learners.
 
-    Writes a run's folder, and ends with the harm of the trained agent beside full braking, the agent's name and the
-    command that evaluates it. Ctrl-C ends the training after the current update and keeps the policy;
-    `ethbrake train --resume FOLDER` continues: the final policy is the same, bit for bit, as without the stop.
+    Writes a run's folder. At the end it prints the harm of the trained agent and of full braking, the agent's name, and
+    a command that evaluates the agent. Ctrl-C ends the training after the current update and saves the policy.
+    `ethbrake train --resume FOLDER` continues the training; the final policy is then the same, bit for bit, as without
+    the interruption.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         if resume is not None:
@@ -172,11 +177,14 @@ def train_command(
             for option in (
                 name for name, value in {**asked, "--seed": seed, "--force": force or None}.items() if value is not None
             ):
-                raise InvalidInput(f"{option}: --resume goes on with what the folder says; leave one of the two out")
+                raise InvalidInput(
+                    f"{option}: cannot be combined with --resume, which uses the settings in the run's folder; leave"
+                    " one of the two options out"
+                )
             _show(out, training.resume(resume, on_progress=out.show_progress, other_versions=other_versions))
             return
         if other_versions:
-            raise InvalidInput("--other-versions: a new training has the versions of now; give it with --resume FOLDER")
+            raise InvalidInput("--other-versions: has no effect on a new training; use it only with --resume FOLDER")
         plan = training.load_recipe(recipe or "ppo")
         changes = training.read_settings(settings, [plan])
         chosen = evaluation.load_runnable(scenario or "paper-random", changes.scenario)
@@ -184,7 +192,7 @@ def train_command(
         begun = [training.Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
-            if begun:  # all input has been checked by now
+            if begun:  # at the first progress report all input has been checked
                 out.note(begun.pop())
             out.show_progress(progress)
 
@@ -196,9 +204,9 @@ def train_command(
 
 
 def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -> None:
-    """Print the result of a training on stdout, beside full braking, and how it ended on stderr.
+    """Print the harm of the trained agent and of full braking on stdout, and how the training ended on stderr.
 
-    ``scenario``: name or path from the command line; None: the name of the training's scenario.
+    ``scenario``: name or path of the scenario from the command line; None: the name of the training's scenario.
     """
     from ethbrake_marl.training.fixed_list import measure_full_braking
     from ethbrake_marl.training.progress import objective_in_words
@@ -215,8 +223,8 @@ def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -
     measured = {"full_brake": measure_full_braking(result.training), result.agent: result.metrics or {}}
     rows = [(agent, *(metrics.get(each.name) for each in columns[1:])) for agent, metrics in measured.items()]
     note = (
-        f"Means per world; harm in m²/s². These are the {plan.evaluation.worlds:,} worlds of seed"
-        f" {plan.evaluation.seed}, on which the training chose its policy."
+        f"Means per world; harm in m²/s². The means are over the {plan.evaluation.worlds:,} worlds of seed"
+        f" {plan.evaluation.seed} with which the training selected its policy."
     )
     table = Sheet("", columns, rows, note)
     settings = [
@@ -246,8 +254,8 @@ def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -
 
 
 def _end(out: Out, result: training.TrainResult) -> None:
-    """Print how the training of ``result`` ended and where it is; if it was interrupted, exit with status 130."""
+    """Print how the training ended, and the folder of the run; if it was interrupted, exit with status 130."""
     if result.status == "interrupted":
-        left = f"go on with: ethbrake train --resume {result.directory} (its policy is there)"
+        left = f"the policy so far is saved; continue with: ethbrake train --resume {result.directory}"
         out.interrupted(f"interrupted after {result.steps:,} training steps; {left}")
     out.note(f"{result.status} after {result.steps:,} training steps: {result.directory}")

@@ -1,7 +1,7 @@
 """The engine's compiled step: actions to commands, motion, ends of episodes, and the reward that vehicles share.
 
 Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
-``clock`` [n, 4] holds the time of the first decision, the numbers of steps, and whether the episode has ended.
+``clock`` [n, 4] contains the time of the first decision, the numbers of steps, and whether the episode has ended.
 """
 
 from __future__ import annotations
@@ -76,12 +76,12 @@ class Step(NamedTuple):
 
     @property
     def ended(self) -> Bools:
-        """Whether this step ended the episode, for either reason, [n]."""
+        """Whether this step terminated or truncated the episode, [n]."""
         return self.terminated | self.truncated
 
     @property
     def failed(self) -> Ints:
-        """Status code of the physics for each world that could not be advanced, 0 for the others, [n]."""
+        """Status code of the physics for each world that could not be advanced, 0 for all other worlds, [n]."""
         return np.asarray(self.outcome[FAILED], np.int64)
 
     @property
@@ -91,12 +91,12 @@ class Step(NamedTuple):
 
     @property
     def first_impact_harm(self) -> Floats:
-        """Harm that the step added to the whole line, counting each pair's first impact only, [n] m2/s2."""
+        """First-impact harm that the step added to the whole line, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_FIRST_HARM], np.float64)
 
     @property
     def total_harm(self) -> Floats:
-        """Harm that the step added to the whole line, counting every impact, [n] m2/s2."""
+        """Total harm that the step added to the whole line, [n] m2/s2."""
         return np.asarray(self.outcome[STEP_TOTAL_HARM], np.float64)
 
     @property
@@ -111,7 +111,7 @@ class Step(NamedTuple):
 
     @property
     def counted_harm(self) -> Floats:
-        """Harm that the step added to the whole line, counting the impacts that the reward counts, [n] m2/s2."""
+        """Harm that the step added to the whole line: first-impact or total harm, as the reward counts, [n] m2/s2."""
         return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
@@ -120,10 +120,11 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Add to the ``table`` of world ``k`` what is needed only if brakes take time to build up.
+    """Write quantities that matter only if brakes take time to build up into the ``table`` of world ``k``.
 
-    These are accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the braking
-    profiles ``pieces`` [N, 2 K]. A separate function, because it would slow down the loop for worlds without build-up.
+    The quantities are accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the
+    braking profiles ``pieces`` [N, 2 K]. This is a separate function, because its code would slow down the loop for
+    worlds without build-up.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -140,25 +141,25 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
 ) -> tuple[int, int]:  # fmt: skip
     """Advance every running world by one step.
 
-    An action outside [-1, 1] moves nothing. A world that cannot be advanced keeps its state; its episode is cut off
-    there, without a reward, and marked in ``outcome``.
+    If an action is outside [-1, 1], no world moves. A world that cannot be advanced keeps its state; its episode is
+    truncated with the reward 0, and ``outcome`` contains the failure.
 
     Args:
-        state: [n, S] motion and harm of the worlds, changed in place.
-        params: [n, K] parameters of the vehicles.
-        clock: [n, CLOCK_WIDTH] changed in place.
-        actions: [n, L] actions of the learners.
-        learners: [L] indices of the learners.
-        settings: [5] ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL``, ``TERMINAL_WEIGHT``.
+        state: motion and harm of the worlds, [n, S]; changed in place.
+        params: parameters of the vehicles, [n, K].
+        clock: times and numbers of steps, [n, CLOCK_WIDTH]; changed in place.
+        actions: actions of the learners, [n, L].
+        learners: indices of the learners, [L].
+        settings: ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL``, ``TERMINAL_WEIGHT``, [5].
         no_rows: ``NO_ROWS``, so that no single impact is recorded.
-        builds_up: must be True if brakes build up in any world, or if a script follows a profile.
-        pieces: [N, 2 K] braking profiles with K intervals of constant command; used only if ``builds_up``.
-        wanted: [n, N] commands, m/s2; the learners' are written.
-        reward: [n, N] written.
-        outcome: [OUTCOME_ROWS, n] written.
+        builds_up: True if brakes build up in some world, or if a script follows a profile.
+        pieces: braking profiles with K intervals of constant command, [N, 2 K]; used only if ``builds_up``.
+        wanted: commands, [n, N] m/s2; the learners' commands are written.
+        reward: result, reward of each vehicle, [n, N].
+        outcome: result, harm and end of the step in each world, [OUTCOME_ROWS, n].
 
-    Returns the row of a world and its error (``BAD_ACTION``, or the status of a world that could not be advanced), or
-    ``(-1, FLAG.DONE)``.
+    Returns ``(-1, FLAG.DONE)``, or the row of a world and its error: ``BAD_ACTION``, or the status of a world that
+    could not be advanced.
 
     """
     n, N = wanted.shape
@@ -258,7 +259,7 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
     return worst, worst_status
 
 
-NO_ROWS = np.empty((0, LISTED.WIDTH))  # an empty list of impacts, so that none are recorded
+NO_ROWS = np.empty((0, LISTED.WIDTH))  # an empty array of impacts, so that no impact is recorded
 
 
 class Rules(NamedTuple):
@@ -275,14 +276,14 @@ class Rules(NamedTuple):
         """Advance every running world by one step and return a status.
 
         Args:
-            worlds: rows of n worlds, changed in place.
-            clock: [n, CLOCK_WIDTH] changed in place.
-            actions: [n, L] actions of the learners in [-1, 1].
-            wanted: [n, N] commands, m/s2; the learners' are written.
-            reward: [n, N] written.
-            outcome: [OUTCOME_ROWS, n] written.
+            worlds: rows of n worlds; changed in place.
+            clock: times and numbers of steps, [n, CLOCK_WIDTH]; changed in place.
+            actions: actions of the learners in [-1, 1], [n, L].
+            wanted: commands, [n, N] m/s2; the learners' commands are written.
+            reward: result, reward of each vehicle, [n, N].
+            outcome: result, harm and end of the step in each world, [OUTCOME_ROWS, n].
 
-        The status is ``FLAG.DONE``, ``BAD_ACTION`` (nothing was moved), or the code of the failed check of some world.
+        The status is ``FLAG.DONE``, ``BAD_ACTION`` (no world was moved), or the code of a check that failed.
 
         """
         _, status = step_worlds(

@@ -1,4 +1,4 @@
-"""``Engine``: a batch of running episodes of one scenario. Every interface steps one."""
+"""``Engine``: a batch of running episodes of one scenario, on which all environments are built."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 class Watcher(Protocol):
     """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
 
-    The engine keeps the watcher's memory beside its state. Both change in one assignment, or, after an error or an
-    interrupt, neither does. So a watcher never changes its memory in place.
+    The engine stores the watcher's memory together with its own state. State and memory change in a single assignment,
+    so neither has changed after an error or an interrupt. A watcher must therefore never change its memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """Return the watcher's memory after episodes have started in the rows with the indices ``rows``.
 
-        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is the watcher's memory before.
+        ``alert``: the worlds of these rows only, at t = 0. ``memory``: the watcher's previous memory.
         """
 
     def stepped(self, memory: Any, before: Engine, after: Engine) -> Any:
-        """Return the watcher's memory after a step, given its ``memory`` before.
+        """Return the watcher's memory after a step; ``memory`` is its memory before the step.
 
         ``before`` and ``after`` are the engine before and after the step.
         """
@@ -72,7 +72,7 @@ class Ruling(NamedTuple):
 
     proposed: Floats  # [n, L] actions that the learners proposed; NaN: none, or not a number
     applied: Floats  # [n, L] actions to apply, in [-1, 1]
-    stepped_in: Bools  # [n] whether the guard replaced an action, or chose E-V2X-BM (mode ``episode``)
+    stepped_in: Bools  # [n] whether the guard replaced an action, or chose E-V2X-BM (in the mode ``episode``)
     asked: Bools  # [n] whether the guard decided in this world; False for ended episodes
     decision: Any  # further details, in the guard's own format
     memory: Any  # the guard's memory after the step
@@ -81,16 +81,16 @@ class Ruling(NamedTuple):
 class Guard(Protocol):
     """A shield inside an engine: it replaces proposed actions by the actions that are applied.
 
-    The engine calls it inside ``Engine.step``, so no action bypasses it. The engine keeps the guard's memory beside its
-    state. State, memory and ruling change in one assignment, or, after an error or an interrupt, none of them does. So
-    a guard never changes its memory in place.
+    The engine calls the guard inside ``Engine.step``, so no action bypasses the guard. The engine stores the guard's
+    memory together with its own state. State, memory and ruling change in a single assignment, so none of them has
+    changed after an error or an interrupt. A guard must therefore never change its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
         """Return the guard's memory after episodes have started in the rows with the indices ``rows``.
 
-        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is the memory before, None before the first
-        episode.
+        ``alert``: the worlds of these rows only, at t = 0. ``memory``: the guard's previous memory; None before the
+        first episode.
         """
 
     def decide(self, running: Engine, memory: Any, proposed: Floats) -> Ruling:
@@ -99,25 +99,25 @@ class Guard(Protocol):
         Args:
             running: the engine before the step.
             memory: the guard's memory.
-            proposed: [n, L] actions of the learners; a column of NaN means that this learner proposed none.
+            proposed: actions of the learners, [n, L]; a column of NaN means that this learner proposed no action.
 
         """
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
         """Return the memory to keep after the step, or raise ``UncertifiedStep`` to undo the step.
 
-        ``ruling`` is the guard's own answer before the step, ``after`` the engine after it.
+        ``ruling``: the guard's answer before the step. ``after``: the engine after the step.
         """
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
-        """Return the guard's infos about the last step: name -> values [n, N].
+        """Return the guard's information about the last step, for ``info``: dictionary name -> values, [n, N].
 
-        Before the first step of an episode, they are about the alert. ``running`` is the engine.
+        Before the first step of an episode, the information is about the alert. ``running`` is the engine.
         """
 
 
 class Now(NamedTuple):
-    """Everything that a reset or a step of an engine changes; replaced in one assignment."""
+    """Everything that a reset or a step of an engine changes; a single assignment replaces all of it."""
 
     state: State  # the running episodes
     roster: Roster  # the world that runs in each row, and the worlds that could not be advanced
@@ -126,11 +126,11 @@ class Now(NamedTuple):
     by_link: bool  # whether the rows have columns for messages over links between vehicles
     rules: Rules  # settings of every step
     watched: dict[Watcher, Any]  # watcher -> its memory
-    ruling: Ruling | None = None  # the guard's answer in the last step; None without one
+    ruling: Ruling | None = None  # the guard's answer in the last step; None without a guard
     stops: tuple[Stop, ...] = ()  # decisions of scripts within the last step, see ``own_grid``
 
     def apart(self) -> Now:
-        """Return a copy whose arrays can be changed without changing these."""
+        """Return a copy whose arrays can be changed without changing the arrays of this object."""
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
@@ -145,23 +145,25 @@ class Now(NamedTuple):
 class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
-    A step goes from one decision of the ``deciders`` to the next; the first begins when the first decider may act. With
-    a ``guard`` (a shield), the applied actions may differ from the proposed ones. If the physics cannot advance a
-    world, its episode is truncated and the ``roster`` names it; the other worlds go on.
+    A step goes from one decision of the ``deciders`` to the next. The first step begins when the first decider may act.
+    With a ``guard`` (a shield), the applied actions may differ from the proposed actions. If the physics cannot advance
+    a world, its episode is truncated and the ``roster`` lists the world; the other worlds continue.
 
     Args:
         scenario: the scenario of all episodes, or another ``Game``.
         n: number of worlds that are advanced together, at least 1.
         learners: indices of the vehicles (0 = front) that need an action in every step.
-        scripts: index of every vehicle that does not learn -> its script.
+        scripts: dictionary from the index of every vehicle that does not learn to the vehicle's script.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what the vehicles observe: one for all, or vehicle name -> observation; None: as the scenario says.
-        seed: seed of the training stream, which provides the worlds unless ``worlds`` does.
-        deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. An evaluation has no
-            learner: there a script is the decider.
-        worlds: worlds of the first episodes, at t = 0; None: the first ones of the training stream.
-        guard: function that makes the guard of this engine; None: proposed actions are applied.
-        reward_vector: components of a vector reward beside the reward (``game.reward_vector``); None: there is none.
+        observation: observation of all vehicles, or a dictionary vehicle name -> observation; None: the observation of
+            the scenario.
+        seed: seed of the training stream, from which the worlds come if ``worlds`` is None.
+        deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. In an evaluation, which
+            has no learners, the evaluated agents are the deciders.
+        worlds: worlds of the first episodes, at t = 0; None: the first worlds of the training stream.
+        guard: function that makes the guard of this engine; None: proposed actions are applied unchanged.
+        reward_vector: components of a vector reward in addition to the reward (``game.reward_vector``); None: no vector
+            reward.
 
     >>> import ethbrake_marl as eb
     >>> engine = eb.make_engine("paper-random", 4, seed=7)
@@ -186,21 +188,23 @@ class Engine:
         reward_vector: RewardVector | None = None,
     ) -> None:
         if not n >= 1:
-            raise InvalidInput(f"engine: n = {n} worlds; at least 1 is needed")
+            raise InvalidInput(f"engine: n = {n}: must be at least 1 world")
         self.scenario, self.n = scenario, n
         self.learners = tuple(learners)
         self.scripts = dict(scripts)
         unassigned = set(range(scenario.vehicles)) - set(self.learners) - set(self.scripts)
         if unassigned or set(self.learners) & set(self.scripts):
             raise InvalidInput(
-                f"engine: learners {self.learners} and scripts {tuple(self.scripts)} must name each of the"
+                f"engine: learners {self.learners} and scripts {tuple(self.scripts)} must together contain each of the"
                 f" {scenario.vehicles} vehicles exactly once"
             )
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
-            raise InvalidInput(f"engine: deciders {self.deciders} must be from 0 to {scenario.vehicles - 1}")
+            raise InvalidInput(
+                f"engine: deciders = {self.deciders}: must be vehicle indices from 0 to {scenario.vehicles - 1}"
+            )
         self._terms = Terms(reward, scenario, self.learners or self.deciders, reward_vector)
-        self.reward, self.components = self._terms.params, self._terms.components  # names of a vector reward's
+        self.reward, self.components = self._terms.params, self._terms.components  # components of the vector reward
         self.observations = observations_of(scenario, observation)  # of each vehicle
         self._plans = tuple(each.plan for each in self.observations)
         self._alike = len(set(self.observations)) == 1
@@ -210,7 +214,7 @@ class Engine:
         self._learner_index = np.array(self.learners, np.int64)
         total = float(self.reward.harm_count == "total")
         self._settings = np.array([*times, self._terms.shared_harm, total, self.reward.terminal])
-        self.reward_terms = self.reward.counted  # names of those whose values each step tells
+        self.reward_terms = self.reward.counted  # names of the terms that each step reports
         self.check_time_step(self.scripts)
         self.guard: Guard | None = None if guard is None else guard(self)
         stream = Stream(scenario, self.deciders, self.scripts, seed)
@@ -219,7 +223,7 @@ class Engine:
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
         """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario's.
 
-        ``drivers`` maps vehicle indices to agents or scripts; those without an attribute ``time_step_s`` fit every
+        ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` fits every
         scenario.
         """
         for script in drivers.values():
@@ -227,11 +231,12 @@ class Engine:
             if step not in (None, here):
                 raise InvalidInput(
                     f"agent {getattr(script, 'name', type(script).__name__)!r} was made for decisions every {step:g} s;"
-                    f" scenario {self.scenario.name!r} has one every {here:g} s: make_agent(..., scenario=...) knows"
+                    f" scenario {self.scenario.name!r} has a decision every {here:g} s; make the agent for this"
+                    " scenario with make_agent(..., scenario=...)"
                 )
 
     def reset(self, *, seed: int | None = None, worlds: Worlds | None = None) -> None:
-        """Start new episodes in all rows. If anything fails, the running episodes go on.
+        """Start new episodes in all rows. If this fails, the running episodes continue.
 
         Args:
             seed: restart the training stream from the first world of this seed; None: continue in the stream.
@@ -244,9 +249,9 @@ class Engine:
         self._now = self._started(stream, self._now.state.guarded, worlds, self._now.watched)
 
     def _started(self, stream: Stream, guarded: Any, worlds: Worlds | None, watched: dict[Watcher, Any]) -> Now:
-        """Return new episodes in all rows, in ``worlds`` (at t = 0) or, if None, in the next worlds of ``stream``.
+        """Return new episodes in all rows, from ``worlds`` (at t = 0) or, if None, from the next worlds of ``stream``.
 
-        ``guarded`` and ``watched`` are the memories of the guard and the watchers so far.
+        ``guarded`` and ``watched`` are the previous memories of the guard and the watchers.
         """
         if worlds is not None:
             check_alert(worlds, self.n, self.scenario.vehicles)
@@ -267,8 +272,9 @@ class Engine:
     def _begin(self, rows: Ints, start: Start) -> None:
         """Start episodes in the rows with the indices ``rows``, in place.
 
-        ``start`` holds their worlds at the alert and at the first decision. Scripts, guard and watchers get their first
-        memory. Messages that arrive before the first step are delivered, and scripts that decide before it do so.
+        ``start`` contains their worlds at the alert and at the first decision. Scripts, guard and watchers get their
+        first memory. Messages that arrive before the first step are delivered, and scripts that decide before the first
+        step are asked.
         """
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
@@ -306,9 +312,10 @@ class Engine:
     def step(self, actions: Actions) -> Step:
         """Advance every running episode by one time step and return the results.
 
-        ``actions`` are numbers in [-1, 1] for each learner: an array [n, L] with columns in the order of ``learners``,
-        or a mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. An episode that has
-        ended does not move until ``renew`` or ``reset``. If the guard refuses the step, nothing changes.
+        ``actions`` contains a number in [-1, 1] for each learner: an array [n, L] with columns in the order of
+        ``learners``, or a mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. An
+        episode that has ended does not move until ``renew`` or ``reset``. If the guard raises ``UncertifiedStep``,
+        nothing changes.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -328,13 +335,13 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """Whether a step cannot fail. Then the arrays are changed in place, which is faster."""
+        """Whether a step cannot fail, so that the arrays can be changed in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
         """Return the learners' actions as an array [n, L], from an array or a mapping as in ``step``.
 
-        Their range is checked later.
+        The range of the actions is checked later.
         """
         shape = (self.n, len(self.learners))
         if type(actions) is np.ndarray and actions.shape == shape and actions.dtype.kind in "fiu":
@@ -344,7 +351,8 @@ class Engine:
         for vehicle in actions:
             if vehicle not in self.learners:
                 raise InvalidInput(
-                    f"step: an action for vehicle index {vehicle!r}; the learners have the indices {self.learners}"
+                    f"step: vehicle index {vehicle!r} has an action but does not learn; the learners have the indices"
+                    f" {self.learners}"
                 )
         columns = np.empty(shape)
         for c, vehicle in enumerate(self.learners):
@@ -352,14 +360,14 @@ class Engine:
                 columns[:, c] = np.nan
                 continue
             if vehicle not in actions:
-                raise InvalidInput(f"step: no action for the learner vehicle_{vehicle + 1}")
+                raise InvalidInput(f"step: the action of the learner vehicle_{vehicle + 1} is missing")
             columns[:, c] = checked_action(actions[vehicle], (self.n,), f"vehicle_{vehicle + 1}")
         return columns
 
     def _in_range(self, columns: Floats) -> Floats:
-        """Return the actions ``columns`` [n, L], with values up to a rounding error of float32 outside [-1, 1] clipped.
+        """Return the actions ``columns`` [n, L], clipped to [-1, 1] where they exceed it by a float32 rounding error.
 
-        Raises ``InvalidInput`` for other values outside [-1, 1].
+        Raises ``InvalidInput`` for values farther outside [-1, 1].
         """
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
         return np.stack(each, axis=1) if each else columns
@@ -371,7 +379,7 @@ class Engine:
         """
         assert self.guard is not None
         if before.guarded is None:
-            raise UncertifiedStep("shield: this episode began before the shield was put around it; reset first")
+            raise UncertifiedStep("shield: this episode began before the shield was added; call reset first")
         return self.guard.decide(before, before.guarded, columns if checked else self._in_range(columns))
 
     def _advance(self, columns: Floats) -> Step:
@@ -394,7 +402,7 @@ class Engine:
     def _ask_scripts(self) -> dict[int, Memory]:
         """Ask the scripts with a memory whose vehicles decide at every step; return vehicle index -> new memory.
 
-        Their commands are written to ``state.wanted``.
+        The commands of these scripts are written to ``state.wanted``.
         """
         asked: dict[int, Memory] = {}
         own_grid = self._own_grid.scripts
@@ -432,7 +440,7 @@ class Engine:
     def _drive_own_grid(self, columns: Floats) -> Way:
         """Move the worlds to the last decision that a script makes within the step; return this part of the step.
 
-        Such scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
+        These scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
         learners' actions.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
@@ -446,7 +454,7 @@ class Engine:
         Args:
             step: the step just made; changed in place.
             harm_before: harm before the step; None if the reward counts the harm of the whole line.
-            start: the worlds before the step; None unless the reward has a measure of single impacts.
+            start: the worlds before the step; None if the reward has no measure of single impacts.
 
         """
         impacts = self.state.impacts
@@ -464,7 +472,9 @@ class Engine:
     def observe(self, vehicle: int) -> Observations:
         """Return the current observation of the vehicle with this index (0 = front) in each world, [n, F]."""
         if not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.scenario.vehicles:
-            raise InvalidInput(f"observe: vehicle index {vehicle!r}; must be in 0..{self.scenario.vehicles - 1}")
+            raise InvalidInput(
+                f"observe: vehicle = {vehicle!r}: must be a vehicle index in 0..{self.scenario.vehicles - 1}"
+            )
         return self.observe_all(np.array([vehicle]))[:, 0]
 
     def observe_all(self, vehicles: Ints | None = None, rows: Ints | None = None) -> Observations:
@@ -472,7 +482,7 @@ class Engine:
 
         Args:
             vehicles: indices of the vehicles (0 = front); None: all learners.
-            rows: indices of the worlds to observe, in place of all n; None: all.
+            rows: indices of the worlds to observe; None: all n worlds.
 
         Raises ``InvalidInput`` if these vehicles observe different features.
 
@@ -480,7 +490,7 @@ class Engine:
         vehicles = self._learner_index if vehicles is None else vehicles
         if not self._alike and len({self.observations[i] for i in vehicles.tolist()}) > 1:
             names = ", ".join(self.scenario.vehicle_names[i] for i in vehicles.tolist())
-            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each")
+            raise InvalidInput(f"observe_all: {names} observe different features; use observe for each vehicle")
         state = self._now.state
         motion, params, clock = state.motion, state.params, state.clock
         plan: Plan = self._plans[0 if self._alike else int(vehicles[0])]
@@ -493,13 +503,12 @@ class Engine:
     def renew(self, rows: Ints) -> None:
         """Start the next episodes of the training stream in the rows with the indices ``rows``.
 
-        The other rows continue. If anything fails, nothing changes. Raises ``InvalidInput`` for a repeated or unknown
-        row.
+        The other rows continue. If this fails, nothing changes. Raises ``InvalidInput`` for a repeated or unknown row.
         """
         if len(rows) == 0:
             return
         if not 0 <= np.min(rows) <= np.max(rows) < self.n or np.bincount(rows).max() > 1:
-            raise InvalidInput(f"renew: rows {rows}; must be different numbers from 0 to {self.n - 1}")
+            raise InvalidInput(f"renew: rows = {rows}: must be different numbers from 0 to {self.n - 1}")
         new = self if self._nobody_refuses_episodes else self._at(self._now.apart())
         (state, roster, stream, *_), now = new._now, new._now
         position = stream.position
@@ -512,7 +521,7 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """Whether the start of an episode cannot fail. Then the arrays are changed in place, which is faster."""
+        """Whether the start of an episode cannot fail, so that the arrays can be changed in place, which is faster."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
@@ -524,10 +533,11 @@ class Engine:
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the parts of the last step: usually one, but a script that decides within the step begins a new one.
+        """Yield the parts of the last step: usually one part, but a script that decides within the step begins another.
 
-        Right after a reset, the parts lead from the alert to the first step. Each part is a tuple: the worlds at its
-        start, the commands that the vehicles followed [n, N] m/s2, and the time at its end [n] s.
+        Right after a reset, the parts lead from the alert to the first step. Each part is a tuple: the worlds at the
+        start of the part, the commands that the vehicles followed [n, N] m/s2, and the time at the end of the part [n]
+        s.
 
         Args:
             before: the worlds at the start of the step.
@@ -541,7 +551,7 @@ class Engine:
         yield before, last_mps2, self.state.time_s.copy()
 
     def protect(self, guard: Guard | None) -> None:
-        """Use this guard from the next reset on; None removes the present one."""
+        """Use this guard from the next reset on; None removes the present guard."""
         self.guard = guard
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
@@ -557,14 +567,13 @@ class Engine:
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add an observer of the episodes. ``memory`` is its memory until the next episode begins."""
+        """Add an observer of the episodes. ``memory`` is the observer's memory until the next episode begins."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
         """Return copies of everything that changes while the engine runs, by name, for ``restore``.
 
-        These are the state, the place in the stream of worlds and the memories of the scripts. Worlds are pure
-        functions of the seed and their number, so the stream is one number.
+        The snapshot contains the state, the position in the stream of worlds, and the memories of the scripts.
         """
         arrays: Arrays = {name: array.copy() for name, array in zip(SNAPSHOT, self.state, strict=False)}
         arrays["stream"] = np.array([self.seed, self._now.stream.position], np.uint64)
@@ -576,19 +585,20 @@ class Engine:
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Continue exactly from ``arrays``, a ``snapshot`` of an engine of the same scenario, size and scripts.
 
-        Raises ``InvalidInput`` before anything changes: for a missing array, an array of another shape, or an engine
-        with a guard, whose memory the snapshot does not hold.
+        Raises ``InvalidInput``, before anything changes, for a missing array, for an array of another shape, and for an
+        engine with a guard, whose memory the snapshot does not contain.
         """
         if self.guard is not None:
             raise InvalidInput(
-                "engine snapshot: a shield stands in this engine; restore first, then put the shield around"
+                "engine snapshot: this engine has a shield, whose memory a snapshot does not contain; restore the"
+                " snapshot first, then add the shield"
             )
         wanted = {name: array.shape for name, array in zip(SNAPSHOT, self.state, strict=False)} | {"numbers": (self.n,)}
         for name, needed in wanted.items():
             have = arrays.get(name)
             if have is None or have.shape != needed:
-                shape = "nothing" if have is None else have.shape
-                raise InvalidInput(f"engine snapshot: {name} is {shape}; {needed} is needed")
+                what = "is missing" if have is None else f"has the shape {have.shape}"
+                raise InvalidInput(f"engine snapshot: the array {name} {what}; the shape {needed} is needed")
         impacts = self.state.impacts and self.state.impacts.read(arrays)
         memories = {vehicle: checked_memory(unflat(arrays, f"script.{vehicle}"), self.n) for vehicle in self.memories}
         motion, params, clock, moving, potential = (np.array(arrays[name], np.float64) for name in SNAPSHOT)
@@ -600,9 +610,9 @@ class Engine:
         self._now = self._now._replace(state=state, stream=stream, roster=roster, rules=self._rules_for(state))
 
     def _rules_for(self, state: State) -> Rules:
-        """Return the settings with which steps must advance the worlds of ``state``, instead of this engine's worlds.
+        """Return the settings of steps that advance the worlds of ``state`` instead of this engine's worlds.
 
-        They differ from the present ones if only the worlds of ``state`` have brakes that take time to build up.
+        They differ from the present settings if only the worlds of ``state`` have brakes that take time to build up.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
@@ -610,14 +620,14 @@ class Engine:
     def place(self, worlds: Worlds, ledger: Ledger | None = None, *, ended: Bools | None = None) -> None:
         """Replace the worlds in all rows, for example by worlds that another simulator has moved.
 
-        Vehicles, memories and times of decisions stay those of the last reset; the next step goes to the next decision
-        after the worlds' time.
+        Vehicles, memories and times of decisions do not change. The next step goes to the next decision after the
+        worlds' time.
 
         Args:
             worlds: n worlds at any time of their episodes.
-            ledger: harm so far; None: none.
-            ended: [n] whether the episode has ended, so that no step moves the world; None: ended if the worlds' time
-                is at or after the horizon.
+            ledger: harm so far; None: no harm.
+            ended: whether each episode has ended, so that no step moves its world, [n]. None: an episode has ended if
+                its world's time is at or after the horizon.
 
         Raises ``InvalidInput`` for another number of worlds or vehicles, and if the reward needs every single impact.
 
@@ -625,10 +635,12 @@ class Engine:
         state = self.state
         if state.impacts is not None:
             names = ", ".join(self._terms.impact_names)
-            raise InvalidInput(f"place: reward: {names} needs every impact, which is not known of worlds placed here")
+            raise InvalidInput(f"place: the reward {names} needs every impact, and placed worlds do not contain them")
         if worlds.speeds_mps.shape != state.wanted.shape:
             n, N = state.wanted.shape
-            raise InvalidInput(f"place: {worlds.n} worlds of {worlds.N} vehicles; {n} of {N} needed")
+            raise InvalidInput(
+                f"place: got {worlds.n} worlds of {worlds.N} vehicles; {n} worlds of {N} vehicles are needed"
+            )
         ledger = empty_ledger(worlds) if ledger is None else ledger
         motion, clock = self._now.kept(packed_with(worlds, ledger)).state, state.clock.copy()
         latest = Decisions(clock[:, START], self.scenario.time_step_s).latest(worlds.time_s)
@@ -656,7 +668,7 @@ class Engine:
         than the state.
         """
         if self.reward.shaping > 0.0:
-            raise InvalidInput(f"branches: reward: shaping = {self.reward.shaping:g}: must be 0; a branch has an end")
+            raise InvalidInput(f"branches: the reward has shaping = {self.reward.shaping:g}; it must be 0 for branches")
         n = len(state.motion)
         roster = Roster(n, self.seed, None)
         roster.warns = False
@@ -677,27 +689,27 @@ class Engine:
 
     @property
     def state(self) -> State:
-        """The running episodes. Not a copy: do not change them."""
+        """State of the running episodes. It is not a copy, so do not change it."""
         return self._now.state
 
     @property
     def worlds(self) -> Worlds:
-        """The running worlds, as a copy."""
+        """Copy of the running worlds."""
         return self._now.rules.unpack(self.packed)
 
     @property
     def packed(self) -> Packed:
-        """The running worlds packed into two arrays (``physics.columns``). Not a copy: do not change them."""
+        """Running worlds, packed into two arrays (``physics.columns``). They are not a copy, so do not change them."""
         return self._now.state.packed
 
     @property
     def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2. Not a copy."""
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2. The array is not a copy."""
         return self._now.state.wanted
 
     @property
     def ledger(self) -> Ledger:
-        """Harm and number of impacts of the running episodes so far, by pair of vehicles, as a copy."""
+        """Harm and number of impacts of the running episodes so far, by pair of vehicles (a copy)."""
         return self._now.state.ledger
 
     @property
@@ -712,22 +724,22 @@ class Engine:
 
     @property
     def roster(self) -> Roster:
-        """The number of the world in each row, and the worlds that the physics could not advance."""
+        """Number of the world in each row, and the worlds that the physics could not advance."""
         return self._now.roster
 
     @property
     def seed(self) -> int:
-        """Seed of the training stream: the endless list of worlds from which new episodes come."""
+        """Seed of the training stream, the endless sequence of worlds from which new episodes come."""
         return self._now.stream.seed
 
     @property
     def observation(self) -> ObservationSpec:
-        """The observation of all learners. Raises ``InvalidInput`` if learners observe different features."""
+        """Observation of all learners. Raises ``InvalidInput`` if learners observe different features."""
         return common_observation(self.observations, self.scenario)
 
     @property
     def memories(self) -> dict[int, Memory]:
-        """Vehicle index -> memory of its script, for the scripts that have a memory."""
+        """Dictionary from vehicle index to the memory of the vehicle's script, for scripts with a memory."""
         return self._now.state.memories
 
     @property
@@ -742,5 +754,5 @@ class Engine:
 
     @property
     def in_pieces(self) -> bool:
-        """Whether a script follows a braking profile, a list of intervals of constant command."""
+        """Whether some script follows a braking profile, which is a sequence of intervals of constant command."""
         return bool(self._now.rules.pieces.shape[1] > 0)

@@ -18,8 +18,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 Memory = Any  # of a script, for n worlds: None, an array [n, ...], or a tuple or mapping of memories
 
 _SHAPES = (
-    "one that remembers has begin(alert, vehicle, scripts) -> memory and act(worlds, memory, vehicle) -> (command,"
-    " memory); one that remembers nothing has no begin, and act(worlds, vehicle) -> command"
+    "an agent with memory has begin(alert, vehicle, scripts) -> memory and act(worlds, memory, vehicle) -> (command,"
+    " memory); an agent without memory has no begin, and act(worlds, vehicle) -> command"
 )
 
 
@@ -45,13 +45,13 @@ def take_memory(memory: Memory, rows: Ints) -> Memory:
 def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
     """Return a copy of ``memory`` in which the worlds ``rows`` have the memory ``part``.
 
-    Parts that ``part`` lacks or has as None keep their old values. Raises ``InvalidInput`` if ``part`` has keys that
-    ``memory`` lacks.
+    Entries that are missing or None in ``part`` keep their old values. Raises ``InvalidInput`` if ``part`` has keys
+    that ``memory`` lacks.
     """
     if part is None:
         return memory
     if memory is None or (isinstance(part, Mapping) and not part.keys() <= memory.keys()):
-        raise InvalidInput("agent: what begins anew remembers other things than what began before")
+        raise InvalidInput("agent: begin returned a memory with other entries than in earlier episodes")
     if isinstance(part, Mapping):
         return {key: renew_memory(of, rows, part.get(key)) for key, of in memory.items()}
     if isinstance(part, tuple | list):
@@ -64,9 +64,9 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
 def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
     """Return ``memory`` if it is valid; otherwise raise ``InvalidInput``.
 
-    Every array must have ``n`` rows. Arrays of objects are also refused, because a copy still holds the same objects.
-    Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` names the memory in the
-    message.
+    Every array must have ``n`` rows. Arrays of objects are also refused, because a copy still contains the same
+    objects. Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` names the memory in
+    the message.
     """
 
     def check(array: Any) -> Any:
@@ -76,7 +76,7 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
                 f"{what}: {type(array).__name__} of shape {shape}; its first axis must be the {n} worlds"
             )
         if array.dtype.hasobject:
-            raise InvalidInput(f"{what}: an array of objects; it must hold numbers, truths or texts")
+            raise InvalidInput(f"{what}: an array of objects; it must contain numbers, booleans or texts")
         return array
 
     parts = [memory]
@@ -95,7 +95,7 @@ Arrays = dict[str, NDArray[Any]]
 
 
 def flat(memory: Memory) -> Arrays:
-    """Return the arrays of a memory as one mapping from path to array.
+    """Return the arrays of a memory as a dictionary from path to array.
 
     For ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. An empty array stands for None.
     """
@@ -114,7 +114,7 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
         return np.array(arrays[place]) if arrays[place].shape != (0,) else None
     inner = dict.fromkeys(name[len(place) + 1 :].partition(".")[0] for name in arrays if name.startswith(f"{place}."))
     if not inner:
-        raise InvalidInput(f"engine snapshot: {place} is nothing; the memory of that vehicle's script is needed")
+        raise InvalidInput(f"engine snapshot: {place} is missing; the memory of this vehicle's script is needed")
     parts = {name: unflat(arrays, f"{place}.{name}") for name in inner}
     return tuple(parts[str(k)] for k in range(len(parts))) if "0" in parts else parts
 
@@ -122,14 +122,14 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    Such a change would make it impossible to restart single rows. ``before`` and ``after`` are the memory before and
-    after the call. ``who`` begins the message.
+    After such a change, single rows could not be restarted. ``before`` and ``after`` are the memory before and after
+    the call. The message begins with ``who``.
     """
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:
         raise InvalidInput(
-            f"{who}: act gave a memory of another form ({kinds}) than it was given ({began}); keys, shapes and dtypes"
-            " are those of begin"
+            f"{who}: act got a memory of the form {began} and returned the form {kinds}; keys, shapes and dtypes must"
+            " stay as begin made them"
         )
 
 
@@ -141,7 +141,7 @@ def is_state_free(script: Script) -> bool:
 def is_ours(script: Script) -> bool:
     """Return whether the script's class belongs to this package.
 
-    Scripts of others get read-only worlds and copies of their memory.
+    All other scripts get read-only worlds and copies of their memory.
     """
     return type(script).__module__.startswith("ethbrake_marl.")
 
@@ -152,10 +152,10 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
     Args:
         script: the script.
         alert: worlds of these episodes, at t = 0.
-        vehicle: index of its vehicle (0 = front).
-        scripts: index of each scripted vehicle -> its script.
+        vehicle: index of the script's vehicle (0 = front).
+        scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
 
-    Raises ``InvalidInput`` naming the script for whatever a user's script raises, and for an invalid memory.
+    Raises ``InvalidInput``, which names the script, if a user's script raises an exception or its memory is invalid.
 
     """
     begin = getattr(script, "begin", None)
@@ -165,7 +165,7 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
         if is_ours(script):
             return begin(alert, vehicle, scripts)
         if len(inspect.signature(script.act).parameters) == 2:
-            raise InvalidInput(f"{_who(script, vehicle)}: has begin, and act without a memory; {_SHAPES}")
+            raise InvalidInput(f"{_who(script, vehicle)}: the agent has begin, but act takes no memory; {_SHAPES}")
         with _as_it_was(script, vehicle):
             return checked_memory(
                 begin(alert.read_only(), vehicle, scripts), alert.n, f"{_who(script, vehicle)}: memory"
@@ -177,9 +177,9 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
 def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
     """Return a script's command for ``vehicle`` (index, 0 = front), [n] m/s2, and its new memory.
 
-    ``memory`` is its memory for these worlds; None for a script without. Raises ``AgentFailed`` naming script, world,
-    moment and shape for a command that is not one number per world, and ``InvalidInput`` naming the script for whatever
-    a user's script raises, or if it changes its own attributes.
+    ``memory`` is the script's memory for these worlds; None for a script without memory. Raises ``AgentFailed``, with
+    script, world, time and shape, if the command is not one number per world. Raises ``InvalidInput``, which names the
+    script, if a user's script raises an exception or changes its own attributes.
     """
     remembers = hasattr(script, "begin")
     try:
@@ -191,7 +191,7 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
                 answer = script.act(worlds.read_only(), *own, vehicle)
             if remembers:
                 if not (isinstance(answer, tuple) and len(answer) == 2):
-                    raise InvalidInput(f"{_who(script, vehicle)}: act gave {type(answer).__name__}; {_SHAPES}")
+                    raise InvalidInput(f"{_who(script, vehicle)}: act returned {type(answer).__name__}; {_SHAPES}")
                 who = f"{_who(script, vehicle)}: memory"
                 _check_kept(memory, checked_memory(answer[1], worlds.n, who), who)
     except Exception as error:
@@ -204,24 +204,24 @@ def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> 
         raise AgentFailed(
             getattr(script, "name", type(script).__name__),
             row if worlds.n else None,
-            f"vehicle_{vehicle + 1} at {worlds.time_s[row : row + 1].min(initial=np.inf):.2f} s: gave {commands.dtype}"
-            f" of shape {commands.shape}; one number per world is needed, shape ({worlds.n},)",
+            f"vehicle_{vehicle + 1} at {worlds.time_s[row : row + 1].min(initial=np.inf):.2f} s: act returned"
+            f" {commands.dtype} of shape {commands.shape}; one number per world is needed, shape ({worlds.n},)",
         )
     return command, memory
 
 
 @contextmanager
 def _as_it_was(script: Script, vehicle: int) -> Iterator[None]:
-    """Raise ``InvalidInput`` if a script changes its own attributes, which all episodes share, in the block.
-
-    For use in a ``with`` statement.
-    """
+    """Context manager: raise ``InvalidInput`` if a script changes its own attributes, which all episodes share."""
     before = dict(getattr(script, "__dict__", {}))
     yield
     for name in {**before, **getattr(script, "__dict__", {})}:
         is_cached = name not in before and isinstance(getattr(type(script), name, None), cached_property)
         if not is_cached and (name not in before or getattr(script, name, None) is not before[name]):
-            raise InvalidInput(f"{_who(script, vehicle)}: keeps something in its attribute {name!r}; {_SHAPES}")
+            raise InvalidInput(
+                f"{_who(script, vehicle)}: the agent changed its attribute {name!r}, which all episodes share;"
+                f" {_SHAPES}"
+            )
 
 
 def _who(script: Script, vehicle: int) -> str:
@@ -231,14 +231,14 @@ def _who(script: Script, vehicle: int) -> str:
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
     """Return the exception to raise in place of ``error``, which a script raised.
 
-    It is an ``InvalidInput`` that names the script; ``error`` itself if it is a package's error or from a package's
-    script.
+    The result is an ``InvalidInput`` that names the script. Errors of this package, and errors from scripts of this
+    package, are returned unchanged.
 
     Args:
         error: the exception.
         script: the script.
         what: name of the method that raised it.
-        worlds: the worlds that the method was given.
+        worlds: the worlds that were passed to the method.
         vehicle: index of the script's vehicle.
 
     """
@@ -259,7 +259,7 @@ def within_capacity(
         worlds: n worlds.
         vehicle: index of the vehicle (0 = front).
         script: the script, for the message.
-        due: [n] worlds in which the command is checked; None: all.
+        due: whether the command is checked in each world, [n]; None: it is checked in all worlds.
 
     """
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]

@@ -37,11 +37,11 @@ Stop = tuple[Floats, Floats]  # state [n, S] of all worlds at a script's decisio
 
 
 class Way(NamedTuple):
-    """The first part of a step, up to the last decision of a script that decides at times of its own in between."""
+    """Result of the first part of a step, which ends at the last decision that a script makes within the step."""
 
     reward: Floats  # [n, N] reward of this part
     harm: Floats  # [2, n] harm of the line in this part: first-impact harm, total harm (m2/s2)
-    stopped: Bools  # [n] whether the world was moved to such a decision
+    stopped: Bools  # [n] whether the world was moved to a decision within the step
     failed: Ints  # [n] status of the physics if the world could not be advanced, else 0
     in_force: Floats  # [n, N] accelerations in force when the step began (m/s2)
     memories: dict[int, Memory]  # vehicle index -> new memory of its script
@@ -51,10 +51,10 @@ class Way(NamedTuple):
         """Add this first part of a step to the results of the rest of the step, in place.
 
         Args:
-            motion: [n, S] state of the worlds after the step.
+            motion: state of the worlds after the step, [n, S].
             column: columns of ``motion``.
-            reward: [n, N] reward of the rest.
-            outcome: [OUTCOME_ROWS, n] outcome of the rest.
+            reward: reward of the rest of the step, [n, N].
+            outcome: outcome of the rest of the step, [OUTCOME_ROWS, n].
 
         """
         reward += self.reward
@@ -67,12 +67,12 @@ class Way(NamedTuple):
 class OwnGrid:
     """Scripts with a memory that decide within an engine's steps.
 
-    Each decides when the latency of its vehicle has elapsed, and every time step from then on. An engine's step goes
-    from one decision of its deciders (the learners or the evaluated agents) to the next, so a script of another vehicle
-    decides within the step.
+    Each script decides when the latency of its vehicle has elapsed, and every time step from then on. An engine's step
+    goes from one decision of its deciders (the learners or the evaluated agents) to the next, so the script of another
+    vehicle decides within the step.
 
     Args:
-        scripts: vehicle index -> its script.
+        scripts: dictionary from vehicle index to script.
         time_step_s: time between two decisions of a script, s.
         horizon_s: time at which an episode is truncated, s.
 
@@ -85,8 +85,8 @@ class OwnGrid:
     def drive_step(self, state: State, rules: Rules, actions: Floats) -> Way:
         """Let the scripts decide within the step that begins, and return this first part of the step.
 
-        ``state`` is changed in place: each world is moved to its last decision that changed a command. ``rules``
-        advance the worlds, under the learners' ``actions`` [n, L].
+        ``state`` is changed in place: each world is moved to its last decision that changed a command. ``rules``:
+        settings of the step. ``actions``: actions of the learners, [n, L].
         """
         column = state.packed.column
         in_force = state.motion[:, column.command : column.previous].copy()
@@ -100,15 +100,16 @@ class OwnGrid:
     def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
         """Let the scripts decide from the alert to the first step of new episodes, and return this part.
 
-        Learners and deciders coast until then, and others see them coast.
+        Learners and deciders coast until the first step, and other vehicles see them coast.
 
         Args:
-            state: all running episodes, with the new ones at the alert; these are moved to their first step, in place.
-            rules: how worlds are advanced.
+            state: all running episodes, with the new episodes at the alert. The new episodes are moved to their first
+                step, in place.
+            rules: settings of the steps.
             rows: rows of the new episodes.
-            start_s: times at which their first steps begin, [len(rows)] s.
+            start_s: times at which the first steps of the new episodes begin, [len(rows)] s.
 
-        Raises ``PhysicsError`` naming the worlds that could not be advanced.
+        Raises ``PhysicsError``, which lists the worlds that could not be advanced.
 
         """
         n, time_s = len(state.motion), state.time_s
@@ -125,9 +126,9 @@ class OwnGrid:
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
         """Make all decisions of the scripts before ``until_s`` [n], and return this part of the step.
 
-        Only the ``running`` [n] worlds of ``state`` are advanced, in place. A world is moved to a decision only if that
-        changes a command, because the rounding of the motion depends on where it is interrupted. ``rules`` advance the
-        worlds; ``actions`` [n, L] are the learners'.
+        Only the ``running`` [n] worlds of ``state`` are advanced, in place. A world is moved to a decision only if this
+        decision changes a command, because the rounding of the motion depends on where it is interrupted. ``rules``:
+        settings of the step. ``actions``: actions of the learners, [n, L].
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column
@@ -175,10 +176,10 @@ class OwnGrid:
 
         Args:
             state: the worlds; only the learners' commands in ``wanted`` are changed.
-            rules: how worlds are advanced.
-            until_s: [n] times, s; a world that is not before its time stays.
-            decision_s: [n] time of the deciders' next decision, which periodic messages need, s.
-            actions: [n, L] actions of the learners; L may be 0.
+            rules: settings of the step.
+            until_s: times, [n] s; a world whose time is not before ``until_s`` does not move.
+            decision_s: time of the deciders' next decision, [n] s; periodic messages depend on it.
+            actions: actions of the learners, [n, L]; L may be 0.
 
         """
         n, wanted = len(state.motion), state.wanted

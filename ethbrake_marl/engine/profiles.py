@@ -1,7 +1,7 @@
 """Command profiles of whole episodes and their harm: the optimisation problem that searches and shields solve.
 
-A *profile* holds the commands of the controlled vehicles from the first decision to the horizon, in at most K phases. A
-*phase* is an interval of constant command that ends at a decision.
+A *profile* contains the commands of the controlled vehicles from the first decision to the horizon, in at most K
+phases. A *phase* is an interval of constant command that ends at a decision.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ TIME_STEP_S = 0.1  # default time between two decisions
 
 
 class ProfileProblem(NamedTuple):
-    """The problem of choosing command profiles of the controlled vehicles in n worlds. Made by ``profile_problem``.
+    """The problem of choosing command profiles of the controlled vehicles in n worlds; made by ``profile_problem``.
 
-    If a line has an obstacle, it is vehicle 0 of every column, and the vehicles' indices start from 1.
+    If a line has an obstacle, the obstacle is vehicle 0 in all arrays, and the indices of the vehicles start from 1.
     """
 
     vehicles: Ints  # [C] indices of the controlled vehicles
@@ -74,12 +74,12 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """Return the problem of the worlds with the indices ``rows`` only."""
+        """Return the problem restricted to the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
     def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
-        """Return a copy in which the worlds with the indices ``rows`` are replaced by those of ``new``, in order."""
+        """Return a copy in which the worlds of ``new`` replace the worlds with the indices ``rows``, in order."""
         arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
         for name, array in arrays.items():
             array[rows] = getattr(new, name)
@@ -91,11 +91,11 @@ class ProfileProblem(NamedTuple):
         return self.clock[:, CLOCK.LAST_STEP].astype(np.int64)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Return profiles that hold constant commands.
+        """Return profiles of constant commands.
 
         ``commands_mps2`` [n, Q, C] are Q constant commands for each world and controlled vehicle. The result has n * Q
-        profiles, in the order of the first two axes. Each is divided into ``MOST_PHASES`` phases, all with the same
-        command, so that a search can change them later.
+        profiles, in the order of the first two axes. Each profile has ``MOST_PHASES`` phases with the same command, so
+        that a search can change them later.
         """
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -108,10 +108,10 @@ class ProfileProblem(NamedTuple):
         )
 
     def even_grid(self, number: int) -> Floats:
-        """Return ``number`` evenly spaced commands from each vehicle's smallest to its largest, [n, number, C] m/s2.
+        """Return ``number`` evenly spaced commands of each vehicle, [n, number, C] m/s2.
 
-        Both ends are included. ``low + (high - low)`` may be an ulp above ``high``, so the result is limited to
-        ``high``.
+        The commands include the vehicle's smallest and largest command. Rounding cannot lead beyond the largest
+        command.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
@@ -120,11 +120,11 @@ class ProfileProblem(NamedTuple):
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
         """Return the same problem, in which a search minimises weighted harm of the vehicles.
 
-        The harm that counts is still that of ``harm_count``. A hash in ``identity`` does not depend on the weights.
+        The count of harm (first-impact or total) does not change, and ``identity`` does not depend on the weights.
 
         Args:
-            weights: [n, N] weight of the harm that each vehicle bears, at least 0, without a column for an obstacle.
-            largest: minimise the largest weighted harm instead of the sum.
+            weights: weight of the harm that each vehicle bears, at least 0, [n, N], without a column for an obstacle.
+            largest: whether to minimise the largest weighted harm of a vehicle instead of the sum.
 
         """
         mass, obstacle = self.mass, self.mass.shape[1] - weights.shape[1]
@@ -136,19 +136,20 @@ class ProfileProblem(NamedTuple):
         return self._replace(weights=pairs, clock=clock)
 
     def follow(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return first-impact and total harm of one profile per world, each [n] m2/s2.
+        """Return the first-impact harm and the total harm of one profile per world, [n] m2/s2 each.
 
-        They equal the engine's to the bit. Raises ``InvalidInput`` for profiles that do not fit the problem or exceed a
-        capacity, ``PhysicsError`` naming the worlds in which a check of the physics failed.
+        Both harms equal the harms in the engine to the last bit. Raises ``InvalidInput`` for profiles that do not fit
+        the problem or exceed a capacity, and ``PhysicsError``, which lists the worlds in which a check of the physics
+        failed.
         """
         first, total = self.follow_pairs(profiles)
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
 
     def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return what a search minimises, for one profile per world, count of harm -> [n] m2/s2.
+        """Return the value that a search minimises, for one profile per world: count of harm -> value, [n] m2/s2.
 
-        It is the harm of the line, the weighted sum of what its vehicles bear, or the largest weighted share. Raises
-        what ``follow`` raises.
+        The value is the harm of the line, the weighted sum of the harms that its vehicles bear, or the largest of these
+        weighted harms. Raises the same errors as ``follow``.
         """
         if (self.clock[:, CLOCK.AIM] == WHOLE).all():
             return dict(zip(HARM_COUNTS, self.follow(profiles), strict=True))
@@ -162,9 +163,10 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the harm that each vehicle bears under one profile per world, count of harm -> [n, N] m2/s2.
+        """Return the harm that each vehicle bears under one profile per world: count of harm -> harm, [n, N] m2/s2.
 
-        There is no column for an obstacle. It equals the engine's to the bit. Raises what ``follow`` raises.
+        There is no column for an obstacle. The harm equals the harm in the engine to the last bit. Raises the same
+        errors as ``follow``.
         """
         obstacle, harms = int(np.isinf(self.mass[:, 0]).any()), {}
         for harm_count, pairs in zip(HARM_COUNTS, self.follow_pairs(profiles), strict=True):
@@ -174,9 +176,10 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def follow_pairs(self, profiles: Profiles) -> tuple[Floats, Floats]:
-        """Return the harm of each pair, first-impact and total, under one profile per world, each [n, P] m2/s2.
+        """Return the first-impact harm and the total harm of each pair under one profile per world, [n, P] m2/s2 each.
 
-        An obstacle ahead and Vehicle 1 are a pair, the first one. Raises what ``follow`` raises.
+        If there is an obstacle ahead, the obstacle and Vehicle 1 are the first pair. Raises the same errors as
+        ``follow``.
         """
         self.check(profiles)
         shape = self.n, self.mass.shape[1] - 1
@@ -184,21 +187,21 @@ class ProfileProblem(NamedTuple):
         ends, commands = np.ascontiguousarray(profiles.ends, np.int64), np.ascontiguousarray(profiles.commands_mps2)
         follow_worlds(self, ends, commands, first, total, failed)
         if failed.any():
-            raise PhysicsError({k: "its profile could not be followed" for k in np.flatnonzero(failed).tolist()})
+            raise PhysicsError({k: "its profile could not be simulated" for k in np.flatnonzero(failed).tolist()})
         return first, total
 
     def check(self, profiles: Profiles) -> None:
         """Raise ``InvalidInput`` for profiles that do not fit this problem.
 
-        There must be one profile per world, with commands within the capacities, and phases that end in order, the last
-        one at the last decision.
+        There must be one profile per world. Commands must be within the capacities. Phases must end in order, and the
+        last phase must end at the last step.
         """
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]
         if profiles.ends.shape != (n, K) or profiles.commands_mps2.shape != (n, K, C):
             raise InvalidInput(
-                f"profiles: shapes {profiles.ends.shape} and {profiles.commands_mps2.shape}; ({n}, K) and ({n}, K, {C})"
-                " are needed"
+                f"profiles: ends has the shape {profiles.ends.shape} and commands_mps2 {profiles.commands_mps2.shape};"
+                f" the shapes must be ({n}, K) and ({n}, K, {C})"
             )
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         good = (profiles.commands_mps2 >= low) & (profiles.commands_mps2 <= high)
@@ -210,7 +213,7 @@ class ProfileProblem(NamedTuple):
             profiles.ends[:, -1] == self.last_step
         ).all()
         if not ordered:
-            raise InvalidInput("profiles: phases must end in order, the last one at the last step")
+            raise InvalidInput("profiles: phases must end in order, and the last phase must end at the last step")
 
 
 def profile_problem(
@@ -229,28 +232,31 @@ def profile_problem(
     Args:
         worlds: n worlds.
         vehicles: indices of the controlled vehicles (0 = front).
-        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+        harm_count: harm that is minimised: ``first`` (first-impact harm) or ``total`` (total harm).
         horizon_s: end of the episodes, s.
         time_step_s: time between two decisions, s.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
             full braking.
-        deciders: indices of vehicles; the first decision is at their smallest latency, or at the worlds' time if that
-            is later. None: ``vehicles``.
-        written_out: describe an obstacle ahead as a vehicle in front (``Worlds.with_obstacle``) even if no world has
-            one; worlds without one get one out of reach. If any world has one, this is always done.
+        deciders: indices of the vehicles that determine the first decision, which is at their smallest latency, or at
+            the worlds' time if this is later. None: ``vehicles``.
+        written_out: whether every world gets an obstacle as the vehicle in front (``Worlds.with_obstacle``) even if no
+            world has an obstacle. An added obstacle is out of reach. If some world has an obstacle, every world gets
+            one.
 
-    Raises ``InvalidInput`` for no vehicle, a repeated or unknown one, an unknown harm count, a command beyond capacity,
-    or a horizon before the first decision.
+    Raises ``InvalidInput`` without vehicles, and for a repeated or unknown vehicle, an unknown harm count, a command
+    beyond capacity, or a horizon before the first decision.
 
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
     check_harm_count(harm_count)
     if not (0.0 < time_step_s < math.inf and 0.0 < horizon_s < math.inf):
-        raise InvalidInput(f"time_step_s {time_step_s!r}, horizon_s {horizon_s!r}: must be positive numbers of seconds")
+        raise InvalidInput(
+            f"time_step_s = {time_step_s!r}, horizon_s = {horizon_s!r}: both must be positive numbers of seconds"
+        )
     v = worlds.vehicles
     command = -v.braking_capacity_mps2 if others_mps2 is None else np.array(others_mps2, np.float64)
     if command.shape != worlds.speeds_mps.shape:
-        raise InvalidInput(f"others_mps2: shape {command.shape}; {worlds.speeds_mps.shape} is needed")
+        raise InvalidInput(f"others_mps2: shape {command.shape}; the shape {worlds.speeds_mps.shape} is needed")
     command[:, chosen] = 0.0
     obstacle = worlds.obstacle_ahead
     if obstacle.any() or written_out:
@@ -273,7 +279,7 @@ def profile_problem(
     decide = _checked_vehicles(vehicles if deciders is None else deciders, worlds.N)
     first = worlds.first_decision_s(decide.tolist())
     if not (first < horizon_s).all():
-        raise InvalidInput(f"horizon_s {horizon_s:g}: must be after the first decision at {first.max():g} s")
+        raise InvalidInput(f"horizon_s = {horizon_s:g}: must be after the first decision at {first.max():g} s")
     clock = np.empty((worlds.n, CLOCK.WIDTH))
     clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP], clock[:, CLOCK.HORIZON] = first, time_step_s, horizon_s
     clock[:, CLOCK.LAST_STEP], clock[:, CLOCK.AIM] = Decisions(first, time_step_s).before(horizon_s), WHOLE
@@ -296,9 +302,9 @@ def profile_problem(
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
     """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
 
-    That is the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions and the
-    horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles; but not the harm
-    count.
+    The harm depends on the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions
+    and the horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles. The hash
+    does not depend on the harm count.
     """
     packed = Packed.of(worlds)
     (state, params), column = packed, packed.column
@@ -330,14 +336,16 @@ def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -
 def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
     chosen = list(vehicles)
     if not chosen or len(set(chosen)) != len(chosen) or not all(0 <= i < N for i in chosen):
-        raise InvalidInput(f"vehicles {tuple(chosen)}: at least one is needed, each once, from 0 to {N - 1}")
+        raise InvalidInput(
+            f"vehicles = {tuple(chosen)}: must be one or more vehicle indices from 0 to {N - 1}, without repetition"
+        )
     return np.array(chosen, np.int64)
 
 
 class Profiles(NamedTuple):
     """One profile per world: ``commands_mps2[k, j]`` is in force from decision ``ends[k, j - 1]`` to ``ends[k, j]``.
 
-    Phases after a world's last one are empty: they also end at the last step.
+    Unused phases are empty: they end at the last step, like the phase before them.
     """
 
     ends: Ints  # [n, K] number of the decision at which each phase ends
@@ -357,9 +365,9 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """Return copies of several sets of profiles, all with the same number of phases, at least ``least``.
+        """Return copies of all ``parts`` with the same number of phases, at least ``least``.
 
-        The added phases are empty: they end where the last one does.
+        The added phases are empty: they end at the end of the last phase.
         """
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
@@ -373,9 +381,9 @@ class Profiles(NamedTuple):
 
 @compiled
 def make_search_world(problem: ProfileProblem, k: int, random: UInt64s) -> SearchWorld:
-    """Return world number ``k`` of a problem, with working memory of its own.
+    """Return world number ``k`` of a problem, with its own working memory.
 
-    ``random`` [n] holds the states of all worlds' random generators; the result refers to entry ``k``.
+    ``random`` [n] contains the states of the random generators of all worlds; the result refers to entry ``k``.
     """
     N = problem.mass.shape[1]
     table = np.zeros((rows_for(problem.pieces.shape[2]), N))

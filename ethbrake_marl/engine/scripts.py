@@ -8,7 +8,7 @@ SAMPLED_AT_ONCE = 1024  # smallest number of training worlds that are drawn toge
 
 
 class Script(Protocol):
-    """Driver of one vehicle in every world of a batch of ``n``. An ``Agent`` is a script with a name.
+    """Driver of one vehicle in every world of a batch of ``n`` worlds. An ``Agent`` is a script with a name.
 
     A script is called when the latency of its vehicle has elapsed, and at every time step from then on.
 
@@ -20,10 +20,10 @@ class Script(Protocol):
     - ``act(worlds, memory, vehicle) -> (command, memory)``: the command [n] m/s2, and the new memory. Worlds without a
       decision at this moment may be included; their results are ignored.
 
-    A memory is None, an array whose first axis is the world, or a tuple or mapping of memories. The caller owns it: it
-    selects rows, restarts some of them, or tries out what would happen. So a script must never change a memory in
-    place. If a mapping contains ``predicted_harm`` [n] (m2/s2), it is the harm that the agent predicted when the
-    episode began.
+    A memory is None, an array whose first axis is the world, or a tuple or mapping of memories. The caller may select
+    rows of a memory, restart some rows, or try out possible continuations. A script must therefore never change a
+    memory in place. If a mapping contains ``predicted_harm`` [n] (m2/s2), this is the harm that the agent predicted
+    when the episode began.
 
     A script with the attribute ``state_free = True`` is called only once per episode, right after ``begin``: its
     command is fixed at the alert.
@@ -32,5 +32,6 @@ class Script(Protocol):
     def act(self, *args: Any, **kwargs: Any) -> Any:
         """Return the commanded acceleration in n worlds, [n] m/s2; a script with memory also returns its new memory.
 
-        Arguments are ``(worlds, vehicle)`` without, and ``(worlds, memory, vehicle)`` with memory.
+        The arguments are ``(worlds, vehicle)`` for a script without memory, and ``(worlds, memory, vehicle)`` for a
+        script with memory.
         """

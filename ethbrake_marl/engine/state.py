@@ -49,7 +49,7 @@ class State(NamedTuple):
 
     @property
     def ledger(self) -> Ledger:
-        """Harm and number of impacts of the episodes so far, by pair of vehicles, as a copy."""
+        """Harm and number of impacts of the episodes so far, by pair of vehicles (a copy)."""
         packed, column = self.packed, self.packed.column
         params = packed.params
         weight = params[:, column.harm_weight : column.own_latency]
@@ -57,12 +57,12 @@ class State(NamedTuple):
         return Ledger(*packed.ledger(), *(each.copy() for each in of_worlds))
 
     def copy(self) -> State:
-        """Return the same state in arrays of its own; memories, which nobody changes in place, are shared."""
+        """Return a copy with its own arrays; memories are shared, because they are never changed in place."""
         motion, params, clock, wanted, potential = (array.copy() for array in self[:5])
         return State(motion, params, clock, wanted, potential, self.memories, self.guarded, self.impacts)
 
     def take(self, rows: Ints) -> State:
-        """Return a state of the rows with the indices ``rows``, which may be repeated."""
+        """Return the state of the rows with the indices ``rows``, which may be repeated."""
         guarded = None if self.guarded is None else self.guarded.take(rows)
         motion, params, clock, wanted, potential, memories = take_memory(self[:6], rows)
         impacts = None if self.impacts is None else self.impacts.take(rows)
@@ -72,10 +72,11 @@ class State(NamedTuple):
     def join(states: list[State]) -> State:
         """Return one state with the rows of several states, one after the other.
 
-        All must come from one engine. Raises ``InvalidInput`` if it has a guard, whose memory cannot be joined.
+        All states must come from one engine. Raises ``InvalidInput`` if this engine has a guard, because memories of
+        guards cannot be joined.
         """
         if states[0].guarded is not None:
-            raise InvalidInput("moments: a shield stands in their engine; what it remembers is not joined")
+            raise InvalidInput("moments: their engine has a shield, whose memory cannot be joined; remove the shield")
         joined = State(*map_memory(lambda *parts: np.concatenate(parts), *(state[:6] for state in states)))
         impacts = [state.impacts for state in states if state.impacts is not None]
         return joined._replace(impacts=EpisodeImpacts.join(impacts) if impacts else None)

@@ -26,8 +26,8 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 class Start(NamedTuple):
     """Worlds of new episodes, advanced from the alert to their first decision."""
 
-    origin: Worlds  # worlds at the alert, t = 0; these n worlds and possibly others
-    first: int  # row in ``origin`` of the first of these worlds; the others follow it
+    origin: Worlds  # worlds at the alert, t = 0: the n worlds and possibly further worlds
+    first: int  # row in ``origin`` of the first of the n worlds; the other worlds follow it
     packed: Packed  # the n worlds at the first decision
     clock: Floats  # [n, CLOCK_WIDTH] times and steps of the episodes, see ``compiled_step``
     wanted: Floats  # [n, N] commands of the scripts whose command never changes, 0 for all other vehicles (m/s2)
@@ -45,7 +45,7 @@ class Start(NamedTuple):
 
 
 class FailedWorld(UserWarning):
-    """Warning: a world could not be advanced, so its episode was cut off. The rest of the batch continues."""
+    """Warning: a world could not be advanced, so its episode was truncated. The other worlds continue."""
 
 
 class Roster:
@@ -54,9 +54,9 @@ class Roster:
     Args:
         n: number of rows.
         seed: seed of the stream of worlds.
-        first: number in the stream of row 0's world; the other rows follow. None: the caller passed the worlds, which
-            have no numbers.
-        given: the worlds that the caller passed, at the alert; None: none.
+        first: number in the stream of the world in row 0; the next worlds are in the next rows. None: the caller passed
+            the worlds, and they have no numbers.
+        given: the worlds that the caller passed, at the alert; None: the worlds come from the stream.
 
     """
 
@@ -76,7 +76,7 @@ class Roster:
     def renew(self, rows: Ints, first: int) -> None:
         """Record that new worlds run in the rows with the indices ``rows``.
 
-        They are the worlds ``first``, ``first + 1``, ... of the stream.
+        The new worlds are the worlds ``first``, ``first + 1``, ... of the stream.
         """
         self.numbers[rows] = first + np.arange(len(rows))
         for row in self.failed.keys() & rows.tolist() if self.failed else ():
@@ -86,9 +86,9 @@ class Roster:
         """Record the worlds that a step could not advance, and warn of them with ``FailedWorld``.
 
         Args:
-            status: [n] status of the physics; 0 for a world without failure.
-            from_s: [n] times at which the step began, s.
-            until_s: [n] times at which it would have ended, s.
+            status: status of the physics, [n]; 0 for a world without failure.
+            from_s: times at which the step began, [n] s.
+            until_s: times at which the step should have ended, [n] s.
 
         """
         new = FLAG.failure(np.where(status == 0, FLAG.DONE, status), from_s, until_s).worlds
@@ -96,7 +96,7 @@ class Roster:
         for row, reason in new.items() if self.warns else ():
             number = int(self.numbers[row])
             name = f"world {number} of seed {self.seed}" if number >= 0 else f"the world of row {row}"
-            warnings.warn(FailedWorld(f"{name}: {reason}; its episode was cut off there"), stacklevel=4)
+            warnings.warn(FailedWorld(f"{name}: {reason}; its episode was truncated there"), stacklevel=4)
 
 
 class Stream:
@@ -107,8 +107,8 @@ class Stream:
 
     Args:
         scenario: the scenario from which worlds are drawn.
-        deciders: indices of the vehicles (0 = front); the first decision is when the first of them may act.
-        scripts: index of each scripted vehicle -> its script.
+        deciders: indices of the vehicles (0 = front); the first decision is when the first decider may act.
+        scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
         seed: seed of the stream.
 
     """
@@ -134,7 +134,7 @@ class Stream:
         return self._drawn - (0 if self._pool is None else len(self._pool.clock) - self._next)
 
     def take(self, count: int) -> Start:
-        """Return the next ``count`` worlds at their first decision, and move on in the stream."""
+        """Return the next ``count`` worlds at their first decision, and advance the position in the stream."""
         if self._pool is None or self._next + count > len(self._pool.clock):
             self._fill(count)
         assert self._pool is not None
@@ -145,8 +145,8 @@ class Stream:
     def _fill(self, count: int) -> None:
         """Draw and prepare at least ``count`` more worlds; worlds that were not taken yet come first.
 
-        A world that cannot be advanced to its first decision is replaced by the next one that can, with a
-        ``FailedWorld`` warning. So the other worlds keep their positions in the stream, and a training continues.
+        If a world cannot be advanced to its first decision, the next world that can be advanced replaces it, with a
+        ``FailedWorld`` warning. The other worlds therefore keep their positions in the stream.
         """
         first, size = self.position, max(4 * count, SAMPLED_AT_ONCE)
         alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
@@ -156,7 +156,9 @@ class Stream:
         if start is None:
             raise PhysicsError(failed)
         for row, reason in failed.items():
-            warnings.warn(FailedWorld(f"world {first + row} of seed {self.seed}: {reason}; left out"), stacklevel=2)
+            warnings.warn(
+                FailedWorld(f"world {first + row} of seed {self.seed}: {reason}; this world is left out"), stacklevel=2
+            )
         if failed:
             later = np.searchsorted(starts, np.arange(alert.n)) % len(starts)
             start = self.prepare(alert.take(starts[later]))
@@ -174,7 +176,7 @@ class Stream:
         step, horizon = self._scenario.time_step_s, self._scenario.horizon_s
         if not (clock[:, START] < horizon).all():
             late = float(clock[:, START].max())
-            raise InvalidInput(f"reset: nobody decides before the horizon ({late:g} s >= {horizon:g} s)")
+            raise InvalidInput(f"reset: the first decision, at {late:g} s, must be before the horizon, {horizon:g} s")
         clock[:, LAST_STEP] = Decisions(clock[:, START], step).before(horizon)
         wanted = np.zeros(alert.speeds_mps.shape)
         for vehicle, script in self._state_free.items():
@@ -188,7 +190,8 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
     """Raise ``InvalidInput`` unless there are ``n`` lines of ``vehicles`` vehicles, at t = 0 and without any impact."""
     if (worlds.n, worlds.N) != (n, vehicles):
         raise InvalidInput(
-            f"reset: {count_of(worlds.n, 'world')} of {worlds.N} vehicles are given; {n} of {vehicles} vehicles needed"
+            f"reset: got {count_of(worlds.n, 'world')} of {worlds.N} vehicles; {count_of(n, 'world')} of {vehicles}"
+            " vehicles must be passed"
         )
     at_alert = (worlds.time_s == 0.0) & ~worlds.pair_hit.any(axis=1) & ~worlds.obstacle_hit
     if not at_alert.all():
@@ -198,7 +201,7 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
 
 
 def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
-    """Return worlds advanced from the alert to their first decision, packed together with the harm up to then.
+    """Return worlds advanced from the alert to their first decision, packed with the harm until this time.
 
     Args:
         alert: n worlds at t = 0.
@@ -211,7 +214,7 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
 
 
 def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
-    """Return worlds packed into two arrays (``physics.columns``), with ``harm`` as their harm so far."""
+    """Return ``worlds`` packed into two arrays (``physics.columns``), with ``harm`` as their harm so far."""
     packed = Packed.of(worlds)
     column, pairs = packed.column, worlds.N - 1
     for group, values in enumerate((harm.first_impact_harm, harm.total_harm, harm.count)):

@@ -22,12 +22,12 @@ from ethbrake_marl.physics.state import Floats, Worlds
 class Terms:
     """The reward of a batch: adds to every step the terms that the compiled step does not know.
 
-    An *objective* says whose harm a vehicle's reward counts; without one, it is the harm of the whole line. *Shaping*
-    adds differences of a potential.
+    An *objective* says whose harm a vehicle's reward counts; without an objective, the harm of the whole line counts.
+    *Shaping* adds differences of a potential.
 
     Args:
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        scenario: scenario whose objective holds if the reward names none.
+        scenario: scenario whose objective is used if the reward has none.
         learners: indices of the vehicles (0 = front) that learn, or that an evaluated agent controls.
         vector: components of a vector reward (``game.reward_vector``); None: rewards are numbers.
 
@@ -57,9 +57,9 @@ class Terms:
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
-        """Return the vector reward of a step, [n, N, K]; 0 for episodes that had ended before it.
+        """Return the vector reward of a step, [n, N, K]; 0 for episodes that had ended before the step.
 
-        ``before`` is the harm before the step, ``state`` the state after it.
+        ``before``: harm before the step. ``state``: state after the step.
         """
         vector = vector_of(self.components, state.ledger.since(before), self.params.harm_count, step.terms)
         vector[state.ended & ~step.ended] = 0.0
@@ -76,7 +76,7 @@ class Terms:
     ) -> State:
         """Add the further terms to the reward of a step, in place, and return the state with its new potentials.
 
-        Episodes that had ended before the step get nothing.
+        Episodes that had ended before the step get no reward.
 
         Args:
             step: results of the compiled step; ``further`` and ``reward`` are changed.
@@ -84,7 +84,7 @@ class Terms:
             scenario: the scenario.
             before: harm before the step; None without objectives.
             impacts_before: impacts of the episodes before the step; None if no measure needs them.
-            worlds: worlds after the step if the reward is shaped; else None.
+            worlds: worlds after the step if the reward is shaped, otherwise None.
 
         """
         if before is not None and self.params.harm > 0.0:
@@ -109,7 +109,7 @@ class Terms:
         return state
 
     def _outcome(self, step: Step, state: State, time_step_s: float) -> StepOutcome:
-        """Return the facts of a step from which measures are computed; ``state`` is the state after it."""
+        """Return the quantities of a step from which measures are computed; ``state`` is the state after the step."""
         motion, params, column = state.motion, state.params, state.packed.column
         return StepOutcome(
             step.first_impact_harm,
@@ -129,7 +129,7 @@ class Terms:
         )
 
     def potentials(self, worlds: Worlds, scenario: Game) -> Floats:
-        """Return the shaping potential of every learner, 0 for other vehicles, [n, N]."""
+        """Return the shaping potentials, [n, N]: the potential of every learner, and 0 for other vehicles."""
         potentials = np.zeros(worlds.speeds_mps.shape)
         shared = self.params.potential(worlds, self._learners, scenario.horizon_s)
         potentials[:, self._learner_index] = shared[:, np.newaxis]

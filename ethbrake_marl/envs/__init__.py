@@ -1,4 +1,4 @@
-"""Environments: PettingZoo (parallel, AEC), Gymnasium, Gymnasium vector and SB3 ``VecEnv``; and ``render()``."""
+"""Environments for PettingZoo (parallel and AEC), Gymnasium (single and vector) and Stable-Baselines3."""
 
 from typing import TYPE_CHECKING
 

@@ -1,7 +1,6 @@
-"""The random draws behind the worlds of an environment: initial states, vehicle types and scenarios, as columns.
+"""Random draws of an environment's worlds: initial states, vehicle types and scenarios, as columns.
 
-Worlds are pure functions of scenario, seed and number. So nothing is stored while episodes run; the worlds are drawn
-again on request.
+A world is a function of scenario, seed and number. It is therefore drawn again on request, instead of being stored.
 """
 
 from __future__ import annotations
@@ -24,14 +23,15 @@ Columns = dict[str, NDArray[Any]]
 
 
 def describe_worlds(engine: Engine) -> Columns:
-    """Return the random draw of each running world, as columns: ``{"gap_1_m": [n], "mass_2_t": [n], ...}``.
+    """Return the random draw of each running world, as columns such as ``{"gap_1_m": [n], "mass_2_t": [n]}``.
 
-    There is a column for each quantity of the world at the alert (the moment at which the episode begins), named as in
-    a table of initial states. A mixture adds ``scenario``, vehicle types add ``vehicle_2_type`` for worlds that were
-    drawn. ``world_seed`` and ``world`` are as in the infos.
+    There is one column for each quantity of a world at the alert, with the same name as in a table of initial states.
+    For worlds that were drawn, a mixture adds the column ``scenario``, and vehicle types add ``vehicle_2_type`` and so
+    on. ``world_seed`` and ``world`` are the same as in the infos.
 
-    Raises ``InvalidInput`` for worlds whose draw is unknown. These are worlds that the caller passed, after a snapshot
-    was restored, and a world that could not be advanced to its first decision, so that another world replaced it.
+    Raises ``InvalidInput`` in two cases: the caller had passed the worlds, and the environment was then restored from a
+    snapshot, which does not contain them; or the physics failed before the first decision of a world, so that another
+    world replaced it.
     """
     numbers, placed = engine.roster.numbers, engine.roster.given
     named = {"world_seed": np.full(engine.n, engine.roster.seed), "world": numbers.copy()}
@@ -39,8 +39,8 @@ def describe_worlds(engine: Engine) -> Columns:
     if own.any():
         if placed is None:
             raise InvalidInput(
-                "describe_worlds: these episodes go on from a snapshot, which does not keep worlds that were given;"
-                " ask again once they have ended, or after a reset"
+                "describe_worlds: the initial states of these worlds are not known, because the environment was"
+                " restored from a snapshot; call describe_worlds after these episodes have ended, or after a reset"
             )
         columns = QUANTITY.columns(placed)
     if not own.all():
@@ -57,8 +57,8 @@ def describe_worlds(engine: Engine) -> Columns:
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     """Draw the worlds with the numbers ``numbers`` in the training stream again, and return them in this order.
 
-    Raises ``InvalidInput`` if the running worlds of the engine differ from them: a world that could not be advanced to
-    its first decision was replaced by another world.
+    Raises ``InvalidInput`` if a drawn world differs from the running world, because the physics failed in the drawn
+    world before its first decision.
     """
     ordered, places = np.unique(numbers, return_inverse=True)
     breaks = np.flatnonzero(np.diff(ordered) > _MOST_APART) + 1
@@ -77,7 +77,7 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     if not same.all():
         k = int(rows[np.argmin(same)])
         raise InvalidInput(
-            f"describe_worlds: world {engine.roster.numbers[k]} of seed {engine.roster.seed} could not be advanced to"
-            f" its first decision; another one stands in row {k}"
+            f"describe_worlds: row {k} is unknown, because the physics failed in world {engine.roster.numbers[k]} of"
+            f" seed {engine.roster.seed} before its first decision, and another world replaced it; call reset"
         )
     return sample

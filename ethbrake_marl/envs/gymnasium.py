@@ -1,4 +1,4 @@
-"""Gymnasium's interface: one learner, one world."""
+"""Environment for Gymnasium, with one learner and one world."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Specified:
-    """Mixin for environments that ``gymnasium.make`` makes: its ``spec`` stores settings only as plain data for JSON.
+    """Mixin for environments of ``gymnasium.make``, whose ``spec`` stores all settings as plain data for JSON.
 
-    A scenario object, for instance, becomes a mapping, and a path becomes a text.
+    For instance, a scenario object becomes a mapping, and a path becomes a text.
     """
 
-    engine: Engine  # the engine that moves the worlds, set by the environment
-    max_episode_steps: int | None = None  # largest number of steps of an episode; None: the horizon limits it alone
-    _spec: EnvSpec | None = None  # the value of ``spec``
+    engine: Engine  # engine that moves the worlds, set by the environment
+    max_episode_steps: int | None = None  # largest number of steps of an episode; None: an episode ends at the horizon
+    _spec: EnvSpec | None = None  # value of the property ``spec``
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's record of how the environment was made; None if it was not made by an id.
+        """Gymnasium's record of how the environment was made; None if ``gymnasium.make`` did not make it.
 
-        No episode is longer than its ``max_episode_steps``.
+        Its ``max_episode_steps`` is an upper bound of the length of an episode.
         """
         return self._spec
 
@@ -55,7 +55,7 @@ class Specified:
     def spec(self, spec: EnvSpec | None) -> None:
         if spec is not None:
             kwargs = {name: _plain(value) for name, value in spec.kwargs.items()}
-            if kwargs.get("learners") is not None:  # may be an exhausted iterator
+            if kwargs.get("learners") is not None:  # the setting may be an iterator that is already exhausted
                 kwargs["learners"] = [self.engine.scenario.vehicle_names[i] for i in self.engine.learners]
             scenario = self.engine.scenario
             from_alert = int(Decisions(np.zeros(1), scenario.time_step_s).before(scenario.horizon_s)[0])
@@ -64,7 +64,7 @@ class Specified:
 
 
 def _plain(setting: Any) -> Any:
-    """Return a setting of an environment as plain data for JSON: a ``Scenario`` as a mapping, a path as a text."""
+    """Return a setting of an environment as plain data for JSON."""
     if isinstance(setting, Scenario):
         return setting.declared()
     if isinstance(setting, RewardParams):
@@ -83,25 +83,26 @@ def _plain(setting: Any) -> Any:
 
 
 class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]):
-    """One learner brakes in a line of vehicles that follow their scripts: ``gymnasium.make("EthBrake-v0")``.
+    """Environment with one learner in a line of vehicles that follow scripts (``gymnasium.make("EthBrake-v0")``).
 
-    Observation: float32 [F], the features of ``ObservationSpec``. Action: [1] in [-1, 1]; -1 full braking capacity, 0
-    coasts, +1 full driving capacity. Terminated: all vehicles are at rest and no command would move one. Truncated:
-    at the horizon. Infos: docs/environments.md. ``reset(seed=s)`` starts the stream of worlds of seed s, ``reset()``
-    goes on in it; ``options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}}`` starts from that
-    state. Raises ``InvalidInput`` for more or fewer than one learner, an action outside [-1, 1], and a step without an
-    episode.
+    - Observation: the features of ``ObservationSpec``, float32 [F].
+    - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
+    - End: it is *terminated* when all vehicles are at rest and no command would move one, *truncated* at the horizon.
+    - Infos and options of ``reset``: docs/environments.md.
 
     Args:
-        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
+        scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
         render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
-        learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
-        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what the learner observes; None: ``observation_for(scenario)``.
-        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
-            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
-        reward_vector: None: a reward is a number. ``vehicles``: it is an array with minus the harm of the step that
-            each vehicle bears; a list: with these components (docs/environments.md).
+        learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
+            of the scenario.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
+        observation: features that the learner observes; None: ``observation_for(scenario)``.
+        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
+            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N], minus the harm that each
+            vehicle bears in the step. A list: a reward is an array with the named components (docs/environments.md).
+
+    Raises ``InvalidInput`` unless there is exactly one learner.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -130,7 +131,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         self.engine = make_engine(
             scenario, 1, learners=learners, reward=reward, observation=observation, reward_vector=reward_vector
         )
-        if self.engine.components:  # as MO-Gymnasium has it
+        if self.engine.components:  # attributes of MO-Gymnasium
             self.reward_space = reward_box(self.engine)
             self.reward_dim = len(self.engine.components)
         self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode)
@@ -144,12 +145,12 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode; return the observation and the info.
+        """Start an episode, and return observation and info.
 
         Args:
-            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
-            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
-                docs/environments.md.
+            seed: start the first world of this seed; None: start the next world of the current seed.
+            options: choose the world with ``{"initial_state": ...}``, or with
+                ``{"listed_world": {"seed": 7, "number": 3}}`` (docs/environments.md).
 
         """
         self._restart(seed, options)
@@ -158,9 +159,9 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         return self._observe(), Report.of(self.engine).plain_infos(self._column)[0]
 
     def step(self, action: NDArray[Any]) -> tuple[Observations, Any, bool, bool, dict[str, Any]]:
-        """Advance by one time step; return observation, reward, terminated, truncated and info.
+        """Advance by one time step, and return observation, reward, terminated, truncated and info.
 
-        ``action`` is [1] in [-1, 1]: -1 full braking capacity, 0 coasts, +1 full driving capacity.
+        ``action`` is an array [1] in [-1, 1]: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
         """
         if not self._running:
             raise InvalidInput("step: no episode is running; call reset first")

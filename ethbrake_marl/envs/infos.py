@@ -1,14 +1,19 @@
-"""Infos of every interface, computed once for all vehicles of all worlds. A reset and a step give the same keys.
+"""Infos of all environments: the entries of ``info``, with the same keys after a reset and after a step.
 
-``time_s``; ``command_in_force_mps2``, the command in force up to now (0 up to the latency); ``chosen_command_mps2`` and
-``chosen_action``, the command that the vehicle asked for, whoever chose it (0 before a learner's first step); the harm
-so far that the vehicle bears, under both counts; the harm of the whole world; and whether there has been an impact.
-About the last step: ``cost``, the harm that it added to the line, as the reward counts impacts (for safe-RL libraries),
-and ``reward_NAME``, each term of the reward before its weight; all are 0 after a reset. ``world_seed`` and ``world``
-identify the world, so that it can be played again (-1: passed by the caller). With a ``v2x`` channel,
-``known_from_s`` [N]: the time from which this vehicle acts on news of each vehicle (infinite: never; for itself: its
-latency). With periodic messages, ``age_s`` [N]: age of the newest received sample of each vehicle (infinite: none).
-Behind a shield, also the shield's infos, as ``shield_NAME``.
+- ``time_s``: time since the alert (s).
+- ``command_in_force_mps2``: command that the vehicle executes (m/s2); 0 until its latency has elapsed.
+- ``chosen_command_mps2``, ``chosen_action``: command (m/s2) and action that policy, caller or script chose; 0 before a
+  learner's first step.
+- ``first_impact_harm``, ``total_harm``: harm that the vehicle has borne so far (m2/s2).
+- ``world_first_impact_harm``, ``world_total_harm``: harm of the whole line so far (m2/s2).
+- ``collided``: whether an impact has happened in this world.
+- ``cost``: harm that the last step added to the line (m2/s2), in the count of the reward; 0 after a reset.
+- ``reward_NAME``: each term of the last step's reward before its weight; 0 after a reset.
+- ``world_seed``, ``world``: seed and number of the world; the number is -1 for a world that the caller passed.
+- ``known_from_s`` [N], with a ``v2x`` channel: time from which the vehicle acts on news of each vehicle (s; infinite:
+  never). Its entry for the vehicle itself is the vehicle's latency.
+- ``age_s`` [N], with periodic messages: age of the newest sample received from each vehicle (s; infinite: none).
+- ``shield_NAME``, with a shield: infos of the shield.
 """
 
 from __future__ import annotations
@@ -49,9 +54,9 @@ _FLOAT32 = np.dtype(np.float32)
 
 
 def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
-    """Return the infos of the engine's shield, each [n, N] with the name ``shield_NAME``; empty without a shield.
+    """Return the infos of the engine's shield, by the name ``shield_NAME``, each [n, N]; empty without a shield.
 
-    ``rows`` are the indices of the worlds to include; None: all.
+    ``rows`` are the indices of the worlds to include; None: all worlds.
     """
     if engine.guard is None or engine.guarded is None:
         return {}
@@ -60,14 +65,14 @@ def shield_columns(engine: Engine, rows: Ints | None = None) -> Columns:
 
 
 def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, Any]]:
-    """Return one dictionary of plain values for each world and vehicle: ``[{"time_s": 0.5, "collided": 0.0}, ...]``.
+    """Return one dictionary of plain values for each world and vehicle, such as ``{"time_s": 0.5, "collided": 0.0}``.
 
-    The list begins with the vehicles of the first world.
+    The result begins with all vehicles of the first world.
 
     Args:
-        columns: name -> values [n, N].
+        columns: name of an info -> values [n, N].
         vehicles: indices of the vehicles to include.
-        count: length of the list if ``columns`` is empty; its dictionaries are then empty.
+        count: number of empty dictionaries to return if ``columns`` is empty.
 
     """
     values = [column.take(vehicles, axis=1).reshape(-1).tolist() for column in columns.values()]
@@ -75,27 +80,27 @@ def plain_rows(columns: Columns, vehicles: Ints, count: int) -> list[dict[str, A
 
 
 class Report(NamedTuple):
-    """Everything that the infos contain at one moment, for n worlds of N vehicles."""
+    """Content of the infos at one moment, for n worlds of N vehicles."""
 
-    values: Floats  # [n, N, len(COLUMNS)] the infos named in COLUMNS, in this order
-    cost: Floats  # [n] harm that the step added to the line (m2/s2); 0 after a reset
-    terms: dict[str, Floats]  # name of a reward term -> its value in the step, [n] or [n, N]; 0 after a reset
-    world_seed: int  # seed of the stream of worlds
-    world: Ints  # [n] number of each world in the stream of that seed
-    known_from_s: Floats | None  # [n, N, N] time from which vehicle i may use messages about j (s); None: no channel
+    values: Floats  # [n, N, len(COLUMNS)] values of the infos in COLUMNS, in the same order
+    cost: Floats  # [n] harm that the last step added to the line (m2/s2); 0 after a reset
+    terms: dict[str, Floats]  # name of a reward term -> its value in the last step, [n] or [n, N]; 0 after a reset
+    world_seed: int  # seed of the worlds
+    world: Ints  # [n] number of each world among the worlds of this seed
+    known_from_s: Floats | None  # [n, N, N] time from which vehicle i may use news of vehicle j (s); None: no channel
     age_s: Floats | None  # [n, N, N] age of vehicle i's newest sample of vehicle j (s); None: no periodic messages
-    shield: Columns  # name -> info of the shield, [n, N]; empty without a shield
+    shield: Columns  # name of an info of the shield -> values [n, N]; empty without a shield
 
     @classmethod
     def of(cls, engine: Engine, step: Step | None = None, rows: Ints | None = None) -> Report:
-        """Return the report of an engine's worlds as they are now.
+        """Return the report of the present moment in an engine's worlds.
 
-        Call it after a step before ended episodes are replaced by new ones.
+        After a step, call this method before new episodes replace the ended episodes.
 
         Args:
             engine: the engine.
             step: results of the last step; None after a reset.
-            rows: indices of the worlds to include; None: all.
+            rows: indices of the worlds to include; None: all worlds.
 
         """
         now, world = engine.state, engine.roster.numbers
@@ -121,14 +126,13 @@ class Report(NamedTuple):
         return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
     def columns(self) -> dict[str, Floats]:
-        """Return the infos named in ``COLUMNS``: name -> values of all vehicles [n, N]."""
+        """Return the infos in ``COLUMNS`` by name, each [n, N]."""
         return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
 
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
-        """Return one dictionary of infos for each vehicle in ``vehicles`` (indices), world by world.
+        """Return one dictionary of infos for each world and each vehicle in ``vehicles`` (indices), world by world.
 
-        The values are plain numbers, except ``chosen_action``, an array [1], and ``known_from_s`` and ``age_s``, arrays
-        [N].
+        The values are plain numbers, except the arrays ``chosen_action`` [1], ``known_from_s`` [N] and ``age_s`` [N].
         """
         worlds: list[list[list[Any]]] = self.values.take(vehicles, axis=1).tolist()
         numbers, costs = self.world.tolist(), self.cost.tolist()
@@ -170,13 +174,13 @@ class Report(NamedTuple):
     def batch_info(self, vehicle: int, rows: Bools, stepped: Bools) -> dict[str, Any]:
         """Return one vehicle's infos in all worlds in Gymnasium's vector format.
 
-        This is ``{"time_s": [n], "_time_s": [n], ...}``; the entry with an underscore marks the worlds that have the
-        info.
+        There are two arrays for each info, such as ``time_s`` [n] and ``_time_s`` [n]. The array ``_time_s`` is true
+        for the worlds that have the info ``time_s``.
 
         Args:
             vehicle: index of the vehicle (0 = front).
-            rows: [n] worlds that have infos.
-            stepped: [n] worlds in which values about the last step are given; they are 0 in the others.
+            rows: mask of the worlds that have infos, [n].
+            stepped: mask of the worlds that report values of the last step, [n]; in all others these values are 0.
 
         """
         columns: dict[str, NDArray[Any]] = {name: info[:, vehicle] for name, info in self.columns().items()}
@@ -201,9 +205,14 @@ class Report(NamedTuple):
 
 @compiled
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
-    """Write the infos named in ``COLUMNS`` to ``out`` [n, N, len(COLUMNS)].
+    """Write the infos in ``COLUMNS`` to ``out``.
 
-    ``state`` and ``params`` are packed worlds (``physics.columns``), ``wanted`` [n, N] the commands of the vehicles.
+    Args:
+        state: packed states of the worlds (``physics.columns``), which contain motion and harm.
+        params: packed parameters of the worlds (``physics.columns``), which contain masses and capacities.
+        wanted: chosen command of each vehicle, [n, N] m/s2.
+        out: array to write to, [n, N, len(COLUMNS)].
+
     """
     n, N = wanted.shape
     column = columns(state)
@@ -239,24 +248,24 @@ def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> 
 
 
 class Begun:
-    """Base class of all environments: it holds an engine, and starts episodes by a seed and options.
+    """Base class of all environments, which starts episodes from a seed and options.
 
-    A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. ``np_random`` and
-    ``np_random_seed`` have the same meaning as in ``gymnasium.Env``.
+    A subclass sets ``engine`` in its constructor, and calls ``_restart`` in its ``reset``. The worlds of a seed form a
+    *stream*: each new episode takes the next world. ``np_random`` and ``np_random_seed`` are as in ``gymnasium.Env``.
     """
 
-    engine: Engine  # the engine that moves the worlds
+    engine: Engine  # engine that moves the worlds
     _known_options: Sequence[str] = (INITIAL_STATE, LISTED_WORLD)  # keys that ``options`` of ``reset`` may have
     _started = False  # whether an episode has begun
-    _goes_on = False  # whether a reset without a seed continues the running stream
+    _goes_on = False  # whether a reset without a seed continues the current stream
     _np_random: np.random.Generator | None = None
     _np_random_seed: int | None = None  # -1: unknown, because the user set the generator
 
     @property
     def np_random(self) -> np.random.Generator:
-        """Random generator for wrappers. The worlds do not depend on it, only on ``np_random_seed``.
+        """Random generator for wrappers. The worlds depend on ``np_random_seed``, not on the state of this generator.
 
-        After you set another generator, each ``reset`` without a seed draws the seed of its worlds from it, until a
+        If you set another generator, each ``reset`` without a seed draws a new seed from this generator, until you call
         ``reset`` with a seed.
         """
         if self._np_random is None:
@@ -272,7 +281,7 @@ class Begun:
 
     @property
     def np_random_seed(self) -> int:
-        """Seed of the stream of worlds, chosen at random unless a seed was passed; -1 after ``np_random`` was set."""
+        """Seed of the stream of worlds, random if no seed was passed; -1 after the user has set ``np_random``."""
         if self._np_random_seed is None:
             self._set_seed(chosen_seed(None))
             assert self._np_random_seed is not None
@@ -282,19 +291,19 @@ class Begun:
         self._np_random, self._np_random_seed = np.random.default_rng(seed), seed
 
     def _restart(self, seed: int | None, options: Mapping[str, Any] | None) -> None:
-        """Start new episodes in all worlds, as ``reset`` does.
+        """Start new episodes in all worlds, for ``reset``.
 
-        With ``options["initial_state"]`` (see ``scenario.tables.worlds_from_state``) every world starts in that state.
-        With ``options["listed_world"] = {"seed": 7, "number": 3}`` the episode starts in that world of the evaluation
-        list; a batch starts in that world and those after it. With autoreset, later episodes come from the stream.
+        With ``options["initial_state"]``, every world starts in this state (``scenario.tables.worlds_from_state``).
+        With ``options["listed_world"] = {"seed": 7, "number": 3}``, the first world is world 3 of the evaluation list
+        with seed 7, the second one is world 4, and so on. Episodes that start by autoreset take worlds of the stream.
         Other options cause the warning ``UnknownResetOption`` and are ignored.
 
         Args:
-            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
-            options: the options; None: none.
+            seed: start with the first world of this seed; None: continue with the next world of the stream.
+            options: the options; None: there are no options.
 
-        Raises ``InvalidInput``, without changing anything, for a seed that is not a whole number >= 0, an invalid
-        initial state or listed world, or both of them.
+        Raises ``InvalidInput`` for a seed that is not a whole number >= 0, for an invalid initial state or listed
+        world, and if both are passed. The environment is then unchanged.
 
         """
         named = None if seed is None else chosen_seed(seed)
@@ -306,14 +315,14 @@ class Begun:
         self._begin(named, wanted_worlds(self.engine, options or {}))
 
     def _begin(self, seed: int | None, worlds: Worlds | None) -> None:
-        """Start episodes in ``worlds`` (at the alert), or, if None, in the next worlds of a stream.
+        """Start episodes in ``worlds`` (at the alert), or in the next worlds of the stream if ``worlds`` is None.
 
-        With a ``seed`` the stream starts anew from its first world. Without a seed the current stream continues; but if
-        the user has set ``np_random``, a new seed is drawn from it.
+        With a ``seed``, a new stream begins. Without a seed, the current stream continues; if the user has set
+        ``np_random``, a new stream begins, with a seed drawn from this generator.
         """
         drawn, used = seed is None and self._np_random_seed == -1, seed
         if drawn:
-            used = int(copy.deepcopy(self.np_random).integers(2**63))  # from a copy, because the reset may still fail
+            used = int(copy.deepcopy(self.np_random).integers(2**63))  # drawn from a copy, because the reset may fail
         elif seed is None and not self._goes_on:
             used = self.np_random_seed
         self.engine.reset(seed=used, worlds=worlds)
@@ -325,10 +334,10 @@ class Begun:
 
     def _check_started(self, what: str) -> None:
         if not self._started:
-            raise InvalidInput(f"{what}: no episode was started; call reset first")
+            raise InvalidInput(f"{what}: no episode has started; call reset first")
 
     def describe_worlds(self) -> Columns:
-        """Return the random draw of each running world: column name -> values [worlds].
+        """Return the random draw of each running world: name of a column -> values [n].
 
         See ``envs.draws.describe_worlds``.
         """
@@ -337,26 +346,26 @@ class Begun:
 
 
 class OneWorld(Begun):
-    """Base class of the environments with a single world: adds ``describe_world``, ``render`` and ``close``.
+    """Base class of environments with a single world, with the methods ``describe_world``, ``render`` and ``close``.
 
     A subclass sets ``viewer`` in its constructor.
     """
 
-    viewer: Viewer  # draws the pictures of the running episode
+    viewer: Viewer  # object that draws pictures of the running episode
 
     def describe_world(self) -> dict[str, Any]:
-        """Return the random draw of the running world: name -> number or text; see ``envs.draws.describe_worlds``."""
+        """Return the random draw of the running world: name -> number or text (``envs.draws.describe_worlds``)."""
         self._check_started("describe_world")
         return {name: column[0].item() for name, column in describe_worlds(self.engine).items()}
 
     def render(self) -> Any:
-        """Return the picture of the present moment, in the form of the render mode.
+        """Return a picture of the present moment, whose type depends on the render mode.
 
-        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of frames since the last call. ``ansi``: a
-        text. ``human``: None, because the window shows every step anyway.
+        ``rgb_array``: a frame [H, W, 3] uint8. ``rgb_array_list``: the list of all frames since the last call.
+        ``ansi``: a text. ``human``: None, because the window shows every step.
         """
         return self.viewer.render()
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if one is open."""
         self.viewer.close()

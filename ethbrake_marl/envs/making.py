@@ -1,4 +1,4 @@
-"""Build the parts that all interfaces share: spaces, engine, actions, seeds and reset options."""
+"""Functions that all environments use: spaces, engine, actions, seeds and options of ``reset``."""
 
 from __future__ import annotations
 
@@ -23,32 +23,33 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario, as_scenario
 from ethbrake_marl.scenario.tables import worlds_from_state
 
-AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping holds the content of a scenario file
+AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
 
 
 def feature_box(features: Sequence[Feature]) -> Box[np.float32]:
-    """Return the observation space of the features: a float32 box [F] with their bounds, which are finite."""
+    """Return the observation space of the features: a float32 box [F] with the (finite) bounds of the features."""
     low, high = (np.array([getattr(f, side) for f in features], np.float32) for side in ("low", "high"))
     return Box(low, high, dtype=np.float32)
 
 
 def action_box() -> Box[np.float32]:
-    """Return the action space, a float32 box [1]: -1 full braking capacity, 0 coasts, +1 full driving capacity."""
+    """Return the action space, a float32 box [1] from -1 (full braking capacity) to +1 (full driving capacity)."""
     return Box(-1.0, 1.0, (1,), dtype=np.float32)
 
 
 def reward_box(engine: Engine) -> Box[np.float64]:
-    """Return the space of vector rewards of an engine that has them: a float64 box [K].
+    """Return the space of the engine's vector rewards: a float64 box [K] for K components.
 
-    It is float64, so that weighted sums of a vector equal the reward of the same weights to the bit.
+    With float64, a weighted sum of the components exactly equals the scalar reward with the same weights.
     """
     return Box(-np.inf, np.inf, (len(engine.components),), dtype=np.float64)
 
 
 def learner_action_space(actions: int | None) -> Any:
-    """Return the action space of a learner: ``action_box()``, or that of as many discrete ``actions``.
+    """Return the action space of a learner.
 
-    Raises ``InvalidInput`` unless ``actions`` is None or a whole number, at least 2.
+    ``actions`` is the number of discrete actions, or None for ``action_box()``. Raises ``InvalidInput`` for a number
+    that is not a whole number of at least 2.
     """
     if actions is None:
         return action_box()
@@ -66,22 +67,24 @@ def make_engine(
     seed: int = 0,
     reward_vector: RewardVector | None = None,
 ) -> Engine:
-    """Return an engine with ``n`` worlds and any number of learners, for a training loop of your own.
+    """Return an engine with ``n`` worlds and any number of learners, for your own training loop.
 
     Args:
-        scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
-        n: number of worlds that are advanced together, at least 1.
-        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
-        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what every vehicle observes, or a mapping from vehicle to its observation; None: the scenario's.
+        scenario: name of a shipped scenario, path of a YAML file, content of such a file as a mapping, or a
+            ``Scenario``.
+        n: number of worlds that are simulated together, at least 1.
+        learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
+        observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
+            observation of the scenario.
         seed: seed of the stream of worlds.
-        reward_vector: components of a vector reward, which each step tells as ``vector`` beside its ``reward``; None:
-            there is none.
+        reward_vector: components of a vector reward, which the result of a step has as ``vector`` in addition to
+            ``reward``; None: there is no vector reward.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
     >>> engine = eb.make_engine("cooperation-3-pair", 4, seed=7)
-    >>> engine.observe_all().shape, engine.step(np.full((4, 2), -1.0)).reward.shape  # of learners, of all vehicles
+    >>> engine.observe_all().shape, engine.step(np.full((4, 2), -1.0)).reward.shape
     ((4, 2, 27), (4, 3))
 
     """
@@ -93,7 +96,7 @@ def make_engine(
             " as a mapping, or a list of groups and features, for instance ['own', 'front_1']"
         )
     if learners is not None and not isinstance(learners, Iterable):
-        raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
+        raise InvalidInput(f"learners = {learners!r}: must be a list of vehicle names, for instance ['vehicle_2']")
     if learners is not None:
         loaded = loaded.with_learners(learners)
     return Engine(
@@ -113,17 +116,25 @@ def only_learner(engine: Engine) -> int:
     check_one_learner(
         engine.scenario.name,
         [engine.scenario.vehicle_names[i] for i in engine.learners],
-        "this environment needs exactly one: pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env",
+        "this environment needs exactly one learner: pass learners=['vehicle_2'], or use parallel_env or"
+        " make_sb3_vec_env",
     )
     return engine.learners[0]
 
 
 def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | None) -> Floats | dict[int, Floats]:
-    """Return the learners' actions of an engine with one world, as ``Engine.step`` takes them: [1, L].
+    """Return the actions of the L learners in the form that ``Engine.step`` takes for one world: [1, L].
 
-    ``actions`` maps vehicle names to actions [1], or to indices of ``count`` discrete actions. Raises ``InvalidInput``
-    naming the vehicle whose action is missing or has the wrong shape; the engine checks the range. Behind a shield,
-    actions may be missing; then the result is a mapping from vehicle index to action [1].
+    With a shield, actions may be missing. The result is then a mapping from a vehicle's index to its action [1].
+
+    Args:
+        engine: engine with one world.
+        actions: name of a learner -> action [1] or, with discrete actions, index of the action.
+        count: number of discrete actions; None: actions are numbers in [-1, 1].
+
+    Raises ``InvalidInput``, with the vehicle's name, if an action is missing or has the wrong shape. ``Engine.step``
+    checks the range of the actions.
+
     """
     names, columns = engine.scenario.vehicle_names, np.empty((1, len(engine.learners)))
     for c, vehicle in enumerate(engine.learners):
@@ -132,7 +143,7 @@ def learner_actions(engine: Engine, actions: Mapping[str, Any], count: int | Non
             if engine.guard is not None:
                 chosen = {i: actions[names[i]] for i in engine.learners if actions.get(names[i]) is not None}
                 return {i: checked_action(each, (1,), names[i], count) for i, each in chosen.items()}
-            raise InvalidInput(f"step: no action for the learner {name}")
+            raise InvalidInput(f"step: the action of learner {name} is missing")
         action = actions[name]
         is_plain = type(action) is np.ndarray and action.shape == (1,) and action.dtype.kind in "fiu"
         if count is not None or not is_plain:
@@ -149,22 +160,22 @@ RESET_MASK = "reset_mask"
 
 
 class UnknownResetOption(UserWarning):
-    """Warning: the environment does not know a key of ``reset``'s options, and ignores it."""
+    """Warning: ``options`` of ``reset`` has an unknown key, which is ignored."""
 
 
 class IgnoredAction(UserWarning):
-    """Warning: an action was passed for a vehicle that follows a script, and is ignored."""
+    """Warning: an action was passed for a vehicle that follows a script; the action is ignored."""
 
 
 def chosen_seed(seed: int | None) -> int:
-    """Return ``seed``, or, for None, a seed of 63 bits from the operating system's entropy.
+    """Return ``seed`` or, if it is None, a random seed of 63 bits from the operating system.
 
     Raises ``InvalidInput`` unless ``seed`` is None or a whole number >= 0.
     """
     if seed is None:
         entropy = np.random.SeedSequence().entropy
-        assert isinstance(entropy, int)  # always, when SeedSequence chooses it itself
-        return entropy % 2**63  # fits into the integers of every library that receives infos
+        assert isinstance(entropy, int)  # true if SeedSequence has no arguments
+        return entropy % 2**63  # infos contain the seed, and some libraries store it as a signed integer of 64 bits
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
         raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
     return int(seed)
@@ -173,9 +184,9 @@ def chosen_seed(seed: int | None) -> int:
 def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
     """Return the worlds that the ``options`` of a reset choose, one for each of the engine's worlds.
 
-    ``initial_state`` puts all of them in one state; ``listed_world`` chooses consecutive worlds of an evaluation list.
-    Without either key the result is None: the worlds come from the stream. Raises ``InvalidInput`` if both keys are
-    present, or if one is invalid.
+    With the key ``initial_state``, all worlds have this state. With the key ``listed_world``, the worlds are
+    consecutive worlds of an evaluation list. Without these keys the result is None: the worlds come from the stream.
+    Raises ``InvalidInput`` if both keys are present, or if a value is invalid.
     """
     if LISTED_WORLD not in options:
         if INITIAL_STATE not in options:
@@ -184,11 +195,12 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
             np.zeros(engine.n, np.int64)
         )
     if INITIAL_STATE in options:
-        raise InvalidInput(f"reset: {INITIAL_STATE} and {LISTED_WORLD} are both given; an episode has one start")
+        raise InvalidInput(f"reset: options has both {INITIAL_STATE} and {LISTED_WORLD}; pass only one of them")
     wanted = options[LISTED_WORLD]
     if not isinstance(wanted, Mapping) or set(wanted) != {"seed", "number"}:
         raise InvalidInput(
-            f"reset: {LISTED_WORLD} = {wanted!r}: must name a world of a list, for instance {{'seed': 7, 'number': 3}}"
+            f"reset: {LISTED_WORLD} = {wanted!r}: must be seed and number of a world in an evaluation list, for"
+            " instance {'seed': 7, 'number': 3}"
         )
     for name in ("seed", "number"):
         check_whole_number(f"reset: {LISTED_WORLD}: {name}", wanted[name], 0)
@@ -196,8 +208,12 @@ def wanted_worlds(engine: Engine, options: Mapping[str, Any]) -> Worlds | None:
 
 
 def warn_of_unknown(options: Iterable[str], known: Sequence[str]) -> None:
-    """Warn with ``UnknownResetOption``, once, about all names in ``options`` that are not in ``known``."""
+    """Issue one ``UnknownResetOption`` warning about all names in ``options`` that are not in ``known``."""
     unknown = sorted({str(name) for name in options} - set(known))
     if unknown:
         names, right = ", ".join(unknown), ", ".join(known)
-        warnings.warn(f"reset: unknown option {names}, ignored; known: {right}", UnknownResetOption, stacklevel=4)
+        warnings.warn(
+            f"reset: options has the unknown keys {names}, which are ignored; known keys: {right}",
+            UnknownResetOption,
+            stacklevel=4,
+        )

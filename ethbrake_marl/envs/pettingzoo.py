@@ -1,4 +1,4 @@
-"""PettingZoo's interfaces: all vehicles of one world are agents, acting in parallel, or in turn (AEC)."""
+"""Environments for PettingZoo: all vehicles of one world are agents, which act in parallel or in turn (AEC)."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from ethbrake_marl.physics.state import Ints
 
 
 class SeededInside:
-    """Mixin for wrappers: ``np_random`` and ``np_random_seed`` are read from, and set on, the innermost environment."""
+    """Mixin for wrappers, whose ``np_random`` and ``np_random_seed`` belong to the innermost environment."""
 
     unwrapped: Any  # the innermost environment
 
     @property
     def np_random(self) -> np.random.Generator:
-        """Random generator of the environment inside; see ``EthBrakeParallelEnv.np_random``."""
+        """Random generator of the innermost environment (``EthBrakeParallelEnv.np_random``)."""
         generator: np.random.Generator = self.unwrapped.np_random
         return generator
 
@@ -51,43 +51,43 @@ class SeededInside:
 
     @property
     def np_random_seed(self) -> int:
-        """Seed of the environment inside; see ``EthBrakeParallelEnv.np_random_seed``."""
+        """Seed of the innermost environment (``EthBrakeParallelEnv.np_random_seed``)."""
         seed: int = self.unwrapped.np_random_seed
         return seed
 
 
 class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's ``OrderEnforcingWrapper``, with ``np_random`` of the wrapped environment."""
+    """PettingZoo's ``OrderEnforcingWrapper``, with the random generator of the wrapped environment."""
 
     def __str__(self) -> str:
         return str(self.env)
 
 
 class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's wrapper from parallel to AEC, but an invalid action is refused at once, in its agent's own turn.
+    """PettingZoo's wrapper from parallel to AEC, which in addition checks each action in the turn of its agent.
 
-    The turn stays with that agent, so that it can act again.
+    After an invalid action, it is still the turn of the same agent, which can act again.
     """
 
     @classmethod
     def around(cls, env: ParallelEnv[str, Observations, NDArray[Any]]) -> AECEnv[str, Observations, NDArray[Any]]:
-        """Return the AEC environment of a parallel environment of this package, possibly wrapped.
+        """Return an AEC environment around a parallel environment of this package, which may have wrappers.
 
-        PettingZoo's order enforcement is included: methods called before ``reset`` raise an error.
+        Its methods raise an error if they are called before ``reset`` (PettingZoo's ``OrderEnforcingWrapper``).
         """
         return Ordered(cls(env))
 
     def step(self, action: Any) -> None:
         """Take the action [1] of the agent whose turn it is (``agent_selection``).
 
-        After the last agent's action, all vehicles advance by one time step. Raises ``InvalidInput`` for an invalid
-        action of a learner, and for any action but None after the agent's episode has ended.
+        After the action of the last agent, all vehicles advance by one time step. Raises ``InvalidInput`` for an
+        invalid action of a learner, and for an action other than None after the end of the agent's episode.
         """
         agent, engine, count = self.agent_selection, self.env.unwrapped.engine, self.env.unwrapped.actions
         assert isinstance(engine, Engine)
         if self.terminations[agent] or self.truncations[agent]:
             if action is not None:
-                raise InvalidInput(f"step: the episode of {agent} is over; only None may follow, or reset")
+                raise InvalidInput(f"step: the episode of {agent} has ended; pass the action None, or call reset")
         elif engine.scenario.vehicle_names.index(agent) in engine.learners and not (action is None and engine.guard):
             checked_action(action, (1,), agent, count)  # behind a shield, an action may be omitted
         super().step(action)
@@ -99,12 +99,12 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
         self._cumulative_rewards = {agent: self._no_reward() for agent in self.agents}
 
     def reward_space(self, agent: str) -> Any:
-        """Return the space of the vector rewards of the agent with this name, as ``EthBrakeParallelEnv`` does."""
+        """Return the space of the vector rewards of ``agent``, a float64 box [K]."""
         return self.unwrapped.reward_space(agent)
 
     @property
     def reward_spaces(self) -> dict[str, Any]:
-        """Spaces of the vector rewards, by agent name, for MOMAland."""
+        """Spaces of the vector rewards by the agent's name, for MOMAland."""
         spaces: dict[str, Any] = self.unwrapped.reward_spaces
         return spaces
 
@@ -113,7 +113,7 @@ class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # P
             self.rewards[agent] = self._no_reward()
 
     def _no_reward(self) -> Any:
-        """Return a reward of zero: the number 0 or, if rewards are vectors, a new array [K] of zeros."""
+        """Return a reward of zero: the number 0 or, with vector rewards, a new array [K] of zeros."""
         components = self.env.unwrapped.engine.components
         return np.zeros(len(components)) if components else 0
 
@@ -124,26 +124,31 @@ WhoIsAgent = Literal["all", "learners"]
 
 
 class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
-    """A line of vehicles ``vehicle_1`` (front) ... ``vehicle_N``, all of which are agents from the alert to the end.
+    """Environment in which the vehicles of a line, ``vehicle_1`` (front) to ``vehicle_N``, are agents.
 
-    Learners need an action [1] in [-1, 1] in each step: -1 full braking capacity, 0 coasts, +1 full driving capacity.
-    Actions of scripted vehicles are ignored; ``infos[agent]`` shows the commands of their scripts. All agents end at
-    the same time: terminated when all are at rest and no command would move one, truncated at the horizon. ``state()``
-    is the full state of the line, for central critics. Observations, rewards, infos and ``reset`` are as in
-    ``EthBrakeEnv``.
+    - Action: each learner needs an action in each step, an array [1] in [-1, 1]. -1 brakes with full capacity, 0
+      coasts, +1 drives with full capacity. Actions of vehicles with scripts are ignored; ``infos[agent]`` contains the
+      commands of their scripts.
+    - End: all agents end together, *terminated* when all vehicles are at rest and no command would move one,
+      *truncated* at the horizon.
+    - ``state()`` returns the full state of the line, for central critics.
+
+    Observations, rewards, infos and ``reset`` are as in ``EthBrakeEnv``.
 
     Args:
-        scenario: a shipped name, the path of a YAML file, its content as a mapping, or a ``Scenario``.
+        scenario: name of a shipped scenario, path of a YAML file, content of such a file as a mapping, or a
+            ``Scenario``.
         render_mode: ``human``, ``rgb_array``, ``rgb_array_list``, ``ansi``, or None (docs/environments.md).
-        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
-        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what every vehicle observes, or a mapping from name to observation; None: the scenario's.
-        agents: ``all`` vehicles, or ``learners`` only, for trainers that learn from every agent.
-        max_cycles: truncates an episode after this many steps; None: only at the horizon.
-        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
-            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
-        reward_vector: None: a reward is a number. ``vehicles``: it is an array with minus the harm of the step that
-            each vehicle bears; a list: with these components (docs/environments.md).
+        learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
+        observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
+            observation of the scenario.
+        agents: vehicles that are agents, ``all`` or ``learners``. Use ``learners`` for trainers that train all agents.
+        max_cycles: number of steps after which an episode is truncated; None: it is truncated at the horizon only.
+        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
+            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N], minus the harm that each
+            vehicle bears in the step. A list: a reward is an array with the named components (docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -187,42 +192,47 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         self._alike = len({seen[i] for i in self._vehicles.tolist()}) == 1
         self.observation_spaces = {names[i]: feature_box(seen[i].features) for i in self._vehicles.tolist()}
         if actions is not None and not learners:
-            raise InvalidInput(f"actions = {actions!r}: nobody learns in {self.engine.scenario.name!r}; leave it out")
+            raise InvalidInput(
+                f"actions = {actions!r}: scenario {self.engine.scenario.name!r} has no learner; omit actions, or pass"
+                " learners=['vehicle_2']"
+            )
         self.actions = actions
         self.action_spaces = {
             agent: learner_action_space(actions) if agent in learners else action_box()
             for agent in self.possible_agents
         }
         self.state_space = feature_box(state_features(self.engine.scenario))
-        if self.engine.components:  # as MOMAland has it
+        if self.engine.components:  # attribute of MOMAland
             self.reward_spaces = {agent: reward_box(self.engine) for agent in self.possible_agents}
 
     def observation_space(self, agent: str) -> Any:
-        """Return the observation space of the agent with this name, a float32 box [F]; the same object on each call."""
+        """Return the observation space of ``agent``, a float32 box [F]; always the same object."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Return the action space of the agent with this name; the same object on each call.
+        """Return the action space of ``agent``; always the same object.
 
-        It is a float32 box [1], or for a learner with discrete actions ``Discrete(actions)``.
+        The space is a float32 box [1] or, for a learner with discrete actions, ``Discrete(actions)``.
         """
         return self.action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:
-        """Return the space of the vector rewards of the agent with this name, a float64 box [K]."""
+        """Return the space of the vector rewards of ``agent``, a float64 box [K]."""
         if not self.engine.components:
-            raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
+            raise InvalidInput(
+                "reward_space: the rewards of this environment are numbers; create the environment with reward_vector"
+            )
         return self.reward_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode; return observations and infos by agent name.
+        """Start an episode, and return observations and infos by the agent's name.
 
         Args:
-            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
-            options: ``{"initial_state": ...}`` or ``{"listed_world": {"seed": 7, "number": 3}}`` choose the world; see
-                docs/environments.md.
+            seed: start the first world of this seed; None: start the next world of the current seed.
+            options: choose the world with ``{"initial_state": ...}``, or with
+                ``{"listed_world": {"seed": 7, "number": 3}}`` (docs/environments.md).
 
         """
         self._restart(seed, options)
@@ -233,15 +243,17 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
-        """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent name.
+        """Advance by one time step; return observations, rewards, terminations, truncations and infos by agent.
 
-        ``actions`` maps agent names to actions [1] in [-1, 1]. Raises ``InvalidInput`` naming the learner whose action
-        is missing or invalid.
+        ``actions`` maps the name of an agent to its action [1] in [-1, 1]. Raises ``InvalidInput`` if the action of a
+        learner is missing or invalid; the message names the learner.
         """
         if not self.agents:
             raise InvalidInput("step: no episode is running; call reset first")
-        if not isinstance(actions, (dict, Mapping)):  # dict first, because that check is faster
-            raise InvalidInput(f"step: actions = {actions!r}: must be a mapping such as {{'vehicle_2': [-1.0]}}")
+        if not isinstance(actions, (dict, Mapping)):  # dict first, because the check for dict is faster
+            raise InvalidInput(
+                f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
+            )
         for agent in actions:
             if agent not in self.action_spaces:
                 raise unknown_name("agent", agent, self.possible_agents)
@@ -270,22 +282,22 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         )
 
     def state(self) -> Observations:
-        """Return the full state of all vehicles, float32 [S] within ``state_space``."""
+        """Return the full state of the line, float32 [S], an element of ``state_space``."""
         self._check_started("state")
         state: Observations = full_state(self.engine.worlds, self.engine.scenario)[0].copy()
         return state
 
     def _warn_of_ignored(self, actions: Mapping[str, Any]) -> None:
-        """Warn once about actions that are ignored because their vehicles follow scripts."""
+        """Warn, once per environment, about actions that are ignored because their vehicles follow scripts."""
         ignored = [agent for agent in self._scripted if actions.get(agent) is not None]
         if not ignored:
             return
         self._scripted = []
         learners = [self.engine.scenario.vehicle_names[i] for i in self.engine.learners]
-        right = "nobody learns: name learners, for instance learners=['vehicle_2']"
+        right = "no vehicle is a learner; name learners, for instance learners=['vehicle_2']"
         if learners:
-            right = f"with agents='learners' the environment has the learners alone: {', '.join(learners)}"
-        text = f"step: actions of {', '.join(ignored)} are ignored, as scripts drive them; {right}"
+            right = f"create the environment with agents='learners' if only {', '.join(learners)} should be agents"
+        text = f"step: actions of {', '.join(ignored)} are ignored, because scripts drive these vehicles; {right}"
         warnings.warn(text, IgnoredAction, stacklevel=3)
 
     def _observations(self) -> dict[str, Observations]:
@@ -295,19 +307,20 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
         every = self.engine.observe_all(self._vehicles)
         return {agent: every[0, i] for i, agent in enumerate(self.possible_agents)}
 
-    def _infos(self, told: Report) -> Infos:
-        return dict(zip(self.possible_agents, told.plain_infos(self._vehicles), strict=True))
+    def _infos(self, report: Report) -> Infos:
+        return dict(zip(self.possible_agents, report.plain_infos(self._vehicles), strict=True))
 
 
 def _agent_vehicles(engine: Engine, agents: WhoIsAgent) -> Ints:
-    """Return the indices of the vehicles that are agents; raise ``InvalidInput`` unless ``agents`` is a known word."""
+    """Return the indices of the vehicles that are agents; raise ``InvalidInput`` for an invalid value of ``agents``."""
     if agents not in get_args(WhoIsAgent):
         raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
     if agents == "all":
         return np.arange(engine.scenario.vehicles)
     if not engine.learners:
         raise InvalidInput(
-            f"agents = 'learners': nobody learns in {engine.scenario.name!r}; name learners, or take 'all'"
+            f"agents = 'learners': scenario {engine.scenario.name!r} has no learner; pass learners=['vehicle_2'], or"
+            " agents='all'"
         )
     return np.array(engine.learners)
 
@@ -316,7 +329,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the environment with agents acting in turn (AEC), front to rear.
+    """Return the environment in which agents act in turn (AEC), from front to rear.
 
     ``scenario`` and ``settings`` are the arguments of ``parallel_env``.
 
@@ -331,9 +344,9 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 
 
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the environment with agents acting in turn (AEC), the same as ``raw_env``.
+    """Return the environment in which agents act in turn (AEC), the same as ``raw_env``.
 
-    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. Actions are not clipped, and nothing ends an
-    episode early: an invalid action raises ``InvalidInput`` in its agent's turn, and the turn stays with that agent.
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. Invalid actions are neither clipped nor do they
+    end the episode: they raise ``InvalidInput``, and it is still the turn of the same agent.
     """
     return raw_env(scenario, **settings)

@@ -1,17 +1,17 @@
-"""Ids of this environment in Gymnasium and PettingZoo. Registration does not import the interfaces."""
+"""Registration of the environments in Gymnasium and PettingZoo. It does not import the environments' modules."""
 
 from __future__ import annotations
 
 GYMNASIUM_ID = "EthBrake-v0"
 
-MO_GYMNASIUM_ID = "EthBrakeMO-v0"  # with vector rewards, for MO-Gymnasium
+MO_GYMNASIUM_ID = "EthBrakeMO-v0"  # environment with vector rewards, for MO-Gymnasium
 
 PETTINGZOO_ID = "ethbrake/ethbrake-v0"
 
 
 def register_environments() -> None:
-    """Register the environment's ids in Gymnasium and PettingZoo. A second call changes nothing."""
-    import gymnasium  # imported here because it would slow down --help
+    """Register the ids of the environments in Gymnasium and PettingZoo. A second call has no effect."""
+    import gymnasium  # imported here, because the import takes time
     import pettingzoo
 
     for id_ in (GYMNASIUM_ID, f"ethbrake/{GYMNASIUM_ID}"):
@@ -22,7 +22,7 @@ def register_environments() -> None:
             entry_point="ethbrake_marl.envs.gymnasium:EthBrakeEnv",
             vector_entry_point="ethbrake_marl.envs.vector:EthBrakeVectorEnv",
         )
-    if MO_GYMNASIUM_ID not in gymnasium.registry:  # its rewards are arrays, which Gymnasium's checker warns of
+    if MO_GYMNASIUM_ID not in gymnasium.registry:  # Gymnasium's checker would warn about array rewards
         gymnasium.register(
             MO_GYMNASIUM_ID,
             entry_point="ethbrake_marl.envs.gymnasium:EthBrakeEnv",

@@ -1,4 +1,4 @@
-"""Pictures of ``render()``: one moment of a world as text or pixels."""
+"""Pictures for ``render()``: one moment of a world as text or as pixels."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
 
 Frame = NDArray[np.uint8]  # [HEIGHT, WIDTH, 3]
 
-BODY_M = 4.5  # drawn length of a vehicle; in the physics, vehicles have no length
+BODY_M = 4.5  # drawn length of a vehicle (m); in the physics, vehicles have no length
 
-FLASH_S = 0.3  # time for which an impact is shown
+FLASH_S = 0.3  # time for which an impact is shown (s)
 
-# The palette of Okabe and Ito for colour-blind readers, without its yellow, which is invisible on white.
+# Palette of Okabe and Ito for colour-blind readers, without its yellow, which is hard to see on white.
 COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 _TEXT_WIDTH = 100  # width of the road in characters
 
-BEHIND_M, AHEAD_M = 3.0, 5.0  # least length of free road in view
+BEHIND_M, AHEAD_M = 3.0, 5.0  # smallest length of free road to show behind and ahead of the line (m)
 
-LEAST_WIDTH_M = 40.0  # least length of road in view
+LEAST_WIDTH_M = 40.0  # smallest length of road to show (m)
 
-LATE_S = 3.0  # longest latency that the view makes room for
+LATE_S = 3.0  # longest latency that is considered when the length of road is chosen (s)
 
 
 class View(NamedTuple):
-    """The stretch of road in a picture, as positions relative to Vehicle 1's front at the alert."""
+    """Stretch of road in a picture. Positions are relative to Vehicle 1's front at the alert."""
 
     left_m: float  # position of the left end (m)
     right_m: float  # position of the right end (m)
@@ -49,23 +49,23 @@ class Struck(NamedTuple):
 
     @property
     def who(self) -> str:
-        """The two parties of the impact in words, such as "Vehicles 1 and 2"."""
+        """Text that names the two parties of the impact, such as "Vehicles 1 and 2"."""
         return "Vehicle 1 and the obstacle" if self.pair < 0 else f"Vehicles {self.pair + 1} and {self.pair + 2}"
 
     @property
     def speed(self) -> str:
-        """The closing speed in words, such as "3.2 m/s" or "< 0.1 m/s"."""
+        """Closing speed as a text, such as "3.2 m/s" or "< 0.1 m/s"."""
         return f"{self.closing_mps:.1f} m/s" if self.closing_mps >= 0.05 else "< 0.1 m/s"
 
 
 class Scene(NamedTuple):
-    """One world at one moment, with everything that a picture shows."""
+    """Everything that a picture shows of one world at one moment."""
 
     title: str  # name of the scenario
     time_s: float  # time since the alert (s)
-    view: View  # the stretch of road that is shown
-    # [N] positions at which the front bumpers are drawn (m from Vehicle 1's at the alert). Vehicles have no length in
-    # the physics, but are drawn BODY_M long; the drawn gaps are the true ones.
+    view: View  # stretch of road that is shown
+    # [N] positions at which the front bumpers are drawn (m, relative to Vehicle 1's front at the alert). Vehicles are
+    # drawn with the length BODY_M and at their true gaps, although they have no length in the physics.
     front_m: Floats
     gaps_m: Floats  # [P] gap of each pair of neighbours (m)
     speeds_mps: Floats  # [N] speed of each vehicle (m/s)
@@ -74,21 +74,21 @@ class Scene(NamedTuple):
     driving_mps2: Floats  # [N] driving capacities (m/s2)
     latency_s: Floats  # [N] time since the alert at which each vehicle may act (s)
     hit: Bools  # [P] whether the pair has had an impact
-    struck: tuple[Struck, ...]  # impacts within the last FLASH_S seconds
+    struck: tuple[Struck, ...]  # impacts during the last FLASH_S seconds
     first_harm: float  # first-impact harm of the line so far (m2/s2)
     total_harm: float  # total harm of the line so far (m2/s2)
-    obstacle_m: float  # position of the obstacle (m from Vehicle 1's front at the alert); infinite: none
+    obstacle_m: float  # position of the obstacle (m, relative to Vehicle 1's front at the alert); infinite: none
     learners: tuple[int, ...]  # indices of the learners (0 = front)
-    shield: bool | None  # whether a shield replaced the action; None: no shield
-    ended: bool  # whether the episode is over
+    shield: bool | None  # whether a shield replaced the action; None: there is no shield
+    ended: bool  # whether the episode has ended
 
     @property
     def shield_words(self) -> str:
-        """The shield's decision in this step in words, such as "shield: stepped in"."""
+        """Text about the shield's decision in this step: "shield: stepped in" or "shield: let it pass"."""
         return "shield: stepped in" if self.shield else "shield: let it pass"
 
     def command_words(self, i: int) -> str:
-        """Return the command in force of the vehicle with index ``i`` in words, such as "brakes 3.0 m/s2"."""
+        """Return a text about the command that vehicle ``i`` executes, such as "brakes 3.0 m/s2"."""
         command = float(self.command_mps2[i])
         if self.latency_s[i] > self.time_s:
             return f"acts from {self.latency_s[i]:.2f} s" if math.isfinite(self.latency_s[i]) else "never acts"
@@ -97,14 +97,14 @@ class Scene(NamedTuple):
         return f"{'brakes' if command < 0.0 else 'drives'} {abs(command):.1f} m/s2"
 
     def text(self) -> str:
-        """Return the scene as text without control characters: the road to scale, then one line for each vehicle."""
+        """Return the scene as text: a line that shows the road to scale, then one line for each vehicle."""
         left, right = self.view
 
         def column(place_m: float) -> int:
             return min(max(int((float(place_m) - left) / (right - left) * _TEXT_WIDTH), 0), _TEXT_WIDTH - 1)
 
         road, lines = ["."] * _TEXT_WIDTH, []
-        for i in range(len(self.front_m) - 1, -1, -1):  # the number of a vehicle stands in its body
+        for i in range(len(self.front_m) - 1, -1, -1):
             first, last = column(self.front_m[i] - BODY_M), column(self.front_m[i])
             road[first : last + 1] = list(f"[{i + 1}>".center(last + 1 - first, "=")[: last + 1 - first])
             gap = f"gap ahead {self.gaps_m[i - 1]:6.2f} m" if i else ""
@@ -126,7 +126,7 @@ class Scene(NamedTuple):
         return "\n".join([*facts, self.shield_words] if self.shield is not None else facts) + "\n"
 
     def frame(self) -> Frame:
-        """Return the scene as a picture [H, W, 3] uint8; the same scene gives the same bytes."""
+        """Return the scene as a picture, [H, W, 3] uint8. Equal scenes give equal pictures."""
         from PIL import Image, ImageDraw
 
         image = Image.new("RGB", (WIDTH * _FINE, HEIGHT * _FINE), _PAPER)
@@ -144,14 +144,14 @@ class Scene(NamedTuple):
 
 
 def vehicle_colour(i: int) -> str:
-    """Return the colour of the vehicle with index ``i`` in every picture, such as ``#0072B2``."""
+    """Return the colour of vehicle ``i`` (0 = front) in all pictures, such as ``#0072B2``."""
     return COLOURS[(i + 1) % len(COLOURS)]
 
 
 def follow(view: View, front_m: Floats) -> View:
-    """Return the view moved forward and widened as far as needed to contain the whole line.
+    """Move a view forward and widen it until it contains the whole line, and return the new view.
 
-    ``front_m`` [N] are the positions at which the front bumpers appear in the picture, m.
+    ``front_m`` [N] are the positions at which the front bumpers are drawn (m).
     """
     on = max(float(front_m[0]) + AHEAD_M - view.right_m, 0.0)
     left = min(view.left_m + on, float(front_m[-1]) - BODY_M - BEHIND_M)
@@ -159,9 +159,9 @@ def follow(view: View, front_m: Floats) -> View:
 
 
 def star(x: float, y: float, far: float, near: float) -> list[tuple[float, float]]:
-    """Return the 16 corners (x, y) of a star with eight points around (x, y).
+    """Return the 16 corners of a star with eight points and the centre (x, y).
 
-    ``far`` is the radius of the points, ``near`` the radius of the corners between them.
+    ``far`` is the distance of the points from the centre, ``near`` the distance of the corners between two points.
     """
     return [
         (x + r * math.cos(k * math.pi / 8), y + r * math.sin(k * math.pi / 8)) for k, r in enumerate([far, near] * 8)
@@ -192,13 +192,16 @@ _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
 
 
 class _Pen:
-    """Draws shapes from coordinates in pixels of the final picture, ``_FINE`` times as large for smooth edges."""
+    """Pen that draws shapes ``_FINE`` times as large as in the final picture, so that edges are smooth later.
+
+    All coordinates are in pixels of the final picture.
+    """
 
     def __init__(self, draw: ImageDraw.ImageDraw) -> None:
         self._draw = draw
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
-        """Draw a box with slightly round corners; ``fill`` is its colour, ``edge`` the colour of its edge, or None."""
+        """Draw a box with slightly round corners in the colour ``fill``; its edge has the colour ``edge``."""
         corners = [value * _FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
         self._draw.rounded_rectangle(corners, 2 * _FINE, fill=fill, outline=edge, width=_FINE * 2)
 
@@ -207,13 +210,13 @@ class _Pen:
         self._draw.line([x1 * _FINE, y1 * _FINE, x2 * _FINE, y2 * _FINE], fill=colour, width=round(width * _FINE))
 
     def shape(self, points: list[tuple[float, float]], fill: str, edge: str | None = None) -> None:
-        """Draw a polygon with these corners (x, y); ``fill`` and ``edge`` are colours, ``edge`` may be None."""
+        """Draw a polygon with the corners ``points`` in the colour ``fill``; its edge has the colour ``edge``."""
         self._draw.polygon([(x * _FINE, y * _FINE) for x, y in points], fill=fill, outline=edge, width=_FINE)
 
 
 def _draw_road(pen: _Pen, scene: Scene) -> None:
     pen.box(0, _ROAD_TOP, WIDTH, _ROAD_BOTTOM, _ASPHALT)
-    for place in _marks(scene, 5.0):  # dashes of the lane's edges, 2 m each, fixed to the road
+    for place in _marks(scene, 5.0):  # dashes of 2 m at the edges of the lane
         left, right = _x(scene, place), _x(scene, place + 2.0)
         for y in (_ROAD_TOP + 5, _ROAD_BOTTOM - 5):
             pen.line(left, y, right, y, _DASH, 1.5)
@@ -246,7 +249,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw the command of vehicle ``i`` as a share of its capacity: braking to the left, driving to the right."""
+    """Draw the panel of vehicle ``i``. Its bar shows the command: to the left braking, to the right driving."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62
@@ -285,14 +288,14 @@ def _write_road(text: ImageDraw.ImageDraw, scene: Scene) -> None:
         middle = _x(scene, scene.front_m[i] - BODY_M * 0.55)
         text.text((middle, _LANE), str(i + 1), _PAPER, _font(16), anchor="mm")
     free = math.inf
-    for left, right, gap_m, hit in _spaces(scene):  # from the right; a label that does not fit is put one line higher
+    for left, right, gap_m, hit in _spaces(scene):  # a label without enough space is written one line higher
         middle, words = (left + right) / 2, f"{gap_m:.1f} m"
         half = _font(14).getlength(words) / 2 + 3
         high = middle + half > free
         colour = _BRAKE if hit else _INK
         text.text((middle, _ROAD_TOP - (27 if high else 13)), words, colour, _font(14), anchor="ms")
         free = math.inf if high else middle - half
-    if scene.struck:  # name the hardest current impact of each pair, at most the two hardest
+    if scene.struck:  # write the hardest current impact of each pair, for at most two pairs
         hardest = {struck.pair: struck for struck in sorted(scene.struck, key=lambda struck: struck.closing_mps)}
         hits = sorted(hardest.values(), key=lambda struck: -struck.closing_mps)[:2]
         words = "impact of " + ", ".join(f"{struck.who} at {struck.speed}" for struck in hits)
@@ -317,19 +320,19 @@ def _write_panel(text: ImageDraw.ImageDraw, scene: Scene, i: int) -> None:
 
 
 def _fitting(words: list[str], width: float, size: int) -> str:
-    """Return the first of ``words`` that is at most ``width`` pixels wide in a font of this size; else the last."""
+    """Return the first of several texts that is at most ``width`` pixels wide in this font size, or the last text."""
     return next((each for each in words if _font(size).getlength(each) <= width), words[-1])
 
 
 def _share(scene: Scene, i: int) -> float:
-    """Return the command in force of vehicle ``i`` as a share of its capacity, -1 to 1; negative for braking."""
+    """Return the command that vehicle ``i`` executes relative to its capacity: -1 full braking, 1 full driving."""
     command = float(scene.command_mps2[i])
     capacity = float((scene.braking_mps2 if command < 0.0 else scene.driving_mps2)[i])
     return command / capacity if command != 0.0 else 0.0
 
 
 def _panel(scene: Scene, i: int) -> tuple[float, float]:
-    """Return left edge and width (pixels) of the panel of vehicle ``i``; Vehicle 1's panel is on the right."""
+    """Return left edge and width (pixels) of the panel of vehicle ``i``. Vehicle 1 has the rightmost panel."""
     count = len(scene.front_m)
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * _MARGIN - gap * (count - 1)) / count, 240.0)
@@ -342,10 +345,10 @@ def _x(scene: Scene, place_m: float) -> float:
 
 
 def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
-    """Return the free stretches of road, from the front backwards: to an obstacle, and between the vehicles.
+    """Return the gap to an obstacle, if there is one, and the gaps between the vehicles, from front to rear.
 
-    Each is a tuple: left and right end (pixels), length (m), and whether the bodies at its two ends have hit each
-    other.
+    A gap is a tuple: left end (pixels), right end (pixels), length (m), and whether the bodies at its ends have had an
+    impact.
     """
     front, obstacle = float(scene.front_m[0]), scene.obstacle_m
     spaces = [(_x(scene, front), _x(scene, obstacle), obstacle - front, any(s.pair < 0 for s in scene.struck))]
@@ -356,19 +359,19 @@ def _spaces(scene: Scene) -> list[tuple[float, float, float, bool]]:
 
 
 def _marks(scene: Scene, every_m: float) -> list[float]:
-    """Return the places on the road (m) that are in view and multiples of ``every_m``."""
+    """Return all positions in view that are multiples of ``every_m`` (m)."""
     first, last = math.ceil(scene.view.left_m / every_m), math.floor(scene.view.right_m / every_m)
     return [k * every_m for k in range(first, last + 1)]
 
 
 def _spacing(scene: Scene) -> float:
-    """Return the distance (m) between two labelled marks on the road, such that at most a dozen fit."""
+    """Return a distance (m) between labelled marks on the road with which at most about a dozen marks are in view."""
     width = scene.view.right_m - scene.view.left_m
     return next((every for every in (5.0, 10.0, 20.0, 50.0, 100.0, 200.0) if width <= 12 * every), 500.0)
 
 
 def _contact(scene: Scene, struck: Struck) -> float:
-    """Return the horizontal position (pixels) at which the impact ``struck`` is shown: between the two bodies."""
+    """Return the horizontal position (pixels) of an impact in the picture, which is between the two bodies."""
     if struck.pair < 0:
         return _x(scene, scene.front_m[0])
     return (_x(scene, scene.front_m[struck.pair + 1]) + _x(scene, scene.front_m[struck.pair] - BODY_M)) / 2
@@ -376,7 +379,7 @@ def _contact(scene: Scene, struck: Struck) -> float:
 
 @cache
 def _font(size: int) -> ImageFont.FreeTypeFont:
-    """Return Pillow's built-in font in this size; it is the same on every machine with this version of Pillow."""
+    """Return Pillow's built-in font in this size, which does not depend on the machine."""
     from PIL import ImageFont
 
     font = ImageFont.load_default(size)

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's interface: a native ``VecEnv`` whose rows are learners. Importing this module imports torch."""
+"""Environment for Stable-Baselines3: a ``VecEnv`` whose rows are learners. Importing this module imports torch."""
 
 from __future__ import annotations
 
@@ -51,25 +51,26 @@ def make_sb3_vec_env(
     render_mode: str | None = None,
     actions: int | None = None,
 ) -> EthBrakeVecEnv:
-    """Return ``n_envs`` worlds as a ``VecEnv`` for Stable-Baselines3.
+    """Return an environment with ``n_envs`` worlds for Stable-Baselines3.
 
     Args:
-        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        n_envs: number of worlds that are advanced together, at least 1.
-        seed: seed of the stream of worlds; None: fresh entropy.
-        learners: vehicles that learn instead of the scenario's, by name (``vehicle_2``) or index from 0; any number.
-        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what the learners observe; None: ``observation_for(scenario)``.
-        horizon_is_end: report no truncation in the infos, so that an algorithm does not add an estimated value beyond
-            the horizon. Harm is counted up to the horizon only, and an estimate beyond it can grow without limit
-            (docs/train.md). False: ``TimeLimit.truncated`` marks episodes that the horizon cut off.
-        appended: numbers appended to a learner's own observation. ``number``: the learner's index among the learners
-            (0 = the foremost); ``state``: the full state of the line (``game.full_state.full_state``), for a central
-            critic.
-        step_infos: fill the infos of every step as the other interfaces do, not only at the end of an episode; slower.
-        render_mode: ``rgb_array`` or None; ``render`` and ``VecVideoRecorder`` show all worlds side by side.
-        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
-            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
+        n_envs: number of worlds that are simulated together, at least 1.
+        seed: seed of the stream of worlds; None: a random seed.
+        learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
+        observation: features that the learners observe; None: ``observation_for(scenario)``.
+        horizon_is_end: report no truncation at the horizon, so that the algorithm does not add an estimated value of
+            the time after the horizon. Such an estimate can grow without limit, because harm after the horizon is not
+            counted (docs/train.md). False: ``TimeLimit.truncated`` marks episodes that ended at the horizon.
+        appended: numbers to append to each observation. ``number``: the number of the learner among the learners (0 =
+            foremost). ``state``: the full state of the line (``game.full_state.full_state``), for a central critic.
+            None: no numbers.
+        step_infos: fill the infos in every step, as the other environments do, instead of at the end of an episode
+            only. This is slower.
+        render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
+        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
+            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
 
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
@@ -92,21 +93,21 @@ def make_sb3_vec_env(
 class EthBrakeVecEnv(Begun, VecEnv):
     """``VecEnv`` whose rows are learners: row ``k * L + l`` is learner l of L (front to rear) in world k.
 
-    With several learners, all rows share one policy, and the rows of a world end together. All worlds take their
-    episodes from one stream. At the end of an episode, its rows' infos hold ``TimeLimit.truncated``,
-    ``terminal_observation``, ``episode`` (return ``r``, steps ``l``; ``t`` is always 0, because no clock is read), and
-    harm under both counts. All other infos are empty, unless ``step_infos``. Attributes and methods belong to the whole
-    batch: there are no inner environments.
+    The rows of a world end together. Each new episode takes the next world of one stream. At the end of an episode, the
+    infos of its rows contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
+    steps ``l``, and ``t``, which is always 0), and all infos of the other environments. At other steps the infos
+    contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on the whole
+    environment.
 
     Args:
         engine: the engine of the worlds; ``make_sb3_vec_env`` builds it.
         seed: seed of the stream of worlds.
-        horizon_is_end: report no truncation at the horizon in the infos, as explained in ``make_sb3_vec_env``.
-        appended: numbers appended to each observation: ``number``, the learner's index among the learners; ``state``,
-            the full state of the line. None: nothing.
-        step_infos: fill the infos of every step, not only at the end of an episode.
+        horizon_is_end: report no truncation at the horizon; see ``make_sb3_vec_env``.
+        appended: numbers to append to each observation: ``number``, the number of the learner among the learners, or
+            ``state``, the full state of the line. None: no numbers.
+        step_infos: fill the infos in every step, instead of at the end of an episode only.
         render_mode: ``rgb_array`` or None.
-        actions: number of discrete actions, of which a row's action is the index; None: an action is in [-1, 1].
+        actions: number of discrete actions; None: an action is a number in [-1, 1].
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -139,7 +140,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         self.appended = appended
         self.step_infos = step_infos
         if render_mode not in (None, "rgb_array"):
-            raise InvalidInput(f"render_mode = {render_mode!r}: must be 'rgb_array', or None")
+            raise InvalidInput(f"render_mode = {render_mode!r}: must be 'rgb_array' or None")
         self.render_mode, self.viewer = render_mode, Viewer(engine, render_mode, batch=True)
         self.actions, space = actions, learner_action_space(actions)
         self._set_seed(seed)
@@ -148,25 +149,25 @@ class EthBrakeVecEnv(Begun, VecEnv):
         rows = engine.n * len(engine.learners)
         self._return = np.zeros(rows)
         self._steps = np.zeros(rows, np.int64)
-        self._begun = np.zeros(0)  # values of the report at each episode's beginning
-        self._begun_shield: Columns = {}  # infos of a shield at each episode's beginning
+        self._begun = np.zeros(0)  # ``Report.values`` at the beginning of each world's episode
+        self._begun_shield: Columns = {}  # ``Report.shield`` at the beginning of each world's episode
         super().__init__(rows, feature_box(features), space)
         self.metadata = {**self.viewer.metadata, "render_modes": ["rgb_array"]}
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Start the stream of ``seed`` at the next reset (None: a random seed); return the seed, once per row.
+        """Set the seed of the worlds from the next reset on, and return the seed, once per row.
 
-        All rows share one stream.
+        ``seed`` is the seed; None: a random seed. All rows have the same seed, because they share one stream of worlds.
         """
         self._set_seed(chosen_seed(seed))
         self._goes_on = False
         return [self.np_random_seed] * self.num_envs
 
     def reset(self) -> Observations:
-        """Start an episode in every world; return the observations, [rows, F] float32.
+        """Start an episode in every world, and return the observations, float32 [rows, F].
 
-        Seed and options are those set before (``seed``, ``set_options``). Options hold for one reset. Invalid options
-        raise ``InvalidInput`` at that reset, and are then forgotten.
+        Use ``seed`` and ``set_options`` before to choose the worlds. Options apply to one reset only. Invalid options
+        raise ``InvalidInput``, and are then forgotten.
         """
         try:
             worlds = self._read_options()
@@ -179,14 +180,14 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe()
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Store the actions for ``step_wait``: [rows, 1] in [-1, 1], or indices [rows]."""
+        """Store the actions of the next step, [rows, 1] in [-1, 1] or, with discrete actions, indices [rows]."""
         self._actions = own_actions(actions, "the learners", self.actions)
 
     def step_wait(self) -> tuple[Observations, Rewards, Bools, list[dict[str, Any]]]:
         """Advance every world by one time step with the stored actions.
 
-        Worlds that end start their next episode at once. Returns observations [rows, F], rewards [rows], whether each
-        row's episode ended [rows], and one dictionary of infos per row.
+        If an episode ends, the next episode starts at once in this row. Returns observations [rows, F], rewards [rows],
+        whether each row's episode ended [rows], and one dictionary of infos per row.
         """
         if not self._started or self._actions is None:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -194,7 +195,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
         engine, learners = self.engine, self._learners
         if actions.size != self.num_envs:
             raise InvalidInput(
-                f"step: actions of shape {actions.shape}; one for each row, ({self.num_envs}, 1), is needed"
+                f"step: actions have the shape {actions.shape}: must have one action per row, ({self.num_envs}, 1)"
             )
         if self.actions is not None:
             actions = checked_action(actions, actions.shape, "the learners", self.actions)
@@ -207,7 +208,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
             if self.step_infos
             else plain_rows(shield_columns(engine), learners, self.num_envs)
         )
-        over = engine.ended  # includes worlds that an interrupted step left without renewal
+        over = engine.ended  # includes worlds that a step which was interrupted did not renew
         ended = np.flatnonzero(over)
         if len(ended):
             self._close_episodes(ended, step, infos)
@@ -218,24 +219,22 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return self._observe(), reward.astype(np.float32), self._by_row(over), infos
 
     def get_images(self) -> list[NDArray[np.uint8]]:
-        """Return the picture of each world, a list of frames [H, W, 3] uint8."""
+        """Return a picture of each world, as a list of frames [H, W, 3] uint8."""
         return list(self.viewer.render())
 
     def close(self) -> None:
-        """Do nothing: there is nothing to release."""
+        """Do nothing, because this environment has no resources to release."""
 
     def snapshot(self) -> Arrays:
-        """Return copies of everything that changes while the environment runs, by name, for ``restore``.
-
-        Call it between two steps.
-        """
+        """Return a copy of the environment's state between two steps, as arrays by name, for ``restore``."""
         arrays = {f"engine.{name}": array for name, array in self.engine.snapshot().items()}
         return arrays | {"return": self._return.copy(), "steps": self._steps.copy(), "begun": self._begun.copy()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Continue from ``arrays``, a ``snapshot`` of the same scenario and size, without a reset.
+        """Restore the state ``arrays`` from ``snapshot``; a reset is not needed.
 
-        Raises ``InvalidInput`` for a snapshot that does not fit.
+        The snapshot must be of an environment with the same scenario and number of worlds; otherwise ``InvalidInput``
+        is raised.
         """
         prefix = "engine."
         self.engine.restore({n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)})
@@ -243,37 +242,43 @@ class EthBrakeVecEnv(Begun, VecEnv):
         for name, like in rows.items():
             have = arrays[name]
             if (have.shape, have.dtype) != (like.shape, like.dtype) or not np.isfinite(have).all():
-                raise InvalidInput(f"environment snapshot: {name}: {like.shape} finite {like.dtype} are needed")
+                raise InvalidInput(
+                    f"environment snapshot: {name}: must be finite numbers of type {like.dtype} and shape {like.shape}"
+                )
         self._return, self._steps = arrays["return"].copy(), arrays["steps"].copy()
         self._begun, self._begun_shield = arrays["begun"].copy(), {}
         self._set_seed(self.engine.seed)
         self._started = self._goes_on = True
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return the attribute ``attr_name`` of the batch, once per requested row."""
+        """Return the attribute ``attr_name`` of this environment, once per requested row."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set the attribute ``attr_name`` of the batch; raise ``InvalidInput`` if ``indices`` names only some rows."""
+        """Set the attribute ``attr_name`` of this environment. Raises ``InvalidInput`` if ``indices`` omits rows."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        """Call the method ``method_name`` of the batch once, and return its result once per row.
+        """Call the method ``method_name`` of this environment once, and return its result once per row.
 
-        ``args`` and ``kwargs`` are its arguments. Raises ``InvalidInput`` if ``indices`` names only some rows.
+        ``args`` and ``kwargs`` are the method's arguments. Raises ``InvalidInput`` if ``indices`` omits rows.
         """
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return False once per requested row: there are no inner wrappers."""
+        """Return False, once per requested row, because the rows have no environments that could be wrapped."""
         return [False for _ in self._get_indices(indices)]
 
     def _close_episodes(self, ended: Ints, step: Step, infos: list[dict[str, Any]]) -> None:
-        """Fill in the final infos of the rows of the worlds ``ended``, before their next episodes start.
+        """Write the final infos of ended episodes into ``infos``, before the next episodes start.
 
-        ``step`` is the last step; ``infos``, one dictionary per row, is changed in place.
+        Args:
+            ended: indices of the worlds whose episodes have ended.
+            step: results of the last step.
+            infos: one dictionary per row; the dictionaries of ended episodes are replaced.
+
         """
         rows, final = self._rows(ended), self._observe(ended)
         plain = Report.of(self.engine, step, ended).plain_infos(self._learners)
@@ -295,7 +300,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
-        """Infos at the start of the running episodes, one dictionary per row, computed at each access."""
+        """Infos at the start of the running episodes, one dictionary per row."""
         if not self._started:
             return [{} for _ in range(self.num_envs)]
         report = Report.of(self.engine)._replace(values=self._begun, shield=self._begun_shield)
@@ -303,12 +308,12 @@ class EthBrakeVecEnv(Begun, VecEnv):
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:
-        """Ignore the empty infos that SB3's constructor assigns."""
+        """Ignore the empty infos that the constructor of Stable-Baselines3's ``VecEnv`` assigns."""
 
     def _observe(self, worlds: Ints | None = None) -> Observations:
-        """Return the observations of all learners, [rows, F] float32, in new arrays.
+        """Return the observations of all learners in a new array, float32 [rows, F].
 
-        ``worlds`` are the indices of the worlds to include; None: all.
+        ``worlds`` are the indices of the worlds to include; None: all worlds.
         """
         every = self.engine.observe_all(self._learners, worlds)
         rows = every.reshape(-1, every.shape[2])
@@ -327,9 +332,10 @@ class EthBrakeVecEnv(Begun, VecEnv):
         return worlds.repeat(len(self._learners))
 
     def _read_options(self) -> Worlds | None:
-        """Return the worlds that the options set for the rows request; None: worlds of the stream.
+        """Return the worlds that the options of ``set_options`` choose; None: the next worlds of the stream.
 
-        Raises ``InvalidInput`` if only some rows have an initial state, or the rows of one world differ.
+        Raises ``InvalidInput`` if some rows have an initial state and others do not, or if the rows of one world have
+        different initial states.
         """
 
         def bytes_of(start: Worlds) -> list[bytes]:
@@ -337,7 +343,9 @@ class EthBrakeVecEnv(Begun, VecEnv):
 
         options = [row or {} for row in self._options]
         if len(options) != self.num_envs:
-            raise InvalidInput(f"set_options: {len(options)} entries; one for each of {self.num_envs} rows is needed")
+            raise InvalidInput(
+                f"set_options: the list has {len(options)} entries: must have one for each of the {self.num_envs} rows"
+            )
         warn_of_unknown((name for row in options for name in row), (INITIAL_STATE,))
         if not any(INITIAL_STATE in row for row in options):
             return None
@@ -350,12 +358,14 @@ class EthBrakeVecEnv(Begun, VecEnv):
             )
             if start is None or (k % width and bytes_of(start) != bytes_of(starts[-1])):
                 raise InvalidInput(
-                    f"set_options: row {k} has {row!r}; if one row has an {INITIAL_STATE}, every row needs one, and the"
-                    " learners of a world the same options"
+                    f"set_options: row {k} has {row!r}; either all rows or no rows may have an {INITIAL_STATE}, and all"
+                    " rows of a world must have the same one"
                 )
             starts += [] if k % width else [start]
         return Worlds.concatenate(starts)
 
     def _refuse_some_rows(self, what: str, indices: VecEnvIndices) -> None:
         if list(self._get_indices(indices)) != list(range(self.num_envs)):
-            raise InvalidInput(f"{what}: indices {indices!r}; rows share one batch, so leave indices out")
+            raise InvalidInput(
+                f"{what}: indices = {indices!r}: must not be passed, because all rows belong to one environment"
+            )

@@ -1,7 +1,7 @@
-"""``Trace``: recorded motion of an engine's worlds, so that every moment can be shown exactly.
+"""``Trace``: recorder of the motion of an engine's worlds, for pictures of any moment.
 
-Between two decisions, the motion follows from the state and the command alone, so each moment is advanced from the
-beginning of its step. A ``Trace`` watches the engine; without a ``Trace`` nothing is recorded and nothing costs time.
+It records the state and the commands at the beginning of each step. The state at a moment within the step is computed
+from them exactly.
 """
 
 from __future__ import annotations
@@ -34,37 +34,38 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 class Motion:
     """Recorded motion of n worlds during one step, or from the alert to the first decision.
 
-    A motion is *open* while it is the latest one: its end is the engine's current state. ``closed`` returns it with a
-    fixed end, and with its ``parts``, which ``scenes`` needs.
+    The latest motion is *open*: it has no end yet. ``closed`` returns the motion with the engine's current state as its
+    end, and with its ``parts``, which ``scenes`` needs. Positions are relative to Vehicle 1's front at the alert.
     """
 
     start: Worlds  # the n worlds at the start
-    command_mps2: Floats  # [n, N] commands (m/s2); where ``fresh``, 0 until ``closed`` sets the commands at the end
-    until_s: Floats  # [n] time at the end since the alert (s); NaN while the motion is open
+    # [n, N] commands (m/s2). If the motion begins at the alert, they are 0 until ``closed`` sets the final commands.
+    command_mps2: Floats
+    until_s: Floats  # [n] time of the end since the alert (s); NaN while the motion is open
     fresh: Bools  # [n] whether the motion begins at the alert, not at a decision
-    front_m: Floats  # [n] position of Vehicle 1 at the start, relative to the alert (m)
+    front_m: Floats  # [n] position of Vehicle 1 at the start (m)
     harm: Floats  # [n, 2] first-impact harm and total harm at the start (m2/s2)
-    left_m: Floats  # [n] left end of the road that pictures of the episode show (m from Vehicle 1 at the alert)
-    right_m: Floats  # [n] right end of that road (m)
+    left_m: Floats  # [n] position of the left end of the road in pictures of the episode (m)
+    right_m: Floats  # [n] position of the right end of the road in pictures of the episode (m)
     struck: Floats  # [k, 4] impacts shortly before the start: row of the world, pair, time (s), closing speed (m/s)
-    stepped_in: Bools | None  # [n] whether a shield replaced an action; None: no shield
-    # Parts of the motion with constant commands, set by ``closed``: worlds at the start, commands, time at the end.
+    stepped_in: Bools | None  # [n] whether a shield replaced an action; None: there is no shield
+    # Consecutive parts with constant commands, each as (worlds at the start, commands, time of the end).
     parts: tuple[tuple[Worlds, Floats, Floats], ...] = ()
 
     def closed(self, engine: Engine) -> Motion:
-        """Return this motion with its end fixed at the current state of ``engine``."""
+        """Return this motion with the current state of ``engine`` as its end."""
         worlds = engine.worlds
         command = np.where(self.fresh[:, np.newaxis], worlds.command_mps2, self.command_mps2)
         parts = tuple(engine.segments(self.start, command))
         return replace(self, command_mps2=command, until_s=worlds.time_s, parts=parts)
 
     def scenes(self, engine: Engine, row: int, times_s: Floats | None = None) -> list[Scene]:
-        """Return the scenes (all that a picture shows) of one world, one for each time.
+        """Return the scenes of one world at several times. The motion must be closed.
 
         Args:
             engine: the engine that was recorded.
             row: row of the world.
-            times_s: [k] times within this motion, which must be closed; None: its end only.
+            times_s: times within this motion, ascending, [k] s; None: the end of the motion.
 
         """
         times = self.until_s[[row]] if times_s is None else times_s
@@ -116,17 +117,17 @@ class Motion:
         return shown
 
 
-Memory = tuple[Motion, ...]  # recorded motions, the running one last
+Memory = tuple[Motion, ...]  # recorded motions in order of time; the last one is open
 
 
 class Trace:
-    """Recorder of the motion of an engine's worlds; a ``Watcher`` of ``engine.engine``.
+    """Recorder of the motion of an engine's worlds, a ``Watcher`` of ``engine.engine``.
 
     Args:
-        engine: engine to watch, from its next reset on.
-        whole: keep every step since the episode began (for engines with one world); if False, the last step only.
-        alert: the worlds at the alert of an engine that is still at its first decision; recording starts there at once.
-            None: at the next reset.
+        engine: engine to record, from its next reset on.
+        whole: record all steps of the episode (for engines with one world). If false, record the latest step only.
+        alert: worlds at the alert of an engine that is at its first decision, to record the running episodes. None:
+            recording starts at the next reset.
 
     """
 
@@ -135,17 +136,17 @@ class Trace:
         engine.watch(self, () if alert is None else self.begun((), alert, np.arange(alert.n)))
 
     def begun(self, memory: Memory, alert: Worlds, rows: Ints) -> Memory:
-        """Return the recorded motions (``Motion``) after episodes have started in the rows with the indices ``rows``.
+        """Return the recorded motions after new episodes have started in some worlds.
 
         Args:
-            memory: the motions recorded before.
-            alert: the worlds of these rows only, at t = 0.
-            rows: indices of the worlds whose episodes have started.
+            memory: the motions recorded so far.
+            alert: the worlds of the new episodes at the alert.
+            rows: rows of the worlds in which new episodes have started.
 
         """
         v, n = alert.vehicles, alert.n
-        # The view contains each line from the alert to rest if all brake fully as soon as they can. A rear vehicle that
-        # would stop further on is assumed to push the vehicles ahead that far.
+        # The view contains the whole line until all vehicles are at rest if all brake fully as soon as they can. A rear
+        # vehicle that would come to rest further ahead is assumed to push the vehicles ahead of it.
         behind = np.concatenate([np.zeros((n, 1)), np.cumsum(alert.gaps_m, axis=1)], axis=1)
         reaction = alert.speeds_mps * np.minimum(v.latency_s, LATE_S)
         rising = (
@@ -169,10 +170,16 @@ class Trace:
         return (replace(last, start=last.start.assign(rows, alert), struck=struck, **columns),)
 
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
-        """Return the recorded motions after a step: those of ``memory``, and the motion of the step.
+        """Return the recorded motions after a step.
 
-        The last motion of ``memory`` is closed first. Unless the trace was made with ``whole``, only the motion of the
-        step is kept. ``before`` and ``after`` are the engine before and after the step.
+        With ``whole``, these are all motions so far, with the last one closed, and the motion of the step. Otherwise
+        they are the motion of the step only.
+
+        Args:
+            memory: the motions recorded so far.
+            before: the engine before the step.
+            after: the engine after the step.
+
         """
         last = memory[-1].closed(before)
         front_m, met = last.front_m, [last.struck]
@@ -198,13 +205,13 @@ class Trace:
         return (*memory[:-1], last, new) if self._whole else (new,)
 
     def motions(self, engine: Engine) -> Memory:
-        """Return all recorded motions in order, the last one up to the engine's current state.
+        """Return all recorded motions in order of time, with the last one closed at the engine's current state.
 
         Raises ``InvalidInput`` before the first reset.
         """
         memory: Memory = engine.memory(self)
         if not memory:
-            raise InvalidInput("render: no episode was started; call reset first")
+            raise InvalidInput("render: no episode has started; call reset first")
         return (*memory[:-1], memory[-1].closed(engine))
 
 

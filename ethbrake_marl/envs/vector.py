@@ -1,4 +1,4 @@
-"""Gymnasium's vector interface: one learner in each of many worlds, which are advanced together."""
+"""Vector environment for Gymnasium: one learner in each of many worlds, which are simulated together."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from ethbrake_marl.physics.state import Bools, Floats
 
 
 class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
-    """Wrapper with a separate cost: ``step`` returns observation, reward, cost, terminated, truncated, info.
+    """Wrapper whose ``step`` also returns a cost: observation, reward, cost, terminated, truncated, info.
 
-    This is the format of Safety-Gymnasium, which OmniSafe expects. The cost is the harm that the step added to the line
-    (m2/s2). It counts first impacts only, or all impacts, as the reward does; other terms of the reward do not enter.
+    OmniSafe expects this format of Safety-Gymnasium. The cost is the harm that the step added to the line (m2/s2), in
+    the count of the reward (first impacts or all impacts).
 
     Args:
-        env: ``EthBrakeEnv``, or a wrapper of one that passes its infos on.
+        env: an ``EthBrakeEnv``, possibly inside wrappers that pass on its infos.
 
-    Raises ``InvalidInput`` for another environment, or one with a ``CostEnv`` inside.
+    Raises ``InvalidInput`` for another environment, or for an environment that already contains a ``CostEnv``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.CostEnv(eb.EthBrakeEnv("paper-random"))
@@ -55,7 +55,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 
     def __init__(self, env: gymnasium.Env[Observations, NDArray[Any]]) -> None:
         if not isinstance(getattr(env, "unwrapped", None), EthBrakeEnv):
-            raise InvalidInput(f"CostEnv: {env!r:.80} reports no cost; must be an EthBrakeEnv, or a wrapper of one")
+            raise InvalidInput(f"CostEnv: env = {env!r:.80}: must be an EthBrakeEnv, or a wrapper around one")
         within = env
         while isinstance(within, gymnasium.Wrapper):
             if isinstance(within, CostEnv):
@@ -66,43 +66,49 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
     def step(  # type: ignore[override]  # six values, as safe-RL libraries have it
         self, action: NDArray[Any]
     ) -> tuple[Observations, float, float, bool, bool, dict[str, Any]]:
-        """Advance by one time step; return observation, reward, cost, terminated, truncated and info.
+        """Advance by one time step, and return observation, reward, cost, terminated, truncated and info.
 
-        ``action`` is [1] in [-1, 1]. The cost is the harm that the step added to the line (m2/s2).
+        ``action`` is an array [1] in [-1, 1]. The cost is the harm that the step added to the line (m2/s2).
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         if isinstance(reward, np.ndarray) and reward.ndim:
             raise InvalidInput(
-                "CostEnv: needs a reward that is a number; mo_gymnasium's LinearReward makes one of a vector"
+                "CostEnv: the reward of the environment is a vector: must be a number; wrap the environment in"
+                " mo_gymnasium's LinearReward first"
             )
         if "cost" not in info:
-            raise InvalidInput(f"CostEnv: {self.env!r:.80} hands on no info['cost']; put CostEnv inside it")
+            raise InvalidInput(
+                f"CostEnv: the wrapper {self.env!r:.80} does not pass on info['cost']; put CostEnv inside this wrapper"
+            )
         return observation, float(reward), info["cost"], terminated, truncated, info
 
 
 class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
-    """Many worlds of ``EthBrakeEnv``: ``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``.
+    """Many worlds of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``).
 
-    All worlds take their episodes from one stream: row k of ``reset(seed=s)`` is world k of seed s, and each new
-    episode is the next world of that stream. All returned arrays are new.
+    After ``reset(seed=s)``, row k is world k of seed s. Each new episode takes the next world of this seed. All
+    returned arrays are new.
 
     Args:
-        num_envs: number of worlds that are advanced together, at least 1.
-        scenario: a shipped name, the path of a YAML file, or a ``Scenario``.
-        render_mode: ``rgb_array``, ``ansi``, or None; ``render`` returns one frame or text for each world.
-        learners: the one vehicle that learns instead of the scenario's, by name (``vehicle_2``) or index from 0.
-        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: what the learner observes; None: ``observation_for(scenario)``.
-        autoreset_mode: Gymnasium's autoreset mode. ``NextStep``, the default, returns the last observation and uses the
-            next step for the reset; that step's action is ignored and its reward is 0. ``SameStep`` returns the first
-            observation of the new episode, with the old episode's last observation in ``infos["final_obs"]`` and its
-            infos in ``infos["final_info"]``. ``Disabled`` never resets: the caller must reset ended rows before the
-            next step.
-        max_episode_steps: truncates an episode after this many steps; None: only at the horizon.
-        actions: None: a learner acts by one number in [-1, 1]. A whole number K, at least 2: by an index of K evenly
-            spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
-        reward_vector: None: rewards are [n]. ``vehicles``: they are [n, K], minus the harm of the step that each
-            vehicle bears; a list: with these components (docs/environments.md).
+        num_envs: number of worlds that are simulated together, at least 1.
+        scenario: name of a shipped scenario, path of a YAML file, or a ``Scenario``.
+        render_mode: ``rgb_array``, ``ansi``, or None. ``render`` returns one frame or text for each world.
+        learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
+            of the scenario.
+        reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
+        observation: features that the learner observes; None: ``observation_for(scenario)``.
+        autoreset_mode: Gymnasium's autoreset mode, which says what happens when an episode ends. ``NextStep``
+            (default): the step returns the last observation, and the next step resets the world, ignores its action and
+            returns the reward 0. ``SameStep``: the step resets the world and returns the first observation of the new
+            episode; ``infos["final_obs"]`` and ``infos["final_info"]`` have the last observation and infos of the old
+            episode. ``Disabled``: the caller must reset ended rows before the next step.
+        max_episode_steps: number of steps after which an episode is truncated; None: it is truncated at the horizon
+            only.
+        actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
+            of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
+        reward_vector: None: rewards are numbers, [n]. ``vehicles``: rewards are arrays, [n, N], minus the harm that
+            each vehicle bears in the step. A list: rewards are arrays with the named components, [n, K]
+            (docs/environments.md).
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -136,7 +142,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         self.engine = make_engine(
             scenario, num_envs, learners=learners, reward=reward, observation=observation, reward_vector=reward_vector
         )
-        if self.engine.components:  # as MO-Gymnasium has it
+        if self.engine.components:  # attributes of MO-Gymnasium
             self.reward_space = reward_box(self.engine)
             self.reward_dim = len(self.engine.components)
         self.render_mode, self.viewer = render_mode, Viewer(self.engine, render_mode, batch=True)
@@ -151,12 +157,12 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, Any]]:
-        """Start an episode in every world; return observations [n, F] and infos.
+        """Start an episode in every world, and return observations [n, F] and infos.
 
         Args:
-            seed: restart the stream of worlds from the first world of this seed; None: continue in the stream.
-            options: ``initial_state`` or ``listed_world`` choose the worlds; ``reset_mask`` [n] restricts the reset to
-                the worlds that it marks. See docs/environments.md.
+            seed: start the first worlds of this seed; None: start the next worlds of the current seed.
+            options: ``initial_state`` or ``listed_world`` to choose the worlds; ``reset_mask`` [n], true for the rows
+                to reset, to reset only some rows (docs/environments.md).
 
         """
         rows = self._rows_to_reset(options)
@@ -170,8 +176,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with the actions [n, 1] in [-1, 1].
 
-        Ended worlds start new episodes according to the autoreset mode. Returns observations [n, F], rewards,
-        terminated, truncated (each [n]) and infos in Gymnasium's vector format.
+        Returns observations [n, F], rewards [n], terminated [n], truncated [n], and infos in Gymnasium's vector format.
+        ``autoreset_mode`` says when a new episode starts after the end of an episode.
         """
         if not self._started:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -179,7 +185,8 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         if self.autoreset_mode is AutoresetMode.DISABLED and before.any():
             over = ", ".join(str(row) for row in np.flatnonzero(before))
             raise InvalidInput(
-                f"step: episodes are over in rows {over}; reset(options={{'reset_mask': ...}}) them first"
+                f"step: the episodes in rows {over} have ended; first reset these rows with"
+                " reset(options={'reset_mask': ...})"
             )
         actions = self._fill_ignored(actions, before)
         if self.actions is not None:
@@ -187,7 +194,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         step = engine.step(actions)
         if self.max_episode_steps is not None:
             engine.cut(step, self.max_episode_steps)
-        # includes worlds that an interrupted step left without renewal
+        # includes worlds that a step which was interrupted did not renew
         renewed = engine.ended if self.autoreset_mode is AutoresetMode.SAME_STEP else before
         infos: dict[str, Any] = {}
         if self.autoreset_mode is AutoresetMode.SAME_STEP and renewed.any():
@@ -199,16 +206,17 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return engine.observe(self.learner), reward, step.terminated, step.truncated, infos
 
     def render(self) -> tuple[Any, ...]:
-        """Return a tuple with the picture of every world: a frame [H, W, 3] uint8, or a text.
+        """Return a tuple with a picture of every world: a frame [H, W, 3] uint8, or a text.
 
-        A world whose episode has just been renewed shows the start of the new one.
+        If a new episode has just started in a world, the picture shows the start of this episode.
         """
         return tuple(self.viewer.render())
 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
-        """Return the actions with 0 for the worlds whose actions are ignored.
+        """Return the actions, with 0 for the worlds whose actions are ignored.
 
-        In mode ``NextStep`` these are the worlds whose episodes had ended ``before`` [n] the step.
+        In mode ``NextStep``, these are the worlds whose episodes had already ended before the step (mask ``before``
+        [n]).
         """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():
             return actions
@@ -218,7 +226,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         return heeded
 
     def _rows_to_reset(self, options: Any) -> Bools:
-        """Return the rows [n] that ``options["reset_mask"]`` marks, or all rows without a mask.
+        """Return ``options["reset_mask"]``, the mask [n] of the rows to reset, or a mask of all rows if it is missing.
 
         Raises ``InvalidInput`` for an invalid mask.
         """
@@ -228,14 +236,15 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.shape == (self.num_envs,)
         if not is_mask or np.ma.is_masked(mask) or not mask.any():
             raise InvalidInput(
-                f"reset: {RESET_MASK} = {mask!r}: must be an array of {self.num_envs} truth values, one of them True"
+                f"reset: {RESET_MASK} = {mask!r}: must be a bool array of shape ({self.num_envs},) with at least one"
+                " True"
             )
         return np.array(mask)
 
     def _renew(self, rows: Bools, seed: int | None, options: Mapping[str, Any]) -> None:
-        """Start the next episodes of the stream in the worlds that ``rows`` [n] marks; the other worlds continue.
+        """Start new episodes in the rows of the mask ``rows`` [n], while the other rows continue.
 
-        Raises ``InvalidInput`` for a ``seed`` or an option that would choose the worlds, because these apply to all
+        Raises ``InvalidInput`` if a ``seed`` or an option chooses the worlds, because such a reset must include all
         rows.
         """
         warn_of_unknown(options, self._known_options)
@@ -243,11 +252,13 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         starts += ["seed"] * (seed is not None)
         if starts or not self._goes_on:
             what = " and ".join(starts) or ("np_random" if self._started else "the first reset")
-            raise InvalidInput(f"reset: {what} with a {RESET_MASK} that leaves rows out: must start all rows")
+            raise InvalidInput(
+                f"reset: {RESET_MASK} omits some rows, but {what} requires a reset of all rows; remove {RESET_MASK}"
+            )
         self.engine.renew(np.flatnonzero(rows))
 
     def _final_infos(self, step: Step) -> dict[str, Any]:
-        """Return the infos ``final_obs`` and ``final_info``, with masks, of the episodes that ended with this step."""
+        """Return the infos ``final_obs`` and ``final_info``, with their masks, of episodes that ended in this step."""
         ended = step.ended
         observations = self.engine.observe(self.learner)
         final = np.full(self.num_envs, None, dtype=object)

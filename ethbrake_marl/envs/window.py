@@ -1,4 +1,4 @@
-"""``Window``: the window of ``render_mode="human"``, drawn with pygame."""
+"""``Window``: window for ``render_mode="human"``, drawn with pygame."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from ethbrake_marl.errors import InvalidInput, need
 
 
 class Window:
-    """Window of ``render_mode="human"``. It opens with its first frame, and stays closed after the user closes it.
+    """Window for ``render_mode="human"``, which opens when the first frame is shown.
 
-    A copy is a separate window. Raises ``MissingExtra`` if pygame is missing.
+    After the user has closed it, it opens again at the next episode. A copy of the object is another window. Raises
+    ``MissingExtra`` if pygame is missing.
     """
 
     def __init__(self) -> None:
         need("pygame")
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no greeting on import
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # pygame otherwise prints a greeting
         import pygame
 
         self._pygame: Any = pygame
         self._screen: Any = None
         self._clock: Any = None
-        self.closed_by_user = False  # reset when an episode begins
+        self.closed_by_user = False  # ``Viewer.began`` sets it to False at the beginning of an episode
 
     def __reduce__(self) -> tuple[type[Window], tuple[()]]:
         return Window, ()
@@ -39,7 +40,7 @@ class Window:
                 self._screen = pygame.display.set_mode((WIDTH, HEIGHT))
             except pygame.error as error:
                 raise InvalidInput(
-                    f"render_mode = 'human': no window can be opened here ({error}); 'rgb_array' needs no display"
+                    f"render_mode = 'human': cannot open a window ({error}); use 'rgb_array', which needs no display"
                 ) from None
             pygame.display.set_caption("EthBrake")
             self._clock = pygame.time.Clock()

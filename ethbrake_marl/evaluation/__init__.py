@@ -1,4 +1,4 @@
-"""Evaluation of agents on fixed lists of worlds: rollouts, measures, statistics, tables, results files, episodes."""
+"""Compare agents on fixed evaluation lists: drive the worlds, measure, compute statistics, write tables and files."""
 
 from typing import TYPE_CHECKING
 

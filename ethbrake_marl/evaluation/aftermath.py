@@ -1,4 +1,4 @@
-"""Watchers that measure more than harm during episodes: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+"""Two measurements taken while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ethbrake_marl.scenario.task import Task
 
 
 class ShovedFront:
-    """Watcher that measures how far Vehicle 1 ends beyond the point that it would reach undisturbed.
+    """Measure how far other vehicles shove Vehicle 1 beyond the place that it would reach if nobody touched it.
 
-    ``shoved = distance driven - distance driven alone up to the horizon``. For a line at rest, this is the distance
-    from Vehicle 1's own stopping point. Negative where Vehicle 1 ends short of that point, for instance after an
-    obstacle threw it back. Create it with ``of``; the engine calls ``see`` after each step.
+    ``shoved = distance that Vehicle 1 drives - distance that it would drive until the horizon if nobody touched it``.
+    The result is negative if Vehicle 1 ends short of that place, for instance because an obstacle threw it back.
+    ``of`` creates the object, and ``see`` is called for each step.
 
     Args:
         worlds: the n worlds at the alert.
-        own_way_m: [n] distance that Vehicle 1 drives undisturbed until the horizon.
+        own_way_m: distance that Vehicle 1 would drive until the horizon if nobody touched it, [n] m.
 
     """
 
@@ -35,9 +35,10 @@ class ShovedFront:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
+        """Return the measurement for ``worlds`` at the alert, or None if it is not defined for the task.
 
-        It is not defined if Vehicle 1 is controlled, if its script depends on the state, or if brakes build up.
+        It is not defined if Vehicle 1 is controlled, if its script reacts to the state of the world, or if brake force
+        builds up gradually.
         """
         script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
         vehicles = worlds.vehicles
@@ -52,12 +53,13 @@ class ShovedFront:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the distance that Vehicle 1 drives in one step.
 
-        It is measured as the change of Vehicle 1's gap to an obstacle, the world's own or one placed out of reach.
+        The distance is the change of Vehicle 1's gap to an obstacle. If the world has none, an obstacle is assumed
+        that Vehicle 1 cannot reach in this step.
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: [n, N] commanded accelerations during the step.
-            until_s: [n] time at which the step ends.
+            command_mps2: commanded accelerations during the step, [n, N].
+            until_s: time at which the step ends, [n].
 
         """
         post = before.with_post_ahead(until_s - before.time_s)
@@ -75,15 +77,16 @@ VEHICLE_2 = 1  # index of the vehicle whose latency sets the time of the map's f
 
 
 class SampledHarm:
-    """Watcher that computes the harm of the episodes as the paper does, which samples the motion at fixed steps.
+    """Compute the sampled harm of the episodes: the paper's sum of squared closing speeds over time samples.
 
-    It replays the commands through ``advance_sampled``, the paper's equations of motion. Every world runs to the
-    horizon; after its exact episode has ended, the last commands are held. The agents saw the exact motion and do not
-    decide again. Create it with ``of``; the engine calls ``see`` after each step, and ``finish`` returns the harm.
+    The agents' commands are applied again in ``advance_sampled``, the paper's equations of motion with a fixed step.
+    Every world runs to the horizon. If its episode in the exact physics ended earlier, its last commands are held. The
+    agents decided in the exact physics; they are not asked again. ``of`` creates the object, ``see`` is called for each
+    step, and ``finish`` returns the harm.
 
     Args:
         worlds: the n worlds at the alert; they are copied.
-        scenario: scenario of the worlds, for time step and horizon.
+        scenario: scenario of the worlds, which sets the time step and the horizon.
 
     """
 
@@ -97,10 +100,11 @@ class SampledHarm:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
-        """Return a watcher for ``worlds`` at the alert, or None if the measure is not defined for the task.
+        """Return the measurement for ``worlds`` at the alert, or None if sampled harm is not defined for the task.
 
-        It is not defined with an obstacle or brakes that build up, which the paper's map does not model, nor if another
-        vehicle than Vehicle 2 decides, because the samples of the map are Vehicle 2's decisions.
+        It is defined if Vehicle 2 alone is controlled and no script reacts to the state of the world, because the
+        samples are taken at Vehicle 2's decisions. The paper's equations also exclude an obstacle, and brake force that
+        builds up gradually.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -110,12 +114,12 @@ class SampledHarm:
         return cls(worlds, task.scenario)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Replay one step. Worlds whose episodes have ended keep their last commands.
+        """Apply the commands of one step in the paper's equations; a world whose episode has ended repeats its last.
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: [n, N] commanded accelerations during the step.
-            until_s: [n] time at which the step ends; equal to the beginning if the world's episode has ended.
+            command_mps2: commanded accelerations during the step, [n, N].
+            until_s: time at which the step ends, [n]; where the episode has ended, the time of its end.
 
         """
         running = until_s > before.time_s
@@ -131,7 +135,7 @@ class SampledHarm:
         self._harm += sum_rows(impacts.total_harm)
 
     def finish(self) -> Floats:
-        """Advance every world to the horizon, and return its sampled harm, [n] m2/s2."""
+        """Advance every world to the horizon, and return the sampled harm of each world, [n] m2/s2."""
         while (self._worlds.time_s < self._horizon_s - 1e-6 * self._step_s).any():
             self._move()
         return self._harm

@@ -1,6 +1,6 @@
-"""Sums of one agent's measures over some worlds, and the estimates computed from them.
+"""Sums of one agent's measures over many worlds, and the means and intervals computed from these sums.
 
-The sums are exact, so the order of addition does not change a bit.
+The sums are exact, so they do not depend on the order in which worlds are added.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from ethbrake_marl.game.measures import REPORTED
 
 @dataclass(frozen=True, slots=True)
 class AgentTally:
-    """Exact sums of one agent's measures over some worlds; tallies of different worlds can be added with ``+``."""
+    """Exact sums of one agent's measures over many worlds; ``+`` adds the sums over other worlds."""
 
-    # True/false measures, by name: number of worlds in which it is true, number of worlds with a value.
+    # Name of a true/false measure -> number of worlds in which it is true, number of worlds in which it has a value.
     counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
-    # Measures that are numbers, by name; true/false measures too, as 1 and 0, if the worlds have clusters.
+    # Name of a numeric measure -> its sums. If the worlds have clusters, also true/false measures, as 1 and 0.
     moments: Mapping[str, Moments] = field(default_factory=dict)
-    # Measures that are compared with a baseline, by name: sum over worlds of own value times the baseline's value.
+    # Name of a measure that is compared with a baseline -> sum over worlds of own value times the baseline's value.
     products: Mapping[str, Fraction] = field(default_factory=dict)
 
     def __add__(self, other: AgentTally) -> AgentTally:
@@ -42,21 +42,21 @@ class AgentTally:
         return AgentTally(counts, moments, products)
 
     def count(self, name: str) -> int:
-        """Return the number of worlds in which the true/false measure ``name`` is true; 0 for an unknown name."""
+        """Return the number of worlds in which the true/false measure ``name`` is true (0 for an unknown name)."""
         return self.counts.get(name, (0, 0))[0]
 
     def share(self, name: str, worlds: int) -> float | None:
-        """Return the share, 0 to 1, of worlds in which the true/false measure ``name`` is true.
+        """Return the fraction (0 to 1) of the worlds in which the true/false measure ``name`` is true.
 
-        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        ``worlds`` is the number of evaluated worlds. The result is None if some of these worlds have no value.
         """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
 
     def sums(self, name: str, worlds: int) -> Moments | None:
-        """Return count, sum and sum of squares of the measure ``name``, whose values are numbers.
+        """Return count, sum and sum of squares of the numeric measure ``name``.
 
-        ``worlds`` is the number of evaluated worlds. Returns None if the measure lacks a value in some of them.
+        ``worlds`` is the number of evaluated worlds. The result is None if some of these worlds have no value.
         """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
@@ -74,11 +74,11 @@ def tally_agents(
 
     Args:
         outcomes: outcome of each agent, by the agent's name.
-        contexts: what each set of measures prepared for these worlds; see ``contexts_of``.
-        baseline: name of the agent to compare with, for sets of measures without a baseline of their own.
-        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
-            the harm that each vehicle bears, and its value under each objective; None: neither.
-        clusters: name of each world's cluster, [n]; None: all worlds are independent.
+        contexts: data that each set of measures computed once for these worlds (``contexts_of``), by the set's name.
+        baseline: name of the agent to compare with, for sets of measures that name no baseline.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). With a list, even an empty one, the result
+            also has the harm that each vehicle bears, and the vehicle's value under each of these objectives.
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
     values: dict[str, dict[str, Values]] = {}
@@ -114,13 +114,13 @@ def tally_agents(
 def estimate_all(
     tallies: Mapping[str, AgentTally], agent: str, worlds: int, *, baseline: str
 ) -> dict[str, Estimate | None]:
-    """Return the estimate (value and 95 % interval) of every measure of one agent, by the measure's name.
+    """Return the estimate (mean and 95 % interval) of every measure of one agent, by the measure's name.
 
     Args:
         tallies: sums of every agent, by the agent's name.
         agent: name of the agent.
-        worlds: number of evaluated worlds. A measure that lacks a value in some of them has the estimate None.
-        baseline: name of the agent to compare with; comparisons are None if it was not evaluated.
+        worlds: number of evaluated worlds. The estimate of a measure is None if some of these worlds have no value.
+        baseline: name of the agent to compare with. If it was not evaluated, the comparisons are None.
 
     """
     own = tallies[agent]
@@ -139,15 +139,15 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Return the estimate of one measure; None if it lacks a value in some of the ``worlds``, or cannot be compared.
+    """Return the estimate of one measure, or None if some worlds have no value or the comparison is impossible.
 
     Args:
         measure: the measure.
-        own: the agent's sums.
-        baseline: the sums of the agent to compare with; None: there is none.
+        own: sums of the agent.
+        baseline: sums of the agent to compare with; None if there is no such agent.
         worlds: number of evaluated worlds.
-        whole: name of a true/false measure (``MeasureSet.whole``). The agent is compared with the baseline only if this
-            is true in all worlds; None: no such condition.
+        whole: name of a true/false measure (``MeasureSet.whole``) that must be true in all worlds for a comparison with
+            the baseline; None if there is no such condition.
 
     """
     name = measure.name if callable(measure.of) else measure.of
@@ -164,11 +164,15 @@ def _estimate(
 
 
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
-    """Return the names of the measures whose means are only lower bounds for one agent.
+    """Return the names of the measures whose means are lower bounds of the true means, for one agent.
 
-    ``tally`` holds the agent's sums over ``worlds`` worlds. A set of measures may name a true/false measure
-    (``MeasureSet.whole``) that says whether a world's values are complete. If this is false in some world, the means of
-    the set are lower bounds.
+    A set of measures may name a true/false measure (``MeasureSet.whole``) that says whether a world's values are
+    complete. If it is false in some world, all means of the set are lower bounds.
+
+    Args:
+        tally: sums of the agent.
+        worlds: number of evaluated worlds.
+
     """
 
     def is_partial(each: MeasureSet) -> bool:

@@ -1,7 +1,6 @@
-"""Evaluation of lists of worlds in chunks: in this process, in several processes, or on a Ray cluster.
+"""Evaluate long lists of worlds in chunks: in this process, in several processes, or on a Ray cluster.
 
-Chunks have a fixed size, and sums over worlds are exact. So no result depends on the number of processes, or on whether
-the worlds are held in memory.
+Chunks have a fixed size, and sums over worlds are exact. Results are therefore the same for any number of processes.
 """
 
 from __future__ import annotations
@@ -38,26 +37,27 @@ from ethbrake_marl.scenario.task import Task
 
 MOST_EPISODES = 10**12
 
-OnDone = Callable[[int], None]  # worlds done so far
+OnDone = Callable[[int], None]  # called with the number of worlds evaluated so far
 
-_MADE: dict[str, Mapping[str, Driver]] = {}  # agents of this process's last lineup; an evaluation drives copies
+# Agents of the lineup that this process built last, by ``Lineup.same``. An evaluation drives copies of them.
+_BUILT: dict[str, Mapping[str, Driver]] = {}
 
 
 @dataclass(frozen=True, slots=True)
 class Lineup:
-    """The agents of an evaluation as plain data, from which every worker process builds the same agents.
+    """Description of an evaluation's agents as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: specs (texts that name agents, such as ``full_brake``), as on the command line.
-        scenario: the scenario whose learners they drive.
-        harm_count: harm that agents minimise: each pair's first impact only (``first``) or all impacts (``total``).
+        agents: specs of the agents (``full_brake``, ``ppo+step``), as on the command line.
+        scenario: scenario whose learners the agents drive.
+        harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
         uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.
-        measures: names or ``FILE:NAME`` of user measures to load, as ``load_measures`` takes them.
-        reported: names of all user measures that the evaluation reports; measures registered later are not added.
-        sets: names of the sets of measures in the requesting process.
-        same: hash of everything that must be equal in every process; see ``Lineup.of``.
-        packages: name and version of each package that provided a part in the requesting process; workers must have the
-            same.
+        measures: names or ``FILE:NAME`` of user measures to load (``load_measures``).
+        reported: names of all user measures that the evaluation reports.
+        sets: names of the sets of measures in the main process. Every worker process must have these sets.
+        same: hash of everything that must be equal in every process (``Lineup.of``).
+        packages: version of each extension package that the main process uses, by name. Every worker process must have
+            these versions.
 
     """
 
@@ -73,35 +73,36 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """Return the lineup of these agents, with a hash that worker processes compare with their own.
+        """Return the lineup of these agents, with a hash of their policies, measures and versions.
 
-        A worker with other policies, measures or versions refuses the lineup (``make``).
+        A worker process computes the same hash and refuses the lineup if the two differ (``make``).
 
         Args:
-            agents: specs, as on the command line.
-            scenario: the scenario whose learners they drive.
-            how: ``harm_count``, ``uncertainty`` and ``measures`` of the class.
+            agents: specs of the agents, as on the command line.
+            scenario: scenario whose learners the agents drive.
+            how: ``harm_count``, ``uncertainty`` and ``measures``, as the class takes them.
 
-        Raises what ``make_lineup`` raises.
+        Raises the errors of ``make_lineup``.
 
         """
         load_measures(how.pop("measures", ()))
-        sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads them, so that their versions are known
+        sets = tuple(name for name, _ in MEASURE_SETS.items())  # loads the sets, so that their versions are known
         lineup = cls(tuple(agents), scenario, measures=tuple(LOADED), reported=tuple(REPORTED), sets=sets, **how)
-        drivers = lineup._make_anew()
+        drivers = lineup._build()
         same = lineup._same(drivers)
-        _MADE.clear()
-        _MADE[same] = drivers
+        _BUILT.clear()
+        _BUILT[same] = drivers
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """Return the agents by spec, built once per process.
+        """Return the agents by spec; each process builds them once.
 
-        Raises ``InvalidInput`` if policies, measures or versions differ from those where the lineup was created.
+        Raises ``InvalidInput`` if this process has other policies, measures or versions than the process that created
+        the lineup.
         """
-        if self.same not in _MADE:
+        if self.same not in _BUILT:
             load_measures(self.measures)
-            drivers = self._make_anew()
+            drivers = self._build()
             same = (
                 self._same(drivers) == self.same
                 and {*self.reported} <= REPORTED.keys()
@@ -109,14 +110,14 @@ class Lineup:
             )
             if not same or any(_installed(name) != used for name, used in self.packages.items()):
                 raise InvalidInput(
-                    "evaluate: a worker has other policies, measures or versions than the process that asks it;"
-                    " install the same everywhere, and change no file while an evaluation runs"
+                    "evaluate: a worker process has other policies, measures or package versions than the main process;"
+                    " install the same versions on all machines, and change no file while an evaluation runs"
                 )
-            _MADE.clear()
-            _MADE[self.same] = drivers
-        return _MADE[self.same]
+            _BUILT.clear()
+            _BUILT[self.same] = drivers
+        return _BUILT[self.same]
 
-    def _make_anew(self) -> Mapping[str, Driver]:
+    def _build(self) -> Mapping[str, Driver]:
         return make_lineup(self.agents, self.scenario, harm_count=self.harm_count, uncertainty=self.uncertainty)
 
     def _same(self, drivers: Mapping[str, Driver]) -> str:
@@ -128,7 +129,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every file that specs and measures name: Python files, and weights for such agents."""
+        """Return the SHA-256 of every Python file and weights file that a spec or measure names."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
@@ -150,22 +151,22 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """Let the agents of a lineup drive every world of a sample, in several processes if requested.
+    """Let the agents of a lineup drive all worlds of a sample, and return their outcomes.
 
     Args:
         lineup: the agents.
-        sample: the worlds, all in memory.
-        seed: seed of the worlds, which is recorded in the result; None for worlds of other origin.
-        jobs: number of processes; None: one, or as many as Ray has cores.
-        ray: address of a Ray cluster, or ``local``; None: no Ray.
-        on_done: called with the number of worlds done so far.
+        sample: the worlds, which are all held in memory.
+        seed: seed of the worlds, which the result records; None for worlds that were not drawn from a seed.
+        jobs: number of processes; None: one process, or with Ray one per core of the cluster.
+        ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
+        on_done: function that is called after each chunk with the number of worlds evaluated so far.
 
     """
     calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
     parts: list[Evaluation] = []
     for part in run_each(calls, jobs, ray):
         parts.append(part)
-        _tell(on_done, len(parts), sample.worlds.n)
+        _report(on_done, len(parts), sample.worlds.n)
     return replace(Evaluation.join(parts), rejected=sample.rejected)
 
 
@@ -177,7 +178,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome without user measures (``Outcome.metrics``) other than those called ``names``."""
+    """Return the outcome without the user measures (``Outcome.metrics``) that ``names`` does not list."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 
@@ -192,19 +193,20 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """Return the statistics of worlds 0 to ``episodes - 1`` of a list of any length.
+    """Let the agents of a lineup drive an evaluation list of any length, and return sums over its worlds.
 
-    The worlds are not held in memory together. Sets of measures that take longer than driving are omitted.
+    The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. Sets of
+    measures that take longer to compute than the episodes themselves are omitted.
 
     Args:
         lineup: the agents.
-        episodes: number of worlds.
+        episodes: number of worlds in the list, 1 to 10^12.
         seed: seed from which the worlds are drawn.
-        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also sum
-            the harm that each vehicle bears, and its value under each objective.
-        jobs: number of processes; None: one, or as many as Ray has cores.
-        ray: address of a Ray cluster, or ``local``; None: no Ray.
-        on_done: called with the number of worlds done so far.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). The result then also has the harm that
+            each vehicle bears, and the vehicle's value under each of these objectives.
+        jobs: number of processes; None: one process, or with Ray one per core of the cluster.
+        ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
+        on_done: function that is called after each chunk with the number of worlds evaluated so far.
 
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
@@ -216,7 +218,7 @@ def tally_list(
     whole = Tally()
     for done, part in enumerate(run_each(calls, jobs, ray), 1):
         whole += part
-        _tell(on_done, done, episodes)
+        _report(on_done, done, episodes)
     return whole
 
 
@@ -224,20 +226,20 @@ def _count(lineup: Lineup, first: int, end: int, seed: int, objectives: Sequence
     return Tally.of(_drive(lineup, lineup.scenario.sample(end - first, seed, first=first), seed, first), objectives)
 
 
-def _tell(on_done: OnDone | None, chunks: int, worlds: int) -> None:
+def _report(on_done: OnDone | None, chunks: int, worlds: int) -> None:
     if on_done is not None:
         on_done(min(chunks * CHUNK, worlds))
 
 
 def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
-    """Return the results table of a list that ``tally_list`` evaluated, one row per agent, as ``summarise`` does.
+    """Return the results table of an evaluation list that ``tally_list`` evaluated, with one row per agent.
 
     Args:
         lineup: the evaluated agents.
         tally: result of ``tally_list``.
-        seed: seed of the list.
+        seed: seed of the evaluation list.
 
-    Raises ``PhysicsError`` if every world was left out.
+    Raises ``PhysicsError`` if every world was left out because of an error.
 
     """
     if not tally.worlds:

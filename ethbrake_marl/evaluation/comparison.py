@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.exploits import MARK, Exploits
 from ethbrake_marl.evaluation.per_world import COMPARED, HARMS, SAME, Result, recorded_value
 from ethbrake_marl.evaluation.statistics import Texts, paired_difference, unpaired_difference
@@ -24,17 +24,18 @@ class Difference:
     """Difference between two results in the mean harm per world of one agent: second minus first (m2/s2)."""
 
     agent: str  # name of the agent, the same in both results
-    policy: Literal["same", "other", "none"]  # trained policies in both results: equal, different, or not any
-    harms: Mapping[str, Estimate]  # harm (``first_impact_harm``, ``total_harm``) -> difference with interval
-    exploits: tuple[Exploits, Exploits]  # behaviour that harm does not count, in the first and in the second result
+    # Whether the agent has the same trained policy in both results, another one, or none in either.
+    policy: Literal["same", "other", "none"]
+    harms: Mapping[str, Estimate]  # count of harm (``first_impact_harm``, ``total_harm``) -> difference with interval
+    exploits: tuple[Exploits, Exploits]  # the agent's exploits in the first and in the second result
 
     @property
     def marked(self) -> str:
-        """Name of the agent, followed by ‡ if in either result its behaviour does damage that harm does not count."""
+        """Name of the agent, followed by ‡ if it has exploits in either result."""
         return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON: ``agent``, ``policy``, ``exploits``, each harm's difference with its interval."""
+        """Return the entry for JSON, with agent, policy, exploits, and differences of harm with intervals."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         exploits = [list(each.names) for each in self.exploits]
         return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
@@ -44,21 +45,18 @@ class Difference:
 class Comparison:
     """Comparison of two results files on the same worlds, agent by agent."""
 
-    differences: tuple[Difference, ...]  # second result minus first, one entry per agent of both
-    unpaired_because: str | None  # reason why the intervals are not paired by world; None: they are paired
-    recordings: int  # number of recordings that the intervals are by; 0: all worlds are independent
-    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # names of agents in the first result only, in the second only
-    # Settings of the agents that differ, by name: value in the first and in the second result; None: not there.
+    differences: tuple[Difference, ...]  # second result minus first, one entry per agent that is in both results
+    unpaired_because: str | None  # why worlds of the two results cannot be paired; None: the intervals are paired
+    recordings: int  # number of recordings, as clusters of worlds; 0: all worlds are independent
+    left_over: tuple[tuple[str, ...], tuple[str, ...]]  # agents of the first result only, agents of the second only
+    # Name of a setting that differs -> value in the first and in the second result; None: the setting is missing.
     other_settings: Mapping[str, tuple[str | None, str | None]]
-    # Versions of packages that differ, by name: version in the first and in the second result; None: not there.
+    # Name of a package whose version differs -> version in the first and in the second result; None: not used.
     other_versions: Mapping[str, tuple[str | None, str | None]]
 
     @property
     def exploits_line(self) -> str:
-        """Sentence about agents whose behaviour does damage that harm does not count (``Exploits``).
-
-        It says in which result they do; it is empty if no agent does.
-        """
+        """Sentence that names agents with exploits, and the result in which they have them; "" without such agents."""
         of_agents: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
@@ -82,23 +80,23 @@ class Comparison:
 
 
 def compare_results(first: Result, second: Result) -> Comparison:
-    """Compare the mean harms of agents of the same name in two results, as second minus first.
+    """Compare the mean harms of agents that have the same name in two results: second result minus first.
 
-    The comparison is paired by world if both results come with a file of every world. Raises ``InvalidInput`` for
-    results of different kinds, on different worlds or scenarios, or without a common agent.
+    If both results have a file with one row per world, the intervals are paired by world. Raises ``InvalidInput`` if
+    the results differ in kind, worlds or scenario, or have no agent in common.
     """
     for key, what in SAME.items():
         value, value_second = (recorded_value(result.about, key) for result in (first, second))
         if value != value_second:
             raise InvalidInput(
-                f"{second.path}: is about {what} than {first.path} ({key} {value_second!s:.12} and {value!s:.12}):"
-                " no comparison"
+                f"{second.path} and {first.path} cannot be compared: {what} ({key} is {value_second!s:.12} and"
+                f" {value!s:.12})"
             )
     common = [agent for agent in first.rows if agent in second.rows]
     left_over = [tuple(agent for agent in one.rows if agent not in common) for one in (first, second)]
     if not common:
-        agents = " and ".join(f"{', '.join(names)}" for names in left_over)
-        raise InvalidInput(f"{first.path} and {second.path} have no agent in common: {agents}")
+        agents = [", ".join(names) for names in left_over]
+        raise InvalidInput(f"{first.path} ({agents[0]}) and {second.path} ({agents[1]}) have no agent in common")
     worlds, because = _worlds_of_both(first, second, common)
     recordings = int(recorded_value(first.about, "recordings") or 0)
     differences = []
@@ -130,19 +128,19 @@ Worlds = dict[str, tuple[Floats, Floats, Texts | None]]
 
 
 def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
-    """Return the harms of every world in both results, and None; or None, and the reason why they cannot be paired.
+    """Return (harms of every world in both results, None), or (None, reason why the worlds cannot be paired).
 
-    ``common``: names of the agents that both results have.
+    ``common``: names of the agents that both results contain.
     """
     try:
         (one, named), (other, _) = first.harms(), second.harms()
     except InvalidInput as error:
-        return None, f"one row per world is needed of both; {error}"
+        return None, f"both results need a file with one row per world; {error}"
     harms: Worlds = {}
     for agent in common:
         worlds = sorted(one.get(agent, {}))
         if len(worlds) != first.rows[agent]["episodes"] or worlds != sorted(other.get(agent, {})):
-            return None, f"the rows per world of {agent} are not those of {count_of(len(worlds), 'same world')}"
+            return None, f"the two results do not list the same worlds for {agent}"
         harms_of_both = [np.array([side[agent][world] for world in worlds]) for side in (one, other)]
         kinds = {RECORDING: np.array([named[world] for world in worlds])} if named else {}
         harms[agent] = harms_of_both[0], harms_of_both[1], clusters_of(kinds, np.array(worlds))
@@ -151,6 +149,7 @@ def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tup
                 stated = result.rows[agent].get(name)
                 if stated is not None and not math.isclose(stated, mean, rel_tol=1e-9, abs_tol=1e-9):
                     raise InvalidInput(
-                        f"{result.path}: {agent}: {name} = {stated:g}, but the mean of its worlds is {mean:g}"
+                        f"{result.path}: {agent}: {name} = {stated:g}, but the mean over the worlds in the file with"
+                        f" one row per world is {mean:g}; one of the two files was changed, so evaluate again"
                     )
     return harms, None

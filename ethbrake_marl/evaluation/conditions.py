@@ -1,4 +1,4 @@
-"""Conditions of a result: the scenario, the worlds and the vehicles behind a table, a figure or a report."""
+"""Conditions under which a result was obtained: scenario, worlds and vehicles, for captions and JSON."""
 
 from __future__ import annotations
 
@@ -35,25 +35,25 @@ _STAY = "\u00a0"  # a non-breaking space
 class Conditions(dict[str, Any]):
     """Dictionary that describes how a result was obtained: scenario, seed, vehicles, scripts, quantities of the worlds.
 
-    ``of`` and ``of_ranges`` create one with the quantities only, ``of_test`` one with all entries.
+    ``of`` and ``of_ranges`` return only the quantities, ``of_test`` all entries.
     """
 
     @classmethod
     def of(cls, worlds: Worlds) -> Conditions:
-        """Return every quantity of the worlds by key: ``{"gaps_m": [7.0, [5.0, 9.0]], "restitution": 0.1}``.
+        """Return every quantity of the worlds by key, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
 
-        The value is a list with an entry for each vehicle or pair, or a single entry for a quantity of the whole world.
-        An entry is a number if all worlds agree, else ``[smallest, largest]``.
+        A quantity of vehicles or pairs has a list with one entry for each of them, front to rear. A quantity of the
+        whole world has a single entry. An entry is a number if all worlds agree, else ``[smallest, largest]``.
         """
         return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
-        """Return the same dictionary as ``of``, from values instead of worlds.
+        """Return the same dictionary as ``of``, computed from arrays of values.
 
         Args:
-            ranges: for each quantity's key, one array per vehicle or pair. It may hold the values of all worlds, or
-                just the smallest and the largest one.
+            ranges: key of a quantity -> one array per vehicle or pair (or one for the whole world). An array has the
+                values of all worlds, or only the smallest and the largest value.
 
         """
         ends_of = {
@@ -75,17 +75,18 @@ class Conditions(dict[str, Any]):
         recordings: int = 0,
         rejected: int = 0,
     ) -> Conditions:
-        """Return all conditions of an evaluation, with the keys that JSON results have under ``parameters``.
+        """Return all conditions of an evaluation: the object ``parameters`` of JSON results.
 
         Args:
             task: the scenario and the controlled vehicles.
-            seed: seed of the list; None for worlds that the caller passed.
+            seed: seed of the evaluation list; None for worlds that the caller passed.
             count: number of worlds.
-            because: key of a set of measures (``MeasureSet.because_key``) -> why the set does not apply to these
-                worlds; None if it applies.
+            because: key of a set of measures (``MeasureSet.because_key``) -> reason why the set does not apply to these
+                worlds; None if the set applies.
             quantities: quantities of the worlds, as ``of`` returns them.
-            recordings: number of recordings that the worlds come from; 0: they come from none.
-            rejected: number of draws that were rejected for an early impact; reported only for rows of a table.
+            recordings: number of recordings that the worlds come from; 0 if the worlds come from no recordings.
+            rejected: number of drawn worlds that were rejected because of an early impact. The result has this number
+                only if the scenario takes its worlds from a table.
 
         """
         scenario = task.scenario
@@ -109,7 +110,7 @@ class Conditions(dict[str, Any]):
 
     @property
     def line(self) -> str:
-        """Caption in one line: scenario, number of worlds, seed, recordings, quantities, unusual messages."""
+        """Caption in one line: scenario, number of worlds, seed, recordings, quantities, content of messages."""
         seed = "" if self["seed"] is None else f", seed {self['seed']}"
         messages = f"; {_message_words(self['tells'])}" if "tells" in self else ""
         worlds = f"{count_of(self['count'], 'world')}{seed}{self.by_recording}"
@@ -117,19 +118,19 @@ class Conditions(dict[str, Any]):
 
     @property
     def by_recording(self) -> str:
-        """Caption on the recordings that intervals are by: ``; 95 % intervals by 55 recordings``; empty without any.
+        """Part of a caption that says how many recordings the worlds come from; empty without recordings.
 
-        A single recording allows no interval.
+        For instance ``; 95 % intervals by 55 recordings``. With a single recording there are no intervals.
         """
         number = self.get("recordings", 0)
         many = f"; 95 % intervals by {number:,} recordings" if number else ""
-        return "; no 95 % intervals: all worlds are of one recording" if number == 1 else many
+        return "; no 95 % intervals: all worlds come from one recording" if number == 1 else many
 
     @property
     def quantities(self) -> str:
-        """The quantities in one line, each with symbol and unit: ``d = 7 m; v = (20, 18, 20) m/s; ...``.
+        """All quantities in one line, with symbols and units, such as ``d = 7 m; v = (20, 18, 20) m/s``.
 
-        If all vehicles or pairs have the same value, it is written once.
+        A value that all vehicles or pairs share is written once.
         """
         parts = []
         for key, (symbol, unit) in _SYMBOLS.items():
@@ -142,12 +143,15 @@ class Conditions(dict[str, Any]):
 
 
 def _plain(tells: Tells) -> Any:
-    """Return what messages contain as plain data for JSON: a list, or a list by vehicle."""
+    """Return what messages contain, as plain data for JSON: one list for all vehicles, or one per vehicle."""
     return {name: [*each] for name, each in tells.items()} if isinstance(tells, Mapping) else [*tells]
 
 
 def message_words(scenario: Scenario) -> str:
-    """Return what messages contain in words, for instance ``messages of all contain place``; empty: the usual."""
+    """Return a text about what messages contain, for instance ``messages of all contain place``.
+
+    The text is empty if the scenario does not set ``tells``.
+    """
     tells = scenario.v2x.channel.tells
     return "" if tells is None else _message_words(tells)
 

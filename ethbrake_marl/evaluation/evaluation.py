@@ -25,26 +25,24 @@ from ethbrake_marl.scenario.sample import clusters_of
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
-_SHOWN_AGENTS = 5  # number of agents named in ``repr``
+_SHOWN_AGENTS = 5  # largest number of agents that ``repr`` names
 
-Columns = dict[str, list[Any]]  # columns of a table with one row per agent and world
+Columns = dict[str, list[Any]]  # columns of a table with one row per agent and world, by name
 
-_TEXTS = {
-    "agent",
-    "scenario",
-    RECORDING,
-    "ended",
-    "knows",
-}  # columns of texts, in addition to those of sets of measures
+# Names of columns that contain texts. Sets of measures add further ones (``MeasureSet.texts``).
+_TEXTS = {"agent", "scenario", RECORDING, "ended", "knows"}
 
-_ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")  # quantities in these tables even if all worlds agree
+# Initial quantities that ``per_world`` lists even if all worlds have the same value.
+_ALWAYS_SHOWN = ("gaps_m", "speeds_mps", "obstacle_gap_m")
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Outcomes of several agents that drove the same vehicles in the same worlds; row k of every array is world k.
+    """Outcomes of several agents that drove the same vehicles in the same worlds.
+
+    Row k of every array belongs to the same world.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -56,17 +54,17 @@ class Evaluation:
     """
 
     scenario: Scenario  # scenario of the worlds
-    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that the agents controlled; the others ran scripts
+    vehicles: tuple[int, ...]  # indices (0 = front) of the vehicles that the agents controlled
     worlds: Worlds  # the n worlds at the alert
-    index: Ints  # [n] number of each world in the evaluation list of ``seed``, from 0
-    seed: int | None  # seed from which the worlds were drawn; None for worlds that the caller passed
+    index: Ints  # [n] number of each world in the evaluation list, from 0
+    seed: int | None  # seed of the evaluation list; None for worlds that the caller passed
     outcomes: dict[str, Outcome]  # results of each agent in these worlds, by the agent's name
-    left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; they are in none of the arrays
-    # Groups of the worlds: ``{"scenario": [n names], "vehicle_2_type": [n names]}``. Only a mixture has ``scenario``,
-    # and only a scenario with vehicle types has the types; else it is empty.
+    left_out: tuple[LeftOut, ...] = ()  # worlds that could not be simulated with some agent; no array contains them
+    # Names of the groups that each world belongs to, [n]: ``scenario`` if the scenario is a mixture,
+    # ``vehicle_2_type`` and so on if it has vehicle types, ``recording`` if its worlds come from recordings.
     kinds: Mapping[str, NDArray[np.str_]] = field(default_factory=dict)
-    rejected: int = 0  # number of draws of this list that were rejected for an early impact
-    host: str = ""  # name of the simulator that moved the worlds; "": the physics of this package
+    rejected: int = 0  # number of drawn worlds that were rejected because of an early impact
+    host: str = ""  # name of the external simulator that moved the vehicles; "": the physics of this package
     _computed: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache of ``once``
 
     def __repr__(self) -> str:
@@ -90,7 +88,7 @@ class Evaluation:
         return Task(self.scenario, self.vehicles)
 
     def once(self, compute: Callable[[Evaluation], T]) -> T:
-        """Return ``compute(self)``. A later call with the same function returns the stored result."""
+        """Return ``compute(self)``, and store the result for later calls with the same function."""
         if compute not in self._computed:
             self._computed[compute] = compute(self)
         result: T = self._computed[compute]
@@ -98,12 +96,12 @@ class Evaluation:
 
     @classmethod
     def join(cls, parts: Sequence[Evaluation]) -> Evaluation:
-        """Join the evaluations of the parts of a list of worlds into the evaluation of the whole list.
+        """Join evaluations of consecutive chunks of worlds into one evaluation of all these worlds.
 
         Args:
-            parts: evaluations of the same agents, in the order of their worlds in the list.
+            parts: evaluations of the same agents, one per chunk, in the order of the worlds.
 
-        Raises ``PhysicsError`` if every world was left out.
+        Raises ``PhysicsError`` if every world was left out because of an error.
 
         """
         left_out = tuple(left for part in parts for left in part.left_out)
@@ -123,10 +121,10 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the same evaluation with some of its worlds only, an empty ``left_out``, and ``rejected`` 0.
+        """Return the evaluation restricted to some of its worlds, with an empty ``left_out`` and ``rejected`` 0.
 
         Args:
-            rows: row numbers of the worlds to keep, or a mask [n] that is true for them.
+            rows: row numbers of the worlds to keep, or a mask [n] that is true for the worlds to keep.
 
         """
         outcomes = {name: outcome.take(rows) for name, outcome in self.outcomes.items()}
@@ -136,9 +134,10 @@ class Evaluation:
 
     @property
     def hidden(self) -> Bools:
-        """Whether the V2X channel hides something about the line from a controlled vehicle, for each world: [n] bool.
+        """Whether the V2X channel hides something from a controlled vehicle, for each world, [n].
 
-        It does where messages arrive late, only from time to time, or not at all.
+        This is so if messages arrive late, only from time to time or not at all, if they omit a quantity, or if another
+        vehicle reacts later than its message says.
         """
         messages, hides = Messages.of(self.worlds), self.worlds.vehicles.hide_from
         from_each = [hides(i) | messages.periodic | messages.withhold_from(i) for i in self.vehicles]
@@ -147,7 +146,7 @@ class Evaluation:
 
     @property
     def clusters(self) -> NDArray[np.str_] | None:
-        """Name of each world's cluster, [n] (``clusters_of``); None: all worlds are independent."""
+        """Name of the cluster (recording) of each world, [n]; None: all worlds are independent."""
         return clusters_of(self.kinds, self.index)
 
     @property
@@ -157,7 +156,7 @@ class Evaluation:
 
     @property
     def conditions(self) -> Conditions:
-        """Scenario, seed, controlled vehicles and every quantity of the worlds, as plain data for captions and JSON."""
+        """Conditions of this evaluation (scenario, seed, controlled vehicles, quantities), for captions and JSON."""
         because = silent_because(contexts_of(self))
         return Conditions.of_test(
             self.task, self.seed, self.worlds.n, because, Conditions.of(self.worlds),
@@ -165,11 +164,14 @@ class Evaluation:
         )  # fmt: skip
 
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
-        """Return a table with one row per agent and world, as columns; None stands for a missing value.
+        """Return a table with one row per agent and world, as a dictionary: name of a column -> its values.
 
-        The result maps the name of a column to its values; docs/evaluate.md lists the columns. Initial quantities are
-        named ``gap_1_m``, ``speed_1_mps``, ``latency_2_s``, ``restitution``. Each of ``objectives`` (``total``,
-        ``social:45``) adds columns with its value for each vehicle.
+        docs/evaluate.md lists the columns. Initial quantities have names such as ``gap_1_m``, ``speed_1_mps``,
+        ``latency_2_s`` and ``restitution``. A missing value is None.
+
+        Args:
+            objectives: objectives such as ``"social:45"``; each adds columns with its value for every vehicle.
+
         """
         n, contexts = self.worlds.n, contexts_of(self)
         initial: Columns = {"world": self.index.tolist()}
@@ -202,7 +204,7 @@ class Evaluation:
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
         """Return the columns of ``per_world`` as arrays, by name.
 
-        NaN stands for a missing number, the empty text for a missing text. Each of ``objectives`` adds columns.
+        A missing number is NaN, and a missing text is empty. ``objectives`` are as in ``per_world``.
         """
         arrays, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
@@ -211,10 +213,10 @@ class Evaluation:
         return arrays
 
     def to_pandas(self) -> Any:
-        """Return a pandas ``DataFrame`` with one row per agent and world: the columns of ``--per-world``.
+        """Return a pandas ``DataFrame`` with one row per agent and world.
 
-        docs/evaluate.md lists the columns. NaN stands for a missing number. ``arrays`` has the same columns without
-        pandas. Raises ``MissingExtra`` if pandas is not installed.
+        docs/evaluate.md lists the columns. A missing number is NaN. ``arrays`` returns the same columns without pandas.
+        Raises ``MissingExtra`` if pandas is not installed.
         """
         with naming_extras():
             from pandas import DataFrame
@@ -222,10 +224,10 @@ class Evaluation:
         return DataFrame(self.arrays())
 
     def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
-        """Return the mean harm of every agent, by vehicle, under several objectives and both counts of harm.
+        """Return the mean value of several objectives, for every agent, each vehicle and both counts of harm.
 
         Args:
-            declared: the objectives, such as ``"total"`` or ``"social:45"``; None: the standard ones
+            declared: objectives such as ``"total"`` or ``"social:45"``; None: the standard objectives
                 (``standard_objectives``).
 
         """
@@ -240,18 +242,18 @@ class Evaluation:
         )
 
     def _repr_html_(self) -> str:
-        """Return HTML of a table with collisions and harm of each agent, for a notebook."""
+        """Return a table with the collisions and harm of each agent as HTML, for a notebook."""
         by, share = self.clusters, Column("Collisions", digits=1, scale=100.0, unit=" %")
         rows = [
             (agent, share_of(each.collided, by), mean(each.first_impact_harm, by), mean(each.total_harm, by))
             for agent, each in self.outcomes.items()
         ]
         note = f"Means per world in m²/s², with their 95 % intervals{self.conditions.by_recording}."
-        note += " eb.summarise shows all measures."
+        note += " eb.summarise(...) shows all measures."
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return this evaluation; raise ``PhysicsError``, naming the worlds, if some worlds were left out."""
+        """Return this evaluation unchanged; raise ``PhysicsError`` with the worlds that were left out, if any."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self
@@ -259,5 +261,5 @@ class Evaluation:
     def outcome(self, agent: str) -> Outcome:
         """Return the results of the agent with this name; raise ``InvalidInput`` if it was not evaluated."""
         if agent not in self.outcomes:
-            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated: {', '.join(self.outcomes)}")
+            raise InvalidInput(f"agent {agent!r} was not evaluated; evaluated agents: {', '.join(self.outcomes)}")
         return self.outcomes[agent]

@@ -1,4 +1,4 @@
-"""Warnings about trained policies that drive in worlds unlike those of their training."""
+"""Warnings about trained policies that drive in worlds unlike their training worlds."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from ethbrake_marl.policies.manifest import Manifest
 from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.schema import Scenario
 
-_MOST_BEYOND = 0.05  # share of worlds outside the training's range that is tolerated without a warning
+_MOST_BEYOND = 0.05  # largest fraction of worlds outside the training range that causes no warning
 
-_TRAINED = 2_000  # number of worlds drawn from the training's scenario to find the range of each quantity
+_TRAINED = 2_000  # number of worlds drawn from the training scenario to find the range of each quantity
 
 
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
     """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds outside the range of its training.
 
-    The training's worlds are drawn from the scenario in the policy's manifest. If that scenario cannot be drawn here,
-    there is no warning. Of the V2X channel, only the latencies and the contents of messages are compared.
+    The range of each quantity is found by drawing worlds from the training scenario, which the policy's manifest
+    contains. If the worlds of this scenario cannot be drawn on this machine, there is no warning. Of the V2X channel,
+    only the latencies and the contents of messages are compared.
 
     Args:
-        agents: agents by name; those that are not trained policies are ignored.
-        worlds: worlds at the alert in which they are to drive.
+        agents: agents by name; agents without a trained policy are ignored.
+        worlds: worlds at the alert in which the agents are to drive.
         scenario: scenario of these worlds.
         vehicles: indices (0 = front) of the vehicles that each agent drives.
 
@@ -53,18 +54,18 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
             if str(trained.scripts.get(i, script)) != str(script):
                 unfamiliar.append(f"{scenario.vehicle_names[i]} by {script}")
         if unfamiliar:
-            beyond = f"trained on {trained.name}, and not for what {scenario.name} has: {', '.join(unfamiliar)}"
+            beyond = f"trained on {trained.name}, but {scenario.name} differs from it: {', '.join(unfamiliar)}"
             warnings.warn(f"{name}: {beyond}", Unfamiliar, stacklevel=2)
 
 
 def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
-    """Return descriptions of quantities of ``worlds`` that lie outside the range of the training's worlds ``before``.
+    """Return descriptions of quantities of ``worlds`` that lie outside the range of the training worlds ``before``.
 
     Example: ``["latency_s in 40 % of the worlds", "no friction"]``.
     """
     unfamiliar, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():
-        if key == "harm_weight":  # no motion depends on it, and a policy observes shares, which are from 0 to 1 anyhow
+        if key == "harm_weight":  # motion does not depend on it, and policies observe it scaled to the range 0 to 1
             continue
         if key not in known:
             unfamiliar.append(key)
@@ -80,11 +81,11 @@ def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
             unfamiliar.append(f"{key} in {100.0 * share:.0f} % of the worlds")
     absent = [key for key in known if key not in here and key != "harm_weight"]
     gone = {key: known[key].of(before) < known[key].high for key in absent}
-    return unfamiliar + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]  # all had it before
+    return unfamiliar + [f"no {key}" for key, there in gone.items() if there.any(axis=1).all()]
 
 
 def _contents(trained: Scenario, scenario: Scenario) -> list[str]:
-    """Return descriptions of what messages contain in one of two scenarios alone, such as ``messages without mass``."""
+    """Return how the contents of messages differ between two scenarios, such as ``messages without mass``."""
     usual = np.array([piece in USUAL_PIECES for piece in PIECES])
     contents = [each.v2x.channel.contents(scenario.vehicles) for each in (trained, scenario)]
     before, here = (np.tile(usual, (scenario.vehicles, 1)) if each is None else each for each in contents)

@@ -1,4 +1,4 @@
-"""Results tables by group of worlds: one table for each scenario of a mixture, or for each type of a vehicle."""
+"""Results tables by group of worlds: one table for each scenario of a mixture, or for each vehicle type."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
 
     Args:
         evaluation: evaluation on a mixture, or on a scenario with types of vehicles.
-        by: kind of group: ``scenario``, or a vehicle's type such as ``vehicle_2_type``.
+        by: what the worlds are grouped by, ``scenario`` or the type of a vehicle, such as ``vehicle_2_type``.
         baseline: name of the agent to compare with.
 
-    Raises ``InvalidInput`` for worlds without groups, ``UnknownName`` for an unknown ``by``.
+    Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` for an unknown ``by``.
 
     >>> import ethbrake_marl as eb
     >>> delays = eb.load_scenario("mixture-delays")
@@ -32,8 +32,8 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
     """
     if not evaluation.kinds:
         raise InvalidInput(
-            f"by {by!r}: these worlds have no groups; those of a mixture have scenario, those with vehicle_types"
-            " have vehicle_1_type and so on"
+            f"by = {by!r}: these worlds have no groups; worlds of a mixture can be grouped by 'scenario', worlds of a"
+            " scenario with vehicle_types by 'vehicle_1_type' and so on"
         )
     if by not in evaluation.kinds:
         raise unknown_name("group", by, evaluation.kinds)

@@ -1,7 +1,7 @@
-"""Identity of a result: hashes of its worlds, scenario and policies, and the versions that computed it.
+"""Identity of a result: hashes of its worlds, scenario and policies, and the software versions that computed it.
 
-Two results can be compared if their worlds and scenarios have the same hashes. Different versions are reported, but do
-not prevent a comparison.
+Two results can be compared if the hashes of their worlds and scenarios are equal. Different software versions are
+reported, but do not prevent a comparison.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ Kind = Literal["evaluate", "shield", "best-harm", "ablate", "learning-curves"]
 
 _PACKAGES = ("ethbrake-marl", "numba", "numpy")
 
-_WORDS = {"name", "title", "description", "source"}  # texts of a scenario, which do not affect an episode
+_WORDS = {"name", "title", "description", "source"}  # keys of a scenario that do not affect an episode
 
-_BLOCK = 50_000  # worlds hashed at once; arrays of messages may be views that would take much memory when copied
+_BLOCK = 50_000  # number of worlds hashed at once; copies of all arrays of messages would take much memory
 
-CHUNK = 2_500  # worlds advanced together, to limit memory; affects no result but ``worlds_sha256`` of a long list
+CHUNK = 2_500  # number of worlds simulated together, to limit memory; ``worlds_sha256`` of long lists depends on it
 
-EPISODES, LIST_SEED = 10_000, 7  # size and seed of the standard evaluation list; trainings use other seeds
+EPISODES, LIST_SEED = 10_000, 7  # length and seed of the standard evaluation list; trainings use other seeds
 
-HELD = 100_000  # largest list that is held in memory as a whole
+HELD = 100_000  # length of the longest evaluation list whose worlds are all held in memory
 
-HASHES = 1 << 256  # modulus of sums of hashes
+HASHES = 1 << 256  # sums of hashes are taken modulo this number
 
 
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
-    """Return a hash of a list of worlds, as 64 hexadecimal digits: equal lists have equal hashes on every machine.
+    """Return a hash of worlds as 64 hexadecimal digits. Equal worlds have equal hashes on every machine.
 
-    It is the SHA-256 of every array (little-endian, by name) and of the numbers of the worlds. For more than 100,000
-    worlds it is ``hash_of_chunks``, which needs less memory.
+    The hash is the SHA-256 of all arrays (little-endian, with their names) and of the numbers of the worlds. For more
+    than 100,000 worlds the hash is ``hash_of_chunks``, which needs less memory.
 
     Args:
         worlds: the n worlds at the alert.
-        index: [n] number of each world in its list.
+        index: number of each world in its evaluation list, [n].
 
     """
     if worlds.n > HELD:
@@ -61,9 +61,14 @@ def _hash_at_once(worlds: Worlds, index: Ints) -> str:
 
 
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
-    """Return the sum modulo 2^256 of the SHA-256 of each chunk of 2,500 worlds.
+    """Return the sum modulo 2^256 of the SHA-256 of all chunks of 2,500 worlds.
 
-    ``index`` [n] is the number of each world in its list; chunks are numbers 0 to 2,499, 2,500 to 4,999, and so on.
+    The first chunk contains the worlds with numbers 0 to 2,499, the second 2,500 to 4,999, and so on.
+
+    Args:
+        worlds: the n worlds at the alert.
+        index: number of each world in its evaluation list, [n].
+
     """
     chunks = [np.flatnonzero(index // CHUNK == number) for number in np.unique(index // CHUNK)]
     return sum(int(_hash_at_once(worlds.take(chunk), index[chunk]), 16) for chunk in chunks) % HASHES
@@ -82,8 +87,8 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 def _arrays(value: Any) -> dict[str, np.ndarray]:
     """Return the arrays of the dataclass ``value`` and of the dataclasses inside it, by name.
 
-    Arrays that say nothing are omitted: those of messages and braking profiles if the worlds have none, build-up rates
-    of brakes that are all infinite, and weights of harm that are all 1.
+    Some arrays are omitted if they have no effect: messages and braking profiles if the worlds have none, build-up
+    rates of brakes if all are infinite, and weights of harm if all are 1.
     """
     arrays: dict[str, np.ndarray] = {}
     usual = {"brake_rate_mps3": np.inf, "release_rate_mps3": np.inf, "harm_weight": 1.0}
@@ -97,48 +102,48 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 
 
 def scenario_sha256(scenario: Scenario) -> str:
-    """Return the SHA-256 of everything in a scenario that affects an episode, including defaults, in hexadecimal.
+    """Return the SHA-256 (hexadecimal) of everything in a scenario that affects an episode, including default values.
 
-    Name, title and other texts are excluded.
+    Name, title, description and source are excluded.
     """
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return the SHA-256 of each vehicle's trained policy: ``{"vehicle_2": "3f..."}``.
+    """Return the SHA-256 of each vehicle's trained policy, such as ``{"vehicle_2": "3f..."}``.
 
-    ``drivers`` maps the index of a vehicle (0 = front) to its agent. Vehicles with an untrained agent are omitted.
+    ``drivers`` maps the index of a vehicle (0 = front) to its agent. Vehicles without a trained policy are omitted.
     """
     return {f"vehicle_{i + 1}": sha for i, agent in drivers.items() if (sha := policy_sha256(agent)) is not None}
 
 
 def result_versions() -> dict[str, str]:
-    """Return name -> version of Python and of every package on which a result's numbers depend.
+    """Return the versions of Python and of every package on which the numbers of a result depend, by name.
 
-    This includes packages that provided a part in this process, and the SHA-256 of the user's own Python files that it
-    ran.
+    The result includes extension packages that this process used, and the SHA-256 of the user's own Python files that
+    it ran.
     """
     return own_versions() | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
 def own_versions() -> dict[str, str]:
-    """Return name -> version of Python, this package, numba and numpy, without other loaded packages."""
+    """Return the versions of Python, this package, numba and numpy, by name."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 
 def result_identity(
     kind: Kind, scenario: Scenario, sample: Sample | None, left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """Return the entries that identify a result, for its JSON file: ``kind``, hashes and ``versions``.
+    """Return the entries of a JSON results file that identify the result.
 
-    The hashes are ``scenario_sha256`` and ``worlds_sha256``.
+    The entries are ``kind``, ``scenario_sha256``, ``worlds_sha256`` and ``versions``.
 
     Args:
         kind: kind of results, such as ``evaluate`` or ``shield``.
         scenario: scenario of the worlds.
-        sample: the worlds; None if parts of the file have different worlds: then there is no ``worlds_sha256``.
-        left_out: rows of the sample that the results do not count; they are not hashed.
+        sample: the worlds. None if the file has results on several samples; ``worlds_sha256`` is then omitted.
+        left_out: rows of the sample that were left out because of errors; the hash does not include them.
 
     """
     identity: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""Build several agents from their specs, as the command line takes them."""
+"""Build the agents of an evaluation from their specs, the texts that name agents on the command line."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
-    """Let every agent decide once, so that its errors show before a long evaluation; raise what it would raise.
+    """Let every agent decide once, to find its errors before a long evaluation. Raises the errors of the agents.
 
-    An agent that does not depend on the state decides in all worlds, any other only in the first.
+    An agent whose commands do not depend on the state (``state_free``) decides in all worlds, other agents only in the
+    first world.
 
     Args:
         agents: agents or teams by name.
         worlds: worlds at the alert.
         scenario: scenario whose learners the agents drive.
-        warn: also warn about policies in worlds unlike those of their training (``warn_unfamiliar``).
+        warn: also warn about policies that drive in worlds unlike their training worlds (``warn_unfamiliar``).
 
     """
     if warn:
@@ -53,19 +54,19 @@ def make_lineup(
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
-    """Make one agent for each spec, to drive the scenario's learners, and return spec -> agent.
+    """Build one agent for each spec, and return the agents by spec.
 
     Args:
-        specs: texts that name agents, as ``make_agent`` takes them (``"full_brake"``, ``"ppo+step"``): a list,
-            or one text with commas between them. A name of a group, such as ``ladder``, stands for several agents.
-        scenario: the scenario whose learners they drive.
-        harm_count: harm that agents minimise, if they optimise: ``first`` or ``total``.
-        uncertainty: uncertainty for the shields that need one, as ``make_agent`` takes it.
+        specs: texts that name agents (``"full_brake"``, ``"ppo+step"``), as a list or as one text with commas between
+            the specs. The name of a group, such as ``ladder``, stands for several agents.
+        scenario: scenario whose learners the agents drive.
+        harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
+        uncertainty: uncertainty for shields that need one, as ``make_agent`` takes it.
         alone: refuse teams, which drive several vehicles.
         bare: refuse agents with a shield, because the caller adds one; with one learner, also refuse teams.
 
-    Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, a team or a shield where none is
-    allowed, and whatever ``make_agent`` raises.
+    Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, or a team or shield that is refused.
+    Also raises the errors of ``make_agent``.
 
     """
     listed = split_specs(specs) if isinstance(specs, str) else specs
@@ -73,29 +74,37 @@ def make_lineup(
     written = [parse_spec(spec) for spec in specs]
     for k, each in enumerate(written):
         if each in written[:k]:
-            raise InvalidInput(f"agent {str(each)!r} is listed twice; each agent drives every world once")
+            raise InvalidInput(f"agent {str(each)!r} is listed twice; list each agent once")
     if uncertainty is not None and not any("uncertainty" in settings_needed(each.shield) for each in written):
-        using = "".join(f"; an agent with +{shield} does: ppo@PATH+{shield}" for shield in shields_with("uncertainty"))
-        raise InvalidInput(f"uncertainty {uncertainty}: nobody uses it{using}")
+        using = "".join(f"; agents with +{shield} do: ppo@PATH+{shield}" for shield in shields_with("uncertainty"))
+        raise InvalidInput(f"uncertainty {uncertainty}: none of the agents uses an uncertainty{using}")
     lineup = {
         str(each): make_agent(str(each), scenario=scenario, harm_count=harm_count, uncertainty=uncertainty)
         for each in written
     }
     for spec, agent in lineup.items():
         if isinstance(agent, Team) and (alone or (bare and len(scenario.learners) == 1)):
-            raise InvalidInput(f"agent {spec!r}: is a team, one agent is needed here: ppo@RUN/policy/vehicle_2")
+            raise InvalidInput(
+                f"agent {spec!r} is a team, but this command needs an agent of one vehicle, for instance"
+                " ppo@RUN/policy/vehicle_2"
+            )
         if bare and parse_spec(spec).shield is not None:
             raise InvalidInput(
-                f"agent {spec!r}: has a shield already; this command puts its own around each agent, so name the agent"
-                " alone, for instance ppo@PATH"
+                f"agent {spec!r} already has a shield, and this command adds its own; name the agent without a shield,"
+                " for instance ppo@PATH"
             )
     return lineup
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """Make one agent for each spec, to drive a single vehicle, and return spec -> agent; see ``make_lineup``.
+    """Build one agent of a single vehicle for each spec, and return the agents by spec.
 
-    ``specs`` are texts that name agents, such as ``full_brake``. ``harm_count`` is the harm that agents minimise, if
-    they optimise. Raises ``InvalidInput`` for a team.
+    Args:
+        specs: texts that name agents, such as ``full_brake``.
+        scenario: scenario whose learners the agents drive.
+        harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
+
+    Raises ``InvalidInput`` for a team, and the errors of ``make_lineup``.
+
     """
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

@@ -1,8 +1,8 @@
-"""Measures of an agent, the sets that they form, and the core's set, which measures the episode.
+"""Measures of an agent, and sets of measures: the base class, the registry, and the set of the core package.
 
-A measure is a formula that turns an agent's outcome into one value per world. Measures that need the same knowledge of
-the worlds form a set. Extensions add sets by entry points of the group ``ethbrake_marl.measure_sets``: tables, JSON and
-files show the measures of every installed set.
+A measure computes one value per world from an agent's outcome. Measures that need the same information about the worlds
+form a set. Extensions add sets with entry points of the group ``ethbrake_marl.measure_sets``. Tables, JSON and files
+show the measures of every installed set.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ BASELINE = "full_brake"
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One measure of an agent. Tables show its rate if its values are true/false, its mean if they are numbers.
+    """One measure of an agent. Tables show the mean of its values; for true/false values, the fraction that is true.
 
     ``of`` is a function that takes the agent's outcome and the context that ``MeasureSet.prepare`` returned. It returns
-    a value for every world, [n], or None if the measure does not exist for this outcome. Alternatively ``of`` is the
-    name of another measure: then this measure compares the values of that one with the baseline's, as ``against`` says.
+    one value per world, [n], or None if the measure is not defined for this outcome. A measure that compares an agent
+    with the baseline has the name of another measure as ``of``; ``against`` says how the values are compared.
     """
 
-    name: str  # key in JSON results, unique among all measures
-    of: Callable[[Outcome, Any], Values | None] | str  # how the values are computed, see above
-    heading: str = ""  # heading of its column in tables; "": no column
+    name: str  # key in JSON results, different for all measures
+    of: Callable[[Outcome, Any], Values | None] | str  # function that computes the values, or name of a measure
+    heading: str = ""  # heading of the measure's column in tables; "": no column
     short: str = ""  # short heading for terminals, possibly with line breaks
-    about: str = ""  # explanation for users; "": that of the measure whose heading begins with the same words
+    about: str = ""  # explanation for users; "": another measure whose heading begins with the same words has it
     percent: bool = False  # whether tables show percent
     # Comparison with the baseline, paired by world: none, mean difference, or relative decrease of the mean.
     against: Literal["", "difference", "decrease"] = ""
@@ -47,76 +47,77 @@ class Measure:
     def values(self, outcome: Outcome, context: Any) -> Values | None:
         """Return the measure's value in every world of an outcome, [n].
 
-        ``context`` is what the measure's set prepared for the evaluation (``contexts_of``). Returns None if the measure
-        only compares another one with a baseline, if its set does not apply (context ``Silent``), or if the outcome
-        lacks it.
+        ``context`` is what the measure's set prepared for the evaluation (``contexts_of``). The result is None if the
+        measure is a comparison with the baseline, if its set does not apply (context ``Silent``), or if the measure is
+        not defined for this outcome.
         """
         if isinstance(self.of, str) or isinstance(context, Silent):
             return None
         return self.of(outcome, context)
 
     def column(self) -> Column:
-        """Return the measure's column in a table: heading, name, and how its numbers are shown."""
+        """Return the measure's column in a table: heading, name and number format."""
         shown = {"digits": 1, "scale": 100.0, "unit": " %"} if self.percent else {}
         return Column(self.heading, self.name, short=self.short, **shown)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """Context of a set of measures that does not apply to an evaluation; its measures then have no values."""
+    """Context of a set of measures that does not apply to an evaluation, so that its measures have no values."""
 
-    because: str  # reason for users, as a clause without capital and full stop
+    because: str  # why the set does not apply: a clause for users, without capital and full stop
 
 
 @dataclass(frozen=True, slots=True)
 class GroupColumn:
     """Column that a set of measures adds to the table of ``ethbrake evaluate`` on a group of scenarios."""
 
-    column: Column  # heading, and how the numbers are shown
-    measures: Mapping[HarmCount, str]  # harm count that the agents minimise -> name of the measure to show
-    note: str  # sentence below the table; its placeholder ``{harm}`` becomes ``first-impact`` or ``total``
+    column: Column  # heading and number format of the column
+    measures: Mapping[HarmCount, str]  # count of harm that the agents minimise -> name of the measure to show
+    note: str  # sentence below the table; ``{harm}`` in it is replaced by ``first-impact`` or ``total``
 
 
 class MeasureSet:
-    """Base class of a set of measures that are computed from the same knowledge of the worlds.
+    """Base class of a set of measures that are computed from the same information about the worlds.
 
-    A subclass must list its measures in ``measures``. It may override ``prepare``, which computes the common knowledge
+    A subclass must list its measures in ``measures``. It may override ``prepare``, which computes this information
     (the *context*) once per evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``,
-    which add texts to a results table. By default there is no context, and nothing is added.
+    which add texts to a results table.
     """
 
     measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
-    counted: tuple[Measure, ...] = ()  # true/false measures without a column, whose true worlds ``row`` can read
-    baseline: str | None = None  # agent to compare with; None: the baseline of ``summarise``
+    counted: tuple[Measure, ...] = ()  # true/false measures without a column; ``row`` can read how often each is true
+    baseline: str | None = None  # name of the agent to compare with; None: the baseline of ``summarise``
     # Name of a measure in ``counted`` that says whether a world's values are complete. If it is false in some world,
     # means are marked "≥" and comparisons are omitted. None: all values are complete.
     whole: str | None = None
-    narrow: tuple[str, ...] = ()  # names of measures that a narrow terminal also shows, if they have values
+    narrow: tuple[str, ...] = ()  # names of measures that even a narrow terminal shows, if they have values
     notebook: tuple[str, ...] = ()  # names of measures that a notebook shows
     group_column: GroupColumn | None = None  # column in the table of a group of scenarios; None: no column
-    # Columns of files with one row per world: name -> function of outcome and context that returns values [n], or None.
+    # Additional columns of files with one row per world, by name. The function takes outcome and context, and returns
+    # values [n], or None if there are none.
     per_world: Mapping[str, Callable[[Outcome, Any], Values | None]] = {}
-    texts: frozenset[str] = frozenset()  # names of the ``per_world`` columns that hold texts
+    texts: frozenset[str] = frozenset()  # names of the ``per_world`` columns that contain texts
     because_key: str | None = None  # key in a result's conditions for the reason why the set does not apply
-    not_in_long_lists: str = ""  # why the set does not apply to lists of more than 100,000 worlds; "": it applies
+    not_in_long_lists: str = ""  # why the set does not apply to more than 100,000 worlds; "": the set applies
 
     def prepare(self, evaluation: Any) -> Any:
-        """Return the context of this ``Evaluation``, which ``Measure.of`` gets as its second argument.
+        """Return the context of an ``Evaluation``, which ``Measure.of`` gets as its second argument.
 
-        Return ``Silent`` with a reason if the set does not apply.
+        Return ``Silent`` with a reason if the set does not apply to the evaluation. By default return None.
         """
         return None
 
     def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
-        """Return fields that the set adds to an agent's object in the JSON results.
+        """Return fields that the set adds to an agent's object in the JSON results; by default none.
 
         The keys must be the same whether or not the set applies.
 
         Args:
-            tally: the agent's ``AgentTally``, with the sums of its measures.
+            tally: sums of the agent's measures (``AgentTally``).
             worlds: number of evaluated worlds.
-            context: what ``prepare`` returned, or ``Silent`` if the set does not apply; None for a list of more than
-                100,000 worlds.
+            context: what ``prepare`` returned (``Silent`` if the set does not apply); None for more than 100,000
+                worlds.
 
         """
         return {}
@@ -137,35 +138,35 @@ class MeasureSet:
 
 
 class EpisodeMeasures(MeasureSet):
-    """The core's measures, computed from the episodes alone; their context is None."""
+    """Measures of the core package: collisions, harm, shoving, comparisons with the baseline, and predicted harm."""
 
     measures = (
         Measure(
             "collision_rate", lambda o, _: o.collided, "Collisions", percent=True,
-            about="Share of worlds with at least one impact; Wilson's interval. Every agent meets the same worlds, each"
+            about="Share of worlds with at least one impact, with Wilson's interval. Every agent drives the same worlds"
             " once.",
         ),
         Measure(
             "first_impact_harm", lambda o, _: o.first_impact_harm, "First-impact harm", "First-impact\nharm",
-            "Squared closing speed (m²/s²), summed over the pairs, each pair's first impact only (the paper's"
-            " protocol); mean per world.",
+            "Squared closing speed of each pair's first impact (m²/s²), summed over the pairs; mean per world. The"
+            " paper counts harm in this way.",
         ),
         Measure(
             "total_harm", lambda o, _: o.total_harm, "Total harm", "Total\nharm",
-            "The same over every impact. A light early touch makes a later, harder impact of the same pair free under"
-            " the first count, so both are shown.",
+            "Squared closing speed of every impact (m²/s²), summed; mean per world. After a light first impact,"
+            " first-impact harm does not count a hard second impact of the same pair; total harm does.",
         ),
         Measure(
             "sampled_harm", lambda o, _: o.sampled_harm, "Sampled harm", "Sampled\nharm",
-            "The paper's own sum (its eq. Jharm): the agent's commands replayed through the paper's fixed-step map at"
-            " the time step; at every sample each pair that overlaps and closes adds its squared closing speed (m²/s²),"
-            " so pushing costs harm for as long as it lasts.",
+            "Harm as a sum over time samples (the paper's eq. Jharm). The agent's commands are applied again in the"
+            " paper's equations of motion with a fixed step. At every sample, each pair that overlaps and still closes"
+            " adds its squared closing speed (m²/s²). Pushing therefore adds harm for as long as it lasts.",
         ),
         Measure(
             "vehicle_1_shoved_m", lambda o, _: o.shoved_m, "Vehicle 1 shoved (m)", "Shoved\nm",
-            "How far Vehicle 1 ends beyond the point where it would stop by itself, mean per world; and the share of"
-            " worlds in which that is more than 5 m. Both counts of harm leave pushing free unless something stands"
-            " ahead; Vehicle 1 brakes for something.",
+            "How far Vehicle 1 ends beyond the place where it would stop by itself: mean per world, and share of worlds"
+            " with more than 5 m. First-impact and total harm do not count pushing. In reality Vehicle 1 brakes for"
+            " something, so pushing is dangerous.",
         ),
         Measure(
             "vehicle_1_shoved_far_rate", lambda o, _: None if o.shoved_m is None else o.shoved_m > FAR_M,
@@ -177,11 +178,11 @@ class EpisodeMeasures(MeasureSet):
         ),
         Measure(
             "total_harm_difference", "total_harm", against="difference",
-            about="The same of total harm.",
+            about="Total harm minus that of full braking, paired by world.",
         ),
         Measure(
             "harm_decrease_first", "first_impact_harm", "Decrease, first-impact", "Decrease\nfirst",
-            "1 − harm / harm of full braking in the same worlds; interval by the delta method, paired by world.",
+            "1 − (mean harm) / (mean harm of full braking in the same worlds), with an interval by the delta method.",
             percent=True, against="decrease",
         ),
         Measure(
@@ -193,7 +194,7 @@ class EpisodeMeasures(MeasureSet):
                 None if o.predicted_harm is None or not np.isfinite(o.predicted_harm).all() else o.predicted_harm
             ),
             "Predicted harm", "Pre-\ndicted",
-            "What the agent itself expected at the alert, under the count that it minimises.", always=False,
+            "Harm that the agent predicted at the alert, in the count that it minimises.", always=False,
         ),
     )  # fmt: skip
     counted = (Measure("horizon_ends", lambda o, _: ~o.at_rest), Measure("policy_share", lambda o, _: o.chosen_policy))
@@ -202,10 +203,10 @@ class EpisodeMeasures(MeasureSet):
 
 
 class RegisteredMeasures(MeasureSet):
-    """Measures that the user registered with ``register_measure``, one for each of ``Outcome.metrics``.
+    """Measures that the user registered with ``register_measure``.
 
     Args:
-        columns: keys of ``Outcome.metrics``.
+        columns: names of their columns, which are the keys of ``Outcome.metrics``.
 
     """
 
@@ -221,18 +222,27 @@ EPISODE = EpisodeMeasures()
 
 
 def register_measure_set(name: str, measures: MeasureSet) -> None:
-    """Add a set of measures to every evaluation, under a name that is a key of ``MEASURE_SETS``.
+    """Add a set of measures to every evaluation.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.measure_sets``. Raises
-    ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, ``AlreadyExists`` if the name of the set or of one of its
-    measures is taken.
+    A package can instead declare an entry point of the group ``ethbrake_marl.measure_sets``.
+
+    Args:
+        name: name of the set, its key in ``MEASURE_SETS``.
+        measures: the set.
+
+    Raises ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, and ``AlreadyExists`` if another set has the same
+    name or a measure of the same name.
+
     """
     if not isinstance(measures, MeasureSet):
-        raise InvalidInput(f"set of measures {name!r}: must be a MeasureSet")
+        raise InvalidInput(f"set of measures {name!r} = {measures!r:.60}: must be a MeasureSet")
     others = [each for each in (EPISODE, *MEASURE_SETS.loaded.values()) if each is not measures]
     taken = {measure.name for each in others for measure in (*each.measures, *each.counted)}
     if twice := sorted(taken & {measure.name for measure in (*measures.measures, *measures.counted)}):
-        raise AlreadyExists(f"set of measures {name!r}: another set has {', '.join(twice)}; give other names")
+        raise AlreadyExists(
+            f"set of measures {name!r}: another set already has measures with the names {', '.join(twice)}; choose"
+            " other names"
+        )
     MEASURE_SETS.add(name, measures, lambda other: other is measures)
 
 
@@ -242,33 +252,37 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
     """Return the context of each installed set of measures for an ``Evaluation``, by the set's name.
 
-    The context is what ``MeasureSet.prepare`` returned: the set's knowledge of the worlds, or ``Silent`` with the
-    reason why the set does not apply. It is computed once per evaluation. ``long_list``: the evaluation is a part of a
-    list of more than 100,000 worlds, to which some sets do not apply.
+    The context is what ``MeasureSet.prepare`` returned: the set's information about the worlds, or ``Silent`` with the
+    reason why the set does not apply. It is computed once per evaluation.
+
+    Args:
+        evaluation: the evaluation.
+        long_list: whether the evaluation is a chunk of more than 100,000 worlds, to which some sets do not apply.
+
     """
     silent = silent_in_long_lists() if long_list else {}
     return {name: silent.get(name) or evaluation.once(each.prepare) for name, each in MEASURE_SETS.items()}
 
 
 def silent_in_long_lists() -> dict[str, Silent]:
-    """Return why sets of measures do not apply to lists of more than 100,000 worlds: name of the set -> ``Silent``."""
+    """Return the sets of measures that do not apply to more than 100,000 worlds: name of the set -> ``Silent``."""
     return {name: Silent(why) for name, each in MEASURE_SETS.items() if (why := each.not_in_long_lists)}
 
 
 def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
     """Return why sets of measures do not apply, by ``MeasureSet.because_key``; None for a set that applies.
 
-    ``contexts`` are those of ``contexts_of``. Sets without such a key are omitted.
+    ``contexts`` is the result of ``contexts_of``. Sets without a ``because_key`` are omitted.
     """
     by_key = {key: contexts[name] for name, each in MEASURE_SETS.items() if (key := each.because_key) is not None}
     return {key: context.because if isinstance(context, Silent) else None for key, context in by_key.items()}
 
 
 def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
-    """Yield (name, set) for all sets of measures, in the order in which JSON results hold their measures.
+    """Yield (name, set) for all sets of measures, in the order of JSON results.
 
-    The set of the core (``EpisodeMeasures``) and that of the user's measures have the name "". ``columns`` are the keys
-    of ``Outcome.metrics``, the measures that the user registered.
+    ``EpisodeMeasures`` and ``RegisteredMeasures`` have the name "". ``columns`` are the keys of ``Outcome.metrics``,
+    the measures that the user registered.
     """
     yield "", EPISODE
     yield "", RegisteredMeasures(columns)
@@ -276,7 +290,7 @@ def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
 
 
 def measures(columns: Iterable[str] = ()) -> tuple[Measure, ...]:
-    """Return the measures of all sets, in the order in which JSON results hold them.
+    """Return the measures of all sets, in the order of JSON results.
 
     ``columns`` are the keys of ``Outcome.metrics``, the measures that the user registered.
     """

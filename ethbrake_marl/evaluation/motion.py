@@ -1,4 +1,4 @@
-"""Exact motion of whole episodes: pieces of cubic polynomials from which the state at any time follows."""
+"""Exact motion of whole episodes as cubic polynomials of time, from which the state at any time is computed."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from ethbrake_marl.physics.trace import segment_pieces
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
-_SAME = 1e-9  # tolerance (m, m/s) within which a piece continues the piece before it, so both are joined
+_SAME = 1e-9  # two consecutive pieces are joined if the first one, continued, is this close to the second (m, m/s)
 
-_SHORT_S = 1e-4  # time (s) within which the pieces of a cascade of tiny bounces are joined
+_SHORT_S = 1e-4  # pieces that begin within this time (s), for instance during tiny bounces, are joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,35 +27,33 @@ class EpisodeMotion:
     """Exact motion of one world from the alert to the end of its episode, with its impacts and harm."""
 
     world: Worlds  # the world at the alert, n = 1
-    # Motion as k pieces in order of time, [k, 1 + 4 N], during each of which all jerks are constant. A row holds the
-    # state at the beginning of a piece: time (s), position of Vehicle 1 (m), gaps (N - 1, m), speeds (N, m/s),
+    # Motion as k pieces in order of time, [k, 1 + 4 N]. A piece is a stretch of time in which all jerks are constant.
+    # Its row is the state at its beginning: time (s), position of Vehicle 1 (m), gaps (N - 1, m), speeds (N, m/s),
     # accelerations (N, m/s2) and jerks (N, m/s3). ``state_at`` returns the state at any time within a piece.
     pieces: Floats
     end_s: float  # time since the alert at which the episode ends (s)
-    impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
-    stepped_in_s: Floats  # times (s) of the decisions in which a shield replaced the policy's action, ascending
+    impacts: ImpactRows  # all impacts in order of time; column ``world`` is 0
+    stepped_in_s: Floats  # times (s) of the decisions at which a shield replaced the policy's action, ascending
     ledger: Ledger  # harm of all impacts of the episode, n = 1
     final: Worlds  # the world at the end of the episode, n = 1
     at_rest: bool  # whether the line came to rest before the horizon
 
     @property
     def harm(self) -> tuple[float, float]:
-        """First-impact harm and total harm of the whole line (m2/s2), as a pair."""
+        """Pair (first-impact harm, total harm) of the whole line, m2/s2."""
         first, total = (float(self.ledger.world_harm(count)[0]) for count in HARM_COUNTS)
         return first, total
 
 
 def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[EpisodeMotion]:
-    """Let an agent drive the scenario's learners through every world, as ``evaluate`` does.
-
-    Returns one ``EpisodeMotion`` per world, in their order.
+    """Let an agent drive every world as in ``evaluate``, and return the motion of each world, in their order.
 
     Args:
         worlds: worlds at the alert.
-        agent: an agent, of which each learner gets a copy, or a team; it is not changed.
-        scenario: scenario of the worlds, whose scripts drive the other vehicles.
+        agent: an agent, of which each learner gets a copy, or a team. The object itself does not change.
+        scenario: scenario of the worlds. The agent drives its learners, its scripts drive the other vehicles.
 
-    Raises ``PhysicsError`` naming the worlds that could not be advanced.
+    Raises ``PhysicsError`` with the worlds that could not be simulated.
 
     """
     team = Team.of(agent, scenario.learners)
@@ -66,12 +64,12 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
 
 class _Follower(Tape):
-    """Recorder of every step, and of the decisions in which a shield replaced the policy's action.
+    """Recorder of every step, and of the decisions at which a shield replaced the policy's action.
 
     Args:
         worlds: the worlds at the alert.
-        team: agents that drive.
-        engine: engine that runs the episodes, from which the shield's decisions are read.
+        team: agents of the controlled vehicles.
+        engine: engine that runs the episodes; its ``ruling`` says what the shield decided.
 
     """
 
@@ -87,8 +85,8 @@ class _Follower(Tape):
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: [n, N] commanded accelerations during the step.
-            until_s: [n] time at which the step ends.
+            command_mps2: commanded accelerations during the step, [n, N].
+            until_s: time at which the step ends, [n].
 
         """
         super().see(before, command_mps2, until_s)
@@ -124,9 +122,9 @@ class _Follower(Tape):
         return motions
 
     def _pieces(self) -> list[Floats]:
-        """Return the motion of each world as pieces, [k, 1 + 4 N] as in ``EpisodeMotion``.
+        """Return the pieces of each world's motion, [k, 1 + 4 N] as in ``EpisodeMotion``.
 
-        A world whose episode ends at once has a single piece.
+        A world whose episode ends at the alert has a single piece.
         """
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
@@ -148,11 +146,11 @@ class _Follower(Tape):
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
-    A piece is dropped if the piece before it, continued, gives its state within rounding. Of several pieces that begin
-    within the same 0.1 ms, only the last remains.
+    A piece is dropped if the piece before it, continued, leads to the same state within rounding. If several pieces
+    begin within the same 0.1 ms, all but the last are dropped.
 
     Args:
-        pieces: [k, 1 + 4 N] time and state at the beginning of each piece, as in ``EpisodeMotion``.
+        pieces: time and state at the beginning of each piece, [k, 1 + 4 N], as in ``EpisodeMotion``.
         vehicles: number of vehicles, N.
 
     """
@@ -166,13 +164,13 @@ def join_pieces(pieces: Floats, vehicles: int) -> Floats:
 
 
 def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
-    """Return the state [4 N] at a time within a piece of constant jerks.
+    """Return the state [4 N] at one time within a piece, a stretch of time in which all jerks are constant.
 
     The state is the position of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2) and jerks (m/s3).
 
     Args:
-        piece: [1 + 4 N] time and state at the beginning of the piece.
-        time_s: time since the alert (s).
+        piece: time and state at the beginning of the piece, [1 + 4 N].
+        time_s: time since the alert at which the state is wanted (s).
         vehicles: number of vehicles, N.
 
     """

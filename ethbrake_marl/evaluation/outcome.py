@@ -1,4 +1,4 @@
-"""``Outcome``: the results of one agent in each world of a list."""
+"""``Outcome``: the results of one agent in several worlds."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount, Ledger
 from ethbrake_marl.game.objectives import Declared, scored
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-_NAMED = 10  # number of left-out worlds that a note lists; JSON lists all of them
+_NAMED = 10  # largest number of left-out worlds that a note lists; JSON lists all of them
 
-COLUMN = "metric_"  # prefix of a registered measure's name, in JSON and in files with every world
+COLUMN = "metric_"  # prefix of a registered measure's name, in JSON and in files with one row per world
 
 Values = NDArray[Any]  # values of a measure in n worlds, [n]
 
 # Knowledge of an agent that does not state what it knows.
 UNSTATED = Knowledge((Source.UNSTATED,))
 
-_COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # fields [n] of an outcome
+_COLUMNS = ("at_rest", "predicted_harm", "chosen_policy", "shoved_m", "sampled_harm")  # fields of shape [n]
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Results of one agent in n worlds: harm, final state and what was measured, world by world.
+    """Results of one agent in each of n worlds: harm, final state and measures.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -44,16 +44,16 @@ class Outcome:
     final: Worlds  # each world at the end of its episode
     at_rest: Bools  # [n] whether the line came to rest before the horizon
     predicted_harm: Floats | None  # [n] harm that the agent predicted at the alert (m2/s2); None if it predicts none
-    # [n] whether the policy behind a shield drove to the end: episode mode chose it at the alert, or step mode replaced
-    # none of its actions. None without a shield.
+    # [n] whether the policy behind a shield drove the whole episode: episode mode chose the policy at the alert, or
+    # step mode replaced none of its actions. None without a shield.
     chosen_policy: Bools | None
-    knows: Knowledge = UNSTATED  # the agent's statement of what it knows about the line
-    # [n] distance by which Vehicle 1 was shoved beyond its own stopping point; None: not measured.
+    knows: Knowledge = UNSTATED  # what the agent says that it knows about the line
+    # [n] distance (m) by which Vehicle 1 was shoved beyond the place where it would stop; None: not measured.
     shoved_m: Floats | None = None
-    # [n] harm by the paper's sum over samples of the motion, for the same commands (m2/s2); None: not measured.
+    # [n] the paper's sampled harm of the same commands (m2/s2); None: not measured.
     sampled_harm: Floats | None = None
     policies: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy's manifest
-    metrics: Mapping[str, Floats] = field(default_factory=dict)  # measures that the user registered, [n], by column
+    metrics: Mapping[str, Floats] = field(default_factory=dict)  # column name of a registered measure -> values [n]
 
     def __repr__(self) -> str:
         n, means = len(self.collided), "no harm"
@@ -62,7 +62,7 @@ class Outcome:
         return f"Outcome({count_of(n, 'world')}, {int(self.collided.sum()):,} collided, {means})"
 
     def take(self, rows: Ints | Bools) -> Outcome:
-        """Return the same outcome with only the worlds ``rows``: row numbers, or a mask [n]."""
+        """Return the outcome restricted to the worlds ``rows`` (row numbers, or a mask [n])."""
         every = {name: getattr(self, name) for name in _COLUMNS}
         columns: dict[str, Any] = {name: None if column is None else column[rows] for name, column in every.items()}
         metrics = {name: column[rows] for name, column in self.metrics.items()}
@@ -70,12 +70,12 @@ class Outcome:
 
     @classmethod
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
-        """Join one agent's outcomes on the parts of a list, in order, into the outcome on the whole list.
+        """Join the outcomes of one agent in consecutive chunks of worlds into one outcome.
 
-        A column that is None in one part is None in the result.
+        A field that is None in one of ``parts`` is None in the result.
         """
         first, columns = parts[0], dict[str, Any]()
-        for name in _COLUMNS:  # None in one part makes the whole column None
+        for name in _COLUMNS:
             values = [getattr(part, name) for part in parts]
             columns[name] = None if any(each is None for each in values) else np.concatenate(values)
         ledger = Ledger(*(np.concatenate([getattr(part.ledger, f.name) for part in parts]) for f in fields(Ledger)))
@@ -85,48 +85,49 @@ class Outcome:
 
     @property
     def collided(self) -> Bools:
-        """Whether at least one impact happened, for each world: [n] bool."""
+        """Whether at least one impact happened, for each world, [n]."""
         return self.ledger.collided
 
     @property
     def impacts(self) -> Ints:
-        """Number of impacts in each world, between vehicles and with an obstacle ahead, [n]."""
+        """Number of impacts in each world, between vehicles and with an obstacle, [n]."""
         return self.ledger.impacts
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
         """Return the harm of the whole line in each world, [n] m2/s2.
 
-        ``harm_count`` says which impacts count: each pair's first one (``first``) or all (``total``).
+        ``harm_count`` says which impacts count: each pair's first impact (``first``) or all impacts (``total``).
         """
         return self.ledger.world_harm(harm_count)
 
     @property
     def first_impact_harm(self) -> Floats:
-        """Harm of all vehicles, counting only each pair's first impact, [n] m2/s2."""
+        """First-impact harm of the whole line in each world, [n] m2/s2."""
         return self.ledger.world_harm("first")
 
     @property
     def total_harm(self) -> Floats:
-        """Harm of all vehicles, counting every impact, [n] m2/s2."""
+        """Total harm of the whole line in each world, [n] m2/s2."""
         return self.ledger.world_harm("total")
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
         """Return the harm that each vehicle bears in each world, [n, N] m2/s2.
 
-        ``harm_count`` says which impacts count: each pair's first one (``first``) or all (``total``).
+        ``harm_count`` says which impacts count: each pair's first impact (``first``) or all impacts (``total``).
         """
         return self.ledger.vehicle_harm(harm_count)
 
     @property
     def ended(self) -> NDArray[np.str_]:
-        """How each episode ended, [n]: ``at_rest`` or ``horizon``."""
+        """How each episode ended, ``at_rest`` or ``horizon``, [n]."""
         return np.where(self.at_rest, "at_rest", "horizon")
 
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:
-        """Return the harm that each vehicle bears, and its value under each objective, as columns [n] by name (m2/s2).
+        """Return the harm that each vehicle bears, and the vehicle's value under each objective (m2/s2).
 
-        First-impact and total harm are both included. The columns of Vehicle 2 are ``first_impact_harm_2``,
-        ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and ``social:45_total_2``.
+        The result maps the name of a column to its values [n]. For instance, the columns of Vehicle 2 are
+        ``first_impact_harm_2``, ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and
+        ``social:45_total_2``.
         """
         by_vehicle = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
         for objective in objectives:
@@ -136,9 +137,9 @@ class Outcome:
         return {f"{name}_{i + 1}": each[:, i] for name, each in by_vehicle.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """Return the results of each world as columns [n], by the names in docs/evaluate.md; None: not measured."""
+        """Return the results of all worlds: name of a column (see docs/evaluate.md) -> values [n], or None."""
         final, obstacle = self.final, {}
-        if (ahead := final.obstacle_ahead).any():  # part of the harm that comes from impacts with the obstacle
+        if (ahead := final.obstacle_ahead).any():
             obstacle = {
                 "obstacle_first_impact_harm": np.where(ahead, self.ledger.obstacle_harm("first"), np.nan),
                 "obstacle_total_harm": np.where(ahead, self.ledger.obstacle_harm("total"), np.nan),
@@ -164,16 +165,16 @@ class Outcome:
 
 
 def none_for_nan(column: Values) -> list[Any]:
-    """Return the values of ``column`` [n] as a list, in which None replaces NaN."""
+    """Return the values of ``column`` [n] as a list, with None instead of NaN."""
     return [None if value != value else value for value in column.tolist()]
 
 
 class LeftOut(NamedTuple):
-    """A world that no agent's outcome contains, because the physics could not advance it with one of the agents."""
+    """A world that is left out for all agents, because the physics failed to simulate it with one of them."""
 
-    world: int  # number of the world in its list, from 0
-    seed: int | None  # seed of the list; None for worlds that the caller passed
-    agent: str  # name of the first agent with which it failed
+    world: int  # number of the world in its evaluation list, from 0
+    seed: int | None  # seed of the evaluation list; None for worlds that the caller passed
+    agent: str  # name of the first agent with which the simulation failed
     reason: str  # message of the error
 
     def __str__(self) -> str:
@@ -182,15 +183,15 @@ class LeftOut(NamedTuple):
 
     @staticmethod
     def line(worlds: Sequence[str], whole: int) -> str:
-        """Return the note for users that some worlds were left out, with up to ten of them.
+        """Return the note for users that some worlds were left out. It lists at most ten of these worlds.
 
         Args:
-            worlds: one text per left-out world, which names it and the reason.
-            whole: number of all worlds, including those.
+            worlds: description of each left-out world, with the reason.
+            whole: number of all worlds, including the left-out worlds.
 
         """
         named = [*worlds[:_NAMED], *(["and so on"] if len(worlds) > _NAMED else [])]
         return (
-            f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, which the physics could not advance"
-            f" (please report them): {'; '.join(named)}."
+            f"LEFT OUT for every agent: {len(worlds):,} of {whole:,} worlds, because the simulation failed"
+            f" (please report this error): {'; '.join(named)}."
         )

@@ -1,4 +1,4 @@
-"""Measures that the user registered, as evaluations show them: loading, columns and headings."""
+"""Measures that the user registered: how evaluations load them, and their columns and headings in tables."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from ethbrake_marl.game.impacts import EpisodeImpacts
 from ethbrake_marl.game.measures import MEASURES, REPORTED, NamedMeasure, register_measure
 from ethbrake_marl.registry import Part
 
-LOADED: dict[str, None] = {}  # arguments of ``load_measures`` so far, in order
+LOADED: dict[str, None] = {}  # all names that ``load_measures`` has loaded so far, in order
 
 
 def load_measures(names: Iterable[str]) -> None:
-    """Load measures by name, and show them in every evaluation from now on.
+    """Load measures by name. All later evaluations of this process report them.
 
-    A name is ``risk``, ``injury``, or the name of a measure of an installed package. ``my_file.py:measure`` runs that
-    Python file, with your permissions, and takes ``measure`` from it: a function, or a ``Part``, which holds a function
-    with the settings of ``register_measure``. Raises ``UnknownName`` with a suggestion, and ``InvalidInput`` for a
-    measure that cannot be loaded.
+    A name is ``risk``, ``injury``, the name of a measure of an installed package, or ``FILE:NAME``. The name
+    ``my_file.py:measure`` runs the Python file ``my_file.py`` with your permissions, and takes ``measure`` from it: a
+    function, or a ``Part``, which is a function with settings for ``register_measure``. Raises ``UnknownName`` for an
+    unknown name, and ``InvalidInput`` for a measure that cannot be loaded.
     """
     for name in names:
         file, colon, own = name.rpartition(":")
@@ -34,7 +34,7 @@ def load_measures(names: Iterable[str]) -> None:
 
 def heading_of(column: str) -> str:
     measure = registered_measure(column)
-    if measure is None:  # the result is older than the registration
+    if measure is None:  # the measure was registered in another process
         return column
     vehicle = column.removeprefix(measure.name).removeprefix("_")
     return f"{measure.name}{f', vehicle {vehicle}' if vehicle else ''} ({measure.unit})"
@@ -45,13 +45,14 @@ def registered_measure(column: str) -> NamedMeasure | None:
 
 
 def measure_columns(terms: Mapping[str, Any], episodes: EpisodeImpacts | None) -> dict[str, Any]:
-    """Return every reported measure of some episodes as columns [n], by name.
+    """Return the values of every registered measure: name of a column -> values [n].
 
     A measure with one value per vehicle has the columns ``NAME_1``, ``NAME_2`` and so on.
 
     Args:
-        terms: measures that are computed at each step, summed over the episodes, [n] or [n, N], by name.
-        episodes: impacts of the episodes, from which the other measures are computed; None if there are none.
+        terms: name of a measure that is computed at each step -> its sum over each episode, [n] or [n, N].
+        episodes: impacts of the episodes, from which all other measures are computed; None if there are no other
+            measures.
 
     """
     columns: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Results files: tables with one row per agent and world, and the JSON files that refer to them."""
+"""Results files: JSON files with one object per agent, and tables with one row per agent and world."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ _HARMS = ("agent", "world", *HARMS)
 def write_per_world(
     path: str | Path, evaluation: Evaluation, *, objectives: Sequence[Declared] = (), force: bool = False
 ) -> None:
-    """Write a table with one row per agent and world: Parquet if the name ends in ``.parquet``, else CSV.
+    """Write a table with one row per agent and world as CSV or Parquet.
 
-    docs/evaluate.md lists the columns. The row of a left-out world holds only its number and the reason, in ``ended``.
-    The file is written completely or not at all.
+    docs/evaluate.md lists the columns. The row of a left-out world has only the world's number and, in the column
+    ``ended``, the reason. If an error occurs, no incomplete file is left behind.
 
     Args:
-        path: the file to write.
-        evaluation: results of the agents.
-        objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Each adds
-            columns with its value for every vehicle.
+        path: file to write, with the ending ``.csv`` or ``.parquet``.
+        evaluation: outcomes of the agents.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md); each adds columns with its value for every
+            vehicle.
         force: replace an existing file.
 
-    Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` for a missing folder or another
+    Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` for a missing folder or another
     ending, ``MissingExtra`` for Parquet without pyarrow.
 
     """
     ending = Path(path).suffix.lower()
     if ending not in (CSV, PARQUET):
-        raise InvalidInput(f"{path}: must end in {CSV} or {PARQUET}")
+        raise InvalidInput(f"{path}: the name of the file must end in {CSV} or {PARQUET}")
     if ending == PARQUET:
         with naming_extras():
             import pyarrow
@@ -69,15 +69,15 @@ Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impa
 
 
 def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
-    """Return the harms in a file of ``write_per_world``, and the recording of each world; empty without this column.
+    """Return (harms of each agent in each world, recording of each world) from a file of ``write_per_world``.
 
-    Left-out worlds are omitted.
+    The second dictionary is empty if the file has no column ``recording``. Left-out worlds are omitted.
 
     Args:
-        path: name of the file, whose ending decides the format; it is not opened.
+        path: name of the file, whose ending decides the format. The file itself is not opened.
         data: content of the file.
 
-    Raises ``InvalidInput`` for a file without these columns.
+    Raises ``InvalidInput`` if the file lacks the columns or has invalid values.
 
     """
     try:
@@ -99,35 +99,36 @@ def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
             if harms[0] not in (None, ""):
                 values = tuple(map(float, harms))
                 if not all(0.0 <= value <= _MOST_HARM for value in values):
-                    raise ValueError(f"world {world}: harm {harms}")
+                    raise ValueError(f"world {world} has the invalid harms {harms}")
                 of_agents.setdefault(agent, {})[int(world)] = values
                 recordings |= {int(world): name for name in recording}
         return of_agents, recordings
     except (KeyError, TypeError, ValueError, NotImplementedError, OSError, csv.Error) as error:
-        raise InvalidInput(f"{path}: is no file of --per-world: {error}") from None
+        raise InvalidInput(f"{path}: is not a file that --per-world wrote: {error}") from None
 
 
 USUAL: Mapping[str, str] = {"harm_count": "first"}  # default settings of agents
 
-COMPARED: dict[Kind, tuple[str, ...]] = {  # harms that are compared, by kind of results
+COMPARED: dict[Kind, tuple[str, ...]] = {  # kind of results -> keys of the harms that are compared
     "evaluate": HARMS,
     "shield": ("harm",),
 }
 
-_LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # size limits of a results file, and of a file with every world
+_LIMIT_BYTES, _MOST_BYTES = 64 << 20, 4 << 30  # size limits of a JSON results file, and of a file of --per-world
 
 _MOST_EPISODES = 10**12
 
 _MOST_HARM = 1e100  # m2/s2; the square of a larger number could overflow
 
-_HASHES = {"worlds_sha256": "another list of worlds", "scenario_sha256": "another scenario"}
+_HASHES = {"worlds_sha256": "their worlds differ", "scenario_sha256": "their scenarios differ"}
 
-SAME = {  # keys that must agree for a comparison; all but the hashes may be missing
-    "kind": "another kind of results",
+# Keys whose values must agree for a comparison -> reason to refuse. All keys but the hashes may be missing.
+SAME = {
+    "kind": "their kinds of results differ",
     "worlds_sha256": _HASHES["worlds_sha256"],
-    "controlled_vehicle": "another controlled vehicle",
+    "controlled_vehicle": "their controlled vehicles differ",
     "scenario_sha256": _HASHES["scenario_sha256"],
-    "harm_count": "another harm",
+    "harm_count": "their counts of harm differ",
 }
 
 _NEEDED = {
@@ -148,14 +149,14 @@ def results_to_json(
     per_world: Path | None = None,
     settings: Mapping[str, str] = USUAL,
 ) -> list[dict[str, Any]]:
-    """Return the content of a results file: one object per row.
+    """Return the content of a JSON results file: one object per agent.
 
     Args:
         rows: rows of the results table, one per agent.
-        rescored: mean harms under other objectives (``Evaluation.rescore``), added to each agent's object.
-        groups: name of a group of worlds -> rows of the same agents on that group (``summarise_by``).
-        per_world: existing file with one row per world; its name and hash go into every object.
-        settings: settings of all agents by name: ``{"harm_count": "first"}`` is the harm that they minimise.
+        rescored: mean values under other objectives (``Evaluation.rescore``), which each agent's object then contains.
+        groups: name of a group of worlds -> rows of the same agents on the worlds of this group (``summarise_by``).
+        per_world: existing file with one row per world; every object then contains its name and hash.
+        settings: settings of all agents by name, such as ``{"harm_count": "first"}``.
 
     """
     objects = [row.to_json() | {"agent_settings": dict(settings)} for row in rows]
@@ -174,23 +175,23 @@ def results_to_json(
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Content of one results file (JSON) that was read and checked."""
+    """Content of one JSON results file, after the checks of ``read_result``."""
 
     path: Path  # the file
-    # JSON object of each agent, by its name; for results of ``ethbrake shield``, by ``AGENT (MODE)``.
+    # Name of an agent -> its JSON object. In results of ``ethbrake shield`` the names have the form ``AGENT (MODE)``.
     rows: Mapping[str, Mapping[str, Any]]
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """JSON object of the first agent, from which to read entries that are the same for all, such as the hashes."""
+        """JSON object of the first agent. Use it to read entries that are equal for all agents, such as the hashes."""
         return next(iter(self.rows.values()))
 
     def estimate(self, agent: str, harm: str) -> Estimate:
-        """Return the mean harm of an agent with its interval.
+        """Return the mean harm of an agent with its interval, m2/s2.
 
         Args:
-            agent: key of ``rows``.
-            harm: key of the harm in the JSON object: ``first_impact_harm``, ``total_harm`` or ``harm``.
+            agent: name of the agent, a key of ``rows``.
+            harm: key of the harm in the JSON object, such as ``first_impact_harm``, ``total_harm`` or ``harm``.
 
         """
         row = self.rows[agent]
@@ -198,40 +199,40 @@ class Result:
         return Estimate(float(mean), None if interval is None else (float(interval[0]), float(interval[1])))
 
     def harms(self) -> tuple[Harms, dict[int, str]]:
-        """Read the harms of every world from the file that was written beside this one with ``--per-world``.
+        """Read the file of ``--per-world`` that belongs to this results file, and return what ``read_harms`` returns.
 
-        Returns them, and the recording of each world, as ``read_harms`` does. Raises ``InvalidInput`` if that file is
-        missing or was changed.
+        Raises ``InvalidInput`` if there is no such file, or if it was changed.
         """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
-            raise InvalidInput(f"{self.path} has none (--per-world)")
+            raise InvalidInput(f"{self.path} was written without such a file (--per-world)")
         file = self.path.parent / Path(beside["file"]).name
         if not file.is_file():
-            raise InvalidInput(f"{file} is not there")
+            raise InvalidInput(f"{file} does not exist")
         data = read_plain(file, _MOST_BYTES)
         if hashlib.sha256(data).hexdigest() != beside.get("sha256"):
-            raise InvalidInput(f"{file} is not the one that was written with {self.path}")
+            raise InvalidInput(f"{file} was changed after {self.path} was written")
         return read_harms(file, data)
 
 
 def read_result(path: Path) -> Result:
-    """Read and check a results file (JSON) that ``ethbrake evaluate``, ``shield`` or ``run`` wrote or printed.
+    """Read and check a JSON results file of ``ethbrake evaluate``, ``ethbrake shield`` or ``ethbrake run``.
 
-    Raises ``InvalidInput`` for any other file, including kinds of results that cannot be compared, and results without
-    hashes.
+    Raises ``InvalidInput`` for any other file, for kinds of results that cannot be compared, and for missing hashes.
     """
     try:
         content = parse_strict_json(read_plain(path, _LIMIT_BYTES))
     except ValueError as error:
         if isinstance(error, EthBrakeError):
             raise
-        raise InvalidInput(f"{path}: is no JSON, or was not written to its end: {error}") from None
+        raise InvalidInput(f"{path}: is not JSON, or is incomplete: {error}") from None
     rows = _rows_of(path, content)
     for row in rows:
         for key, kind in _NEEDED.items():
             if not isinstance(row.get(key), kind):
-                raise InvalidInput(f"{path}: {key} is missing or no {kind.__name__}: evaluate again")
+                raise InvalidInput(
+                    f"{path}: {key} is missing or not of type {kind.__name__}; run ethbrake evaluate again"
+                )
         who = f"{path}: {row['agent']}"
         if not 1 <= row["episodes"] <= _MOST_EPISODES or isinstance(row["episodes"], bool):
             raise InvalidInput(f"{who}: episodes = {row['episodes']!s:.40}: must be 1 to {_MOST_EPISODES:,}")
@@ -239,28 +240,31 @@ def read_result(path: Path) -> Result:
             raise InvalidInput(f"{who}: horizon_ends = {row['horizon_ends']!s:.40}: must be 0 to {row['episodes']:,}")
         draws = recorded_value(row, "recordings") or f"{row['episodes']}"
         if not (draws.isdecimal() and len(draws) < 14 and 1 <= int(draws) <= row["episodes"]):
-            raise InvalidInput(f"{who}: recordings = {draws:.40}: must be 1 to {row['episodes']:,}, or left out")
+            raise InvalidInput(f"{who}: recordings = {draws:.40}: must be 1 to {row['episodes']:,}, or be missing")
         shoved = row.get("vehicle_1_shoved_m")
         if shoved is not None and not (type(shoved) in (int, float) and abs(shoved) <= _MOST_HARM):
-            raise InvalidInput(f"{who}: vehicle_1_shoved_m = {shoved!r:.40}: must be metres, or null")
+            raise InvalidInput(f"{who}: vehicle_1_shoved_m = {shoved!r:.40}: must be a number of metres, or null")
         for harm in COMPARED[row["kind"]]:
             if not _is_mean(row.get(harm), row.get(f"{harm}_interval"), int(draws)):
-                raise InvalidInput(f"{who}: {harm} is no mean with an interval [low, high] around it")
+                raise InvalidInput(
+                    f"{who}: {harm} = {row.get(harm)!s:.40}, {harm}_interval = {row.get(f'{harm}_interval')!s:.60}:"
+                    " must be a mean harm, and an interval [low, high] that contains the mean"
+                )
     if len({tuple(recorded_value(row, key) for key in SAME) for row in rows}) > 1:
-        raise InvalidInput(f"{path}: its agents drove different worlds; each test needs a file of its own")
+        raise InvalidInput(f"{path}: the agents drove different worlds; write the results of each test to its own file")
     named = [
         f"{row['agent']} ({row['mode']})" if row["kind"] == "shield" and "mode" in row else str(row["agent"])
         for row in rows
     ]
     if twice := {name for name in named if named.count(name) > 1}:
-        raise InvalidInput(f"{path}: {min(twice)} stands in it twice")
+        raise InvalidInput(f"{path}: lists the agent {min(twice)} twice; evaluate each agent once")
     return Result(path, dict(zip(named, rows, strict=True)))
 
 
 def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
-    """Return the value of ``key`` in ``row`` (an agent's JSON object), or else in its ``parameters``, as text.
+    """Return the value of ``key`` in an agent's JSON object ``row``, or else in its ``parameters``, as text.
 
-    None if it is in neither.
+    Return None if neither has the key.
     """
     parameters = row.get("parameters")
     value = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
@@ -268,9 +272,9 @@ def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
 
 
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
-    """Return whether these JSON values are a mean harm and an interval ``[low, high]`` around it.
+    """Return whether ``mean`` is a mean harm, and ``interval`` an interval ``[low, high]`` that contains it.
 
-    ``interval`` may be None; for a single independent draw (``draws`` = 1) it must be.
+    ``interval`` may be None. If ``draws``, the number of independent worlds, is 1, it must be None.
     """
     ends = [mean, mean] if interval is None else interval
     if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and draws == 1):
@@ -281,25 +285,27 @@ def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
 
 
 def _rows_of(path: Path, content: Any) -> list[dict[str, Any]]:
-    """Return the objects of a results file, one for each agent; raise ``InvalidInput`` for other content.
+    """Return the JSON objects of a results file, one for each agent; raise ``InvalidInput`` for other content.
 
-    ``content`` is the parsed JSON; ``path`` is named in errors.
+    ``content`` is the parsed JSON of the file ``path``.
     """
     several = [content] if isinstance(content, dict) else content
     if not isinstance(several, list) or not several or not all(isinstance(row, dict) for row in several):
-        raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one")
+        raise InvalidInput(f"{path}: is not a results file of ethbrake evaluate --json")
     for row in several:
         kind = row.get("kind")
         if not isinstance(kind, str):
-            raise InvalidInput(f"{path}: is no results file, as ethbrake evaluate --json prints one (kind is missing)")
+            raise InvalidInput(f"{path}: is not a results file of ethbrake evaluate --json (kind is missing)")
         if kind not in get_args(Kind):
             raise InvalidInput(f"{path}: {unknown_name('kind of results', kind, get_args(Kind))}")
         if kind not in COMPARED:
-            raise InvalidInput(f"{path}: results of {kind} cannot be compared; those of {', '.join(COMPARED)} can")
+            raise InvalidInput(
+                f"{path}: results of the kind {kind} cannot be compared; results of {' and '.join(COMPARED)} can"
+            )
     if not isinstance(content, dict):
         return several
     about = {key: value for key, value in content.items() if key != "agents"}
     agents = content.get("agents")
     if not isinstance(agents, list) or not agents or not all(isinstance(row, dict) for row in agents):
-        raise InvalidInput(f"{path}: agents is missing or no list of objects: it is not whole")
+        raise InvalidInput(f"{path}: agents is missing or not a list of objects; the file is incomplete")
     return [row | about for row in agents]

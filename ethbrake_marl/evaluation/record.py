@@ -1,7 +1,7 @@
 """Record of one episode at fine time resolution, for figures and viewers.
 
-Between two decisions, the motion follows from the state and the command alone. So the episode is first run as in an
-evaluation; then each step is sampled, and every sample is advanced directly from the beginning of its step.
+The episode is first run as in an evaluation. The state at each sample time is then computed from the state and the
+commands at the beginning of the step.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SAMPLE_S = 0.02  # default time between two samples (s)
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
-    """One world from the alert to its end, sampled at k times; row 0 is the alert.
+    """Motion of one world from the alert to the end of its episode, sampled at k times. Row 0 is the alert.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -47,9 +47,9 @@ class EpisodeRecord:
     time_s: Floats  # [k] time since the alert, ascending
     gaps_m: Floats  # [k, P] gap of each pair
     speeds_mps: Floats  # [k, N] speed of each vehicle
-    positions_m: Floats  # [k, N] position of each vehicle along the road; vehicles have no length here
-    command_mps2: Floats  # [k, N] commanded signed acceleration from this time on; 0 before the latency has elapsed
-    impacts: ImpactRows  # all impacts in order of time; their column ``world`` is 0
+    positions_m: Floats  # [k, N] position of each vehicle along the road, as if vehicles had no length
+    command_mps2: Floats  # [k, N] commanded acceleration from this time on; 0 before the latency has elapsed
+    impacts: ImpactRows  # all impacts in order of time; column ``world`` is 0
     ledger: Ledger  # harm of all impacts of the episode, n = 1
     at_rest: bool  # whether the line came to rest before the horizon
 
@@ -70,24 +70,24 @@ class EpisodeRecord:
 def record_episode(
     world: Worlds, agent: Driver, *, scenario: Scenario, vehicle: int | str | None = None, sample_s: float = SAMPLE_S
 ) -> EpisodeRecord:
-    """Record one world from the alert on, exactly as ``evaluate`` runs it.
+    """Let an agent drive one world exactly as in ``evaluate``, and record the motion.
 
     Args:
         world: the world at the alert, n = 1.
-        agent: agent or team; it is not changed.
+        agent: agent or team. The object itself does not change.
         scenario: scenario of the world, whose scripts drive the other vehicles.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        sample_s: largest time between two samples (s); every decision is a sample, too.
+        sample_s: largest time between two samples (s). Times of decisions are sampled in any case.
 
-    Raises ``InvalidInput`` for more than one world or ``sample_s`` not above 0.
+    Raises ``InvalidInput`` if there is not exactly one world, or if ``sample_s`` is not above 0.
 
     """
     if world.n != 1:
         raise InvalidInput(
-            f"record_episode: {count_of(world.n, 'world')}; exactly 1 is needed, for instance worlds.take([0])"
+            f"record_episode: world has {count_of(world.n, 'world')}; pass exactly 1, for instance worlds.take([0])"
         )
     if not (sample_s > 0.0 and math.isfinite(sample_s)):
-        raise InvalidInput(f"record_episode: sample_s = {sample_s}; must be finite and above 0")
+        raise InvalidInput(f"record_episode: sample_s = {sample_s}: must be a finite number of seconds above 0")
     several = vehicle is None and len(scenario.learners) > 1
     vehicles = scenario.learners if several else (controlled_vehicle(scenario, vehicle),)
     tape = Tape(world)
@@ -103,10 +103,14 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    ``segments`` are the steps of one world, each with the world before, the commands [1, N], and the end time [1]. Two
-    samples of a step are at most ``sample_s`` apart (s). Only the last step includes its end. Worlds hold gaps and
-    speeds, not positions. So Vehicle 1's position is measured as its gap to an obstacle ahead, which is the world's own
-    or one out of reach.
+    Two samples of a step are at most ``sample_s`` apart (s). The end of a step is sampled as the beginning of the next
+    step, and the end of the last step as its last sample. A world does not contain positions, so Vehicle 1's position
+    is computed from its gap to an obstacle. If the world has no obstacle, one is assumed that Vehicle 1 cannot reach.
+
+    Args:
+        segments: steps of one world, each as (world at the beginning, commands [1, N], time of the end [1]).
+        sample_s: largest time between two samples (s).
+
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment
     for number, (before, command, until_s) in enumerate(segments):
@@ -126,5 +130,5 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
 
 
 def line_positions(front: Floats, gaps: Floats) -> Floats:
-    """Return the positions [k, N] of all vehicles, ``front`` [k] being that of Vehicle 1, from the gaps [k, P]."""
+    """Return the positions [k, N] of all vehicles from Vehicle 1's position ``front`` [k] and the gaps [k, P]."""
     return np.concatenate([front[:, np.newaxis], front[:, np.newaxis] - np.cumsum(gaps, axis=1)], axis=1)

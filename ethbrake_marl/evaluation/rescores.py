@@ -1,4 +1,4 @@
-"""Mean harm of agents under several objectives: one row per agent, objective and count of harm."""
+"""Mean values of several objectives for each agent: one row per agent, objective and count of harm."""
 
 from __future__ import annotations
 
@@ -13,25 +13,31 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """Mean value of one agent's episodes under one objective, for each vehicle; less is better."""
+    """Mean value of one objective for each vehicle, when one agent drives. Smaller values are better."""
 
     agent: str  # name of the agent
     objective: str  # objective as in scenarios: ``total``, ``own``, ``social:45``
-    harm_count: HarmCount  # impacts that count: each pair's first one (``first``) or all (``total``)
-    each: tuple[Estimate, ...]  # mean per world (m2/s2) of each vehicle, front to rear
+    harm_count: HarmCount  # impacts that count: each pair's first impact (``first``) or all impacts (``total``)
+    each: tuple[Estimate, ...]  # mean value per world (m2/s2) for each vehicle, front to rear
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON: ``objective``, ``harm_count``, and each vehicle's mean and interval."""
+        """Return the entry for JSON, with ``objective``, ``harm_count``, and each vehicle's mean and interval."""
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
 
 class Rescores(list[Rescored]):
-    """List of ``Rescored`` rows that ``print`` and a notebook show as two tables: first-impact and total harm."""
+    """List of ``Rescored`` rows, shown by ``print`` and in notebooks as two tables: first-impact and total harm.
+
+    Args:
+        rows: rows for each agent, objective and count of harm.
+        recordings: number of recordings that the worlds come from; 0: all worlds are independent.
+
+    """
 
     def __init__(self, rows: Iterable[Rescored] = (), recordings: int = 0) -> None:
         super().__init__(rows)
-        self.recordings = recordings  # number of recordings that the intervals are by; 0: all worlds are independent
+        self.recordings = recordings
 
     def __str__(self) -> str:
         return terminal_text(self.sheet("first"), "", self.sheet("total"), whole_rows=True)
@@ -40,9 +46,9 @@ class Rescores(list[Rescored]):
         return "\n".join(self.sheet(harm_count).html() for harm_count in HARM_COUNTS)
 
     def sheet(self, harm_count: HarmCount) -> Sheet:
-        """Return the table of first-impact harm (``first``) or total harm (``total``).
+        """Return the table for first-impact harm (``first``) or total harm (``total``).
 
-        It has one line per agent and objective, and one column per vehicle.
+        The table has one row per agent and objective, and one column per vehicle.
         """
         shown = [row for row in self if row.harm_count == harm_count]
         vehicles = range(len(shown[0].each) if shown else 0)

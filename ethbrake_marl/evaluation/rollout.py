@@ -1,6 +1,6 @@
 """Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
-The list is fixed because "the first episodes that finish" would contain too many short episodes, and crashes end early.
+The worlds are fixed in advance. Counting the episodes that finish first would favour short episodes, and so crashes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
-OnWorlds = Callable[[str, int], None]  # callback with an agent's name and its number of worlds done so far
+OnWorlds = Callable[[str, int], None]  # called with an agent's name and the number of worlds that it has driven so far
 
 
 def evaluate(
@@ -56,28 +56,29 @@ def evaluate(
     on_progress: OnWorlds | None = None,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive every world once, from the alert to the episode's end.
+    """Let each agent drive every world once, from the alert to the end of the episode.
 
-    The other vehicles follow the scenario's scripts. A world's outcome depends neither on ``chunk`` nor on the other
-    worlds. A world that cannot be advanced (a defect of the physics) is left out for all agents; ``left_out`` lists it.
+    The other vehicles follow the scenario's scripts. The outcome in a world does not depend on the other worlds. If the
+    physics fails in a world with one agent, the world is left out for all agents (``left_out``).
 
     Args:
-        worlds: worlds at the alert, or a sample that ``scenario.sample`` drew; None: draw ``episodes`` worlds from
-            ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo"``, or a list), which minimise first-impact
-            harm; or a mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the
-            originals do not change.
-        scenario: scenario of the worlds, also by name or path.
+        worlds: worlds at the alert, or a sample from ``scenario.sample``; None: draw ``episodes`` worlds from ``seed``.
+        agents: specs as on the command line (``"full_brake,ppo"``, or a list of specs), or a mapping from name to agent
+            or ``Team``. Each controlled vehicle gets a copy of its agent; the objects that you pass do not change.
+            Agents that are built from specs minimise first-impact harm.
+        scenario: scenario of the worlds, or its name or path.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: number of worlds to draw; None: 10,000.
-        seed: seed of the list; None: 7. With ``worlds``, it is only recorded in the result.
-        chunk: number of worlds advanced together; None: 2,500.
-        on_progress: called after each chunk with an agent's name and the number of its worlds done.
+        seed: seed of the evaluation list; None: 7. If ``worlds`` is passed, the seed is only recorded in the result.
+        chunk: number of worlds simulated together, which does not change the results; None: 2,500.
+        on_progress: function that is called after each chunk with an agent's name and the number of worlds that the
+            agent has driven so far.
         aftermath: also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the user
-            registered; takes longer.
+            registered. This takes longer.
 
-    Warns (``Unfamiliar``) about policies in worlds unlike those of their training. Raises ``PhysicsError`` if no world
-    is left; ``InvalidInput`` for worlds of another scenario or after the alert, and if agents and vehicles do not fit.
+    Warns (``Unfamiliar``) about policies that drive in worlds unlike their training worlds. Raises ``PhysicsError`` if
+    every world is left out, and ``InvalidInput`` for worlds of another scenario, for worlds after the alert, and for
+    agents that do not fit the controlled vehicles.
 
     """
     scenario = load_scenario(scenario)
@@ -87,11 +88,11 @@ def evaluate(
         seed = LIST_SEED if seed is None else seed
         worlds = scenario.sample(EPISODES if episodes is None else episodes, seed=seed)
     elif episodes is not None:
-        raise InvalidInput(f"evaluate: episodes = {episodes!r}: worlds were passed too; leave one of the two out")
+        raise InvalidInput(f"evaluate: episodes = {episodes!r}: pass either worlds or episodes, not both")
     _check_request(worlds, agents, chunk)
     sample = worlds if isinstance(worlds, Sample) else Sample(worlds, np.arange(worlds.n, dtype=np.int64), 0)
     if not sample.worlds.n:
-        raise InvalidInput("evaluate: worlds: there are none; at least one is needed")
+        raise InvalidInput("evaluate: worlds is empty; pass at least one world")
     check_alert(sample.worlds, sample.worlds.n, scenario.vehicles)
     vehicles = controlled_vehicles(scenario, vehicle, agents)
     warn_unfamiliar(agents, sample.worlds, scenario, vehicles)
@@ -105,7 +106,7 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """Yield consecutive parts of at most ``size`` worlds, each as (row of its first world in the sample, part)."""
+    """Yield consecutive chunks of at most ``size`` worlds, as pairs (row of the first world in the sample, chunk)."""
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -119,23 +120,23 @@ def drive_chunk(
     first: int = 0,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive all of these worlds together, from the alert to the end of their episodes.
+    """Let each agent drive one chunk of worlds, all together, from the alert to the end of their episodes.
 
-    If every world fails, the evaluation is empty.
+    If the physics fails in every world, the result has no worlds.
 
     Args:
-        sample: the worlds, a part of a list.
+        sample: the worlds of the chunk.
         agents: agents or teams by name.
         scenario: scenario of the worlds.
-        seed: seed of the list, which is recorded in the result.
+        seed: seed of the evaluation list, which is recorded in the result.
         vehicles: indices (0 = front) of the controlled vehicles.
-        first: row of the part's first world in the list, for error messages.
+        first: row of the chunk's first world in the evaluation list, for error messages.
         aftermath: also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user registered.
 
     """
     n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
     outcomes: dict[str, Outcome] = {}
-    advanced: dict[str, Ints] = {}  # rows of the worlds in each outcome
+    advanced: dict[str, Ints] = {}  # name of an agent -> rows of the worlds in its outcome
     lost, rejected = dict[int, LeftOut](), sample.rejected
     for name, agent in agents.items():
         roll_out = partial(_roll_out, sample.worlds, agent, vehicles, scenario, aftermath)
@@ -159,14 +160,14 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
     """Raise ``InvalidInput`` if one of these arguments of ``evaluate`` has a wrong type or value."""
     if not isinstance(worlds, Worlds | Sample):
         raise InvalidInput(
-            f"evaluate: worlds = {worlds!r}: must be worlds or a sample, as scenario.sample(n, seed) gives"
+            f"evaluate: worlds = {worlds!r}: must be Worlds or a Sample, for instance scenario.sample(100, seed=7)"
         )
     if not isinstance(agents, Mapping):
         raise InvalidInput(
-            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo', or a mapping of agents"
+            f"evaluate: agents = {agents!r}: must be specs such as 'full_brake,ppo', or a mapping from name to agent"
         )
     if not agents:
-        raise InvalidInput("evaluate: no agents; at least one is needed, for instance full_brake")
+        raise InvalidInput("evaluate: agents is empty; pass at least one agent, for instance 'full_brake'")
     for name, agent in agents.items():
         check_agent(agent, f"evaluate: agent {name!r}", alone=False)
         Knowledge.of(agent)  # raises for an invalid ``knows``
@@ -177,8 +178,8 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
-    This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. Without learners the
-    result is empty if all agents are teams; otherwise raises ``InvalidInput``.
+    This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. If the scenario has no
+    learner, return an empty tuple if all agents are teams, and otherwise raise ``InvalidInput``.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
@@ -189,23 +190,26 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     """Return the index (0 = front) of the single controlled vehicle.
 
     This is ``vehicle`` (name or index), or the scenario's only learner if ``vehicle`` is None. Raises ``InvalidInput``
-    if there is not exactly one learner, or another learner than ``vehicle``.
+    if ``vehicle`` is None and the scenario does not have exactly one learner, or if another vehicle is a learner.
     """
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]
     if vehicle is None:
-        check_one_learner(scenario.name, names, "say which vehicle the agents drive")
+        check_one_learner(scenario.name, names, "name the vehicle that the agents drive, for instance vehicle_2")
         return learners[0]
     if isinstance(vehicle, str):
         if vehicle not in scenario.vehicle_names:
             raise unknown_name("vehicle", vehicle, scenario.vehicle_names)
         vehicle = scenario.vehicle_names.index(vehicle)
     if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < scenario.vehicles:
-        raise InvalidInput(f"vehicle = {vehicle!r}: must be a name or an index from 0 to {scenario.vehicles - 1}")
+        raise InvalidInput(
+            f"vehicle = {vehicle!r}: must be the name of a vehicle, or an index from 0 to {scenario.vehicles - 1}"
+        )
     if set(learners) - {vehicle}:
         raise InvalidInput(
-            f"scenario {scenario.name!r}: its learners are {', '.join(names)}, but only"
-            f" {scenario.vehicle_names[vehicle]} is controlled; give the others a script (scenario.replace(roles=...))"
+            f"scenario {scenario.name!r} has the learners {', '.join(names)}, but vehicle ="
+            f" {scenario.vehicle_names[vehicle]} is the only controlled vehicle; give each other learner a script"
+            " (scenario.replace(roles=...))"
         )
     return int(vehicle)
 
@@ -213,11 +217,7 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let a new team of copies of ``agent`` drive the worlds with the row numbers ``rows`` of ``whole``.
-
-    ``vehicles`` are the indices of the controlled vehicles. With ``aftermath``, also measure how far Vehicle 1 is
-    shoved, sampled harm, and measures that the user registered.
-    """
+    """Let copies of ``agent`` drive the rows ``rows`` of ``whole``. The other arguments are as in ``drive_chunk``."""
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))
@@ -237,10 +237,10 @@ def _roll_out(
 
 
 def outcome_of(team: Team, episodes: Episodes) -> Outcome:
-    """Return the ``Outcome`` of a team's episodes.
+    """Return the ``Outcome`` of a team's episodes, without ``shoved_m``, ``sampled_harm`` and ``metrics``.
 
-    It lacks what watchers measure during the episodes: ``shoved_m``, ``sampled_harm`` and ``metrics``. The fields
-    ``predicted_harm`` and ``chosen_policy`` come from the memory of an agent that drives alone, or from a shield.
+    The fields ``predicted_harm`` and ``chosen_policy`` are read from the shield's memory or, if the team has a single
+    vehicle and no shield, from the agent's memory.
     """
     memory: Any = next(iter(episodes.memories.values()), None) if len(team.drivers) == 1 else None
     if episodes.guarded is not None:
@@ -260,17 +260,14 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """Return the entry ``what`` of an agent's memory, one number per world [n]; None if there is no such entry.
-
-    ``team`` is named in errors.
-    """
+    """Return the entry ``what`` of an agent's memory, one number per world [n], or None if there is no such entry."""
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None
     column = np.asarray(value)
     if column.shape != (n,) or column.dtype.kind not in "biuf":
         raise InvalidInput(
-            f"agent {team.name!r}: {what} is {column.dtype} of shape {column.shape}; one number per world, ({n},), is"
-            " needed"
+            f"agent {team.name!r}: {what} in its memory has type {column.dtype} and shape {column.shape}; must be one"
+            f" number per world, shape ({n},)"
         )
     return column

@@ -1,8 +1,8 @@
-"""Statistics over trainings with different seeds: estimates that say what to expect of another seed.
+"""Statistics over trainings with different seeds: means whose intervals say what to expect of another seed.
 
-Usually there are few seeds, and a single bad one moves a mean a lot. The interquartile mean omits the best and the
-worst quarter. The bootstrap estimates its error by resampling seeds within each task (stratified), because tasks are
-chosen and not drawn.
+There are usually few seeds, and a single bad seed moves a mean a lot. The interquartile mean omits the best and the
+worst quarter. Its error is estimated with a stratified bootstrap: seeds are resampled within each task (scenario),
+because seeds are random and tasks are not.
 """
 
 from __future__ import annotations
@@ -17,35 +17,37 @@ from ethbrake_marl.evaluation.statistics import CONFIDENCE, Texts, check, of_amo
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.physics.state import Floats, Ints
 
-RESAMPLES = 10_000  # bootstrap resamples of seeds
+RESAMPLES = 10_000  # number of bootstrap resamples of seeds
 
-_RESAMPLES = 2_000  # bootstrap resamples of seeds and worlds
+_RESAMPLES = 2_000  # number of bootstrap resamples of seeds and worlds
 
-_LEAST_REDUCTION = 1e-3  # part of the possible reduction below which a resample has no share
+# A resample whose possible reduction is below this fraction of the possible reduction in all data is not used.
+_LEAST_REDUCTION = 1e-3
 
-_CUT = 0.25  # share of values that the interquartile mean omits at either end
+_CUT = 0.25  # fraction of the values that the interquartile mean omits at either end
 
-_AT_ONCE = 1 << 20  # resampled worlds in memory at once: 8 MB
+_AT_ONCE = 1 << 20  # number of resampled worlds in memory at once (8 MB)
 
 
 def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
-    """Return the mean of the middle half of all values, with its stratified bootstrap interval (percentiles).
+    """Return the interquartile mean of all values, with its stratified bootstrap interval (percentiles).
 
-    Of all n values, floor(n / 4) are omitted at either end. The interval is None if no task has two seeds.
+    The floor(n / 4) smallest and the floor(n / 4) largest of all n values are omitted. The interval is None if no task
+    has two seeds.
 
     Args:
-        tasks: for each task (scenario), the results of its trainings, one number per seed.
+        tasks: results of the trainings on each task (scenario), one number per seed.
         resamples: number of bootstrap resamples.
         seed: seed of the bootstrap.
 
-    Raises ``InvalidInput`` for a task without values, or for a value that is not finite.
+    Raises ``InvalidInput`` if there are no tasks, if a task has no values, or if a value is not finite.
 
     """
     from scipy.stats import bootstrap, trim_mean  # imported here because it takes a second to load
 
     strata = [check(figures, f"interquartile_mean: task {k}", "seed") for k, figures in enumerate(tasks)]
     if not strata:
-        raise InvalidInput("interquartile_mean: no tasks; at least one list of figures is needed")
+        raise InvalidInput("interquartile_mean: tasks is empty; pass the results of at least one task")
 
     def statistic(*drawn: Floats, axis: int) -> Floats:
         middle: Floats = trim_mean(np.concatenate(drawn, axis=axis), _CUT, axis=axis)
@@ -73,18 +75,19 @@ def mean_over_seeds(
 ) -> Estimate:
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, with a bootstrap interval.
 
-    The bootstrap resamples the seeds of each side, and the worlds or clusters, which both sides share. So an interval
-    of differences that excludes 0 holds for other seeds *and* other worlds. There is no interval for a single world or
-    cluster, nor without a baseline if all values are 0. The interval of true/false values without a baseline also
-    covers Wilson's interval, because resamples of values that hardly ever differ are too narrow.
+    The bootstrap resamples the seeds of ``values``, the seeds of ``baseline``, and the worlds (or clusters of worlds).
+    The interval is therefore valid for other seeds and other worlds. There is no interval for a single world or
+    cluster. Without a baseline, there is none either if all values are 0; and the interval of true/false values always
+    contains Wilson's interval, because bootstrap intervals of nearly constant values are too narrow.
 
     Args:
-        values: [seeds, worlds] result of the training with each seed in each world.
-        baseline: [seeds, worlds] results to subtract, in the same worlds; the number of seeds may differ.
-        clusters: name of each world's cluster, [worlds]; only clusters are independent. None: all worlds are.
+        values: result of the training with each seed in each world, [seeds, worlds].
+        baseline: results to subtract, in the same worlds, [seeds, worlds]; the number of seeds may differ.
+        clusters: name of the cluster of each world, [worlds]. Only clusters are independent of each other. None: all
+            worlds are independent.
         seed: seed of the bootstrap.
 
-    Raises ``InvalidInput`` for arrays that cannot be paired or are not finite.
+    Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite.
 
     """
     array = np.atleast_2d(np.asarray(values))
@@ -95,7 +98,7 @@ def mean_over_seeds(
         return estimate
     if array.dtype != np.bool_:
         return of_amounts(estimate, nothing=not array.any())
-    share = min(value, 1.0)  # a mean of ones may be rounded up
+    share = min(value, 1.0)  # the mean of values that are all 1 may be rounded up
     if clusters is None:
         low, high = wilson(share, array.shape[1])
     else:
@@ -107,17 +110,17 @@ def mean_over_seeds(
 def share_over_seeds(
     values: ArrayLike, worst: ArrayLike, best: ArrayLike, *, clusters: Texts | None = None, seed: int = 0
 ) -> Estimate | None:
-    """Return the share of the possible reduction that ``values`` reaches: 0 like ``worst``, 1 like ``best``.
+    """Return the share of the possible reduction: 0 for values as bad as ``worst``, 1 for values as good as ``best``.
 
-    It is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with the bootstrap interval of
-    ``mean_over_seeds``. Returns None unless ``best`` has a lower mean than ``worst``, also in nearly all resamples:
-    few worlds with a reduction allow no share.
+    The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
+    ``mean_over_seeds``. Returns None if the mean of ``best`` is not below the mean of ``worst``, or if it is not
+    clearly below the mean of ``worst`` in 5 % or more of the resamples.
 
     Args:
-        values: [seeds, worlds] harms to judge.
-        worst: [seeds, worlds] harms that count as share 0, in the same worlds.
-        best: [seeds, worlds] harms that count as share 1, in the same worlds.
-        clusters: as in ``mean_over_seeds``.
+        values: harms of the trainings to judge, [seeds, worlds] (m2/s2).
+        worst: harms that count as share 0, in the same worlds, [seeds, worlds].
+        best: harms that count as share 1, in the same worlds, [seeds, worlds].
+        clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap.
 
     """
@@ -139,24 +142,32 @@ def share_over_seeds(
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
     """Return each of ``sides`` as an array [seeds, worlds].
 
-    Raises ``InvalidInput``, naming the function ``who``, if their numbers of worlds differ or a value is not finite.
+    Raises ``InvalidInput`` if the numbers of worlds differ or a value is not finite. ``who`` is the name of the calling
+    function, for the message.
     """
     arrays = tuple(np.atleast_2d(np.asarray(side, np.float64)) for side in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
         shapes = " and ".join(str(side.shape) for side in arrays)
-        raise InvalidInput(f"{who}: shapes {shapes}: must be [seeds, worlds] with the same worlds")
+        raise InvalidInput(
+            f"{who}: the arrays have the shapes {shapes}: must be [seeds, worlds] with the same number of worlds"
+        )
     if not all(np.isfinite(side).all() for side in arrays):
-        raise InvalidInput(f"{who}: every harm must be finite")
+        raise InvalidInput(f"{who}: some values are NaN or infinite: all values must be finite")
     return arrays
 
 
 def _resampled(
     value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Texts | None, seed: int
 ) -> Estimate:
-    """Return ``value`` with a bootstrap interval, or without one for a single world or cluster.
+    """Return ``value`` with a bootstrap interval, or without an interval for a single world or cluster.
 
-    The interval holds the percentiles of ``of(means)``, where ``means`` [resamples, sides] are the resampled means.
-    ``clusters`` names the cluster of each world (None: all are independent); ``seed`` is the seed of the bootstrap.
+    Args:
+        value: the estimate.
+        sides: arrays [seeds, worlds], whose seeds and common worlds are resampled.
+        of: function of the resampled means [resamples, sides], whose percentiles are the ends of the interval.
+        clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
+        seed: seed of the bootstrap.
+
     """
     worlds = sides[0].shape[1]
     cluster = np.arange(worlds) if clusters is None else np.unique(clusters, return_inverse=True)[1]
@@ -168,10 +179,17 @@ def _resampled(
 
 
 def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed: int) -> Floats:
-    """Return the mean of each of ``sides`` (arrays [seeds, worlds]) in each bootstrap resample, [resamples, sides].
+    """Return the mean of each side in each bootstrap resample, [resamples, sides].
 
-    Seeds are resampled separately for each side; clusters are resampled once for all sides, each with all its worlds.
-    ``cluster`` [worlds] is the number of each world's cluster, from 0.
+    Seeds are resampled separately for each side. Clusters are resampled once for all sides; a drawn cluster contributes
+    all its worlds.
+
+    Args:
+        sides: arrays [seeds, worlds].
+        cluster: number of each world's cluster, from 0, [worlds].
+        resamples: number of resamples.
+        seed: seed of the random numbers.
+
     """
     worlds, number = len(cluster), int(cluster.max()) + 1
     rng = np.random.default_rng(seed)
@@ -184,7 +202,7 @@ def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed
         means = np.empty((size, len(sides)))
         for column, side in enumerate(sides):
             seeds = rng.integers(len(side), size=(size, len(side)))
-            # No matrix product, because its order of addition depends on the machine.
+            # A matrix product would add in an order that depends on the machine.
             of_seeds = np.stack([(weights * row).sum(axis=1) for row in side], axis=1)
             means[:, column] = np.take_along_axis(of_seeds, seeds, axis=1).mean(axis=1)
         parts.append(means)

@@ -1,4 +1,4 @@
-"""Comparison of the shield's modes on the same worlds: harm, and the effect of each intervention."""
+"""Comparison of the shield's modes in the same worlds: harm, and whether each intervention of the shield helped."""
 
 from __future__ import annotations
 
@@ -24,47 +24,47 @@ from ethbrake_marl.shields.episodes import Shielded
 from ethbrake_marl.shields.evidence import SAME_HARM, VERDICTS, review
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
-# ``step-alert``: rollouts of the policy only at the alert; ``step-cap``: no vehicle bears more harm than its cap.
+# ``step-alert``: step mode with rollouts of the policy at the alert only; ``step-cap``: step mode with caps.
 Mode = Literal["none", "episode", "step", "step-alert", "step-cap"]
 
-CHUNK = 500  # worlds advanced together; limits memory, and does not change results
+CHUNK = 500  # number of worlds simulated together, to limit memory; does not change results
 
 
 class VehicleRow(NamedTuple):
     """Results of one vehicle of the line behind a shield in step mode."""
 
-    vehicle: str  # name, such as ``vehicle_2``
-    replaced: float | None  # share, 0 to 1, of its decisions that the shield replaced; None: it is not shielded
-    harm: float  # mean harm that it bears per world (m2/s2)
-    baseline: float  # mean harm that it would bear if the line followed the shield's baseline plan (m2/s2)
-    above_baseline: float  # share, 0 to 1, of worlds in which it bears more than under that plan
+    vehicle: str  # name of the vehicle, such as ``vehicle_2``
+    replaced: float | None  # fraction of the vehicle's decisions that the shield replaced; None: it has no shield
+    harm: float  # mean harm per world that the vehicle bears (m2/s2)
+    baseline: float  # mean harm that the vehicle would bear under the shield's baseline plan (m2/s2)
+    above_baseline: float  # fraction of worlds in which the vehicle bears more harm than under the baseline plan
 
 
 @dataclass(frozen=True, slots=True)
 class ModeRow:
-    """Results of one agent, or one team, behind one mode of the shield."""
+    """Results of one agent (or one team) with the shield in one mode."""
 
     agent: str  # name of the agent or team, without the shield
     mode: Mode  # the shield's mode; ``none``: without a shield
     harm: Estimate  # mean harm per world (m2/s2)
-    horizon_ends: int  # number of worlds in which something still moves at the horizon, after which no bound holds
+    horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon; no bound covers later harm
     # Harm minus the harm in episode mode, paired by world (m2/s2); None in episode mode itself, and for teams.
     against_episode: Estimate | None
     # Harm minus the harm without a shield, paired by world (m2/s2); None without a shield.
     against_none: Estimate | None = None
-    # The fields from here to ``above_bound`` exist only in step mode and its variants.
-    replaced: float | None = None  # share, 0 to 1, of all decisions of shielded vehicles that the shield replaced
-    bound: Estimate | None = None  # mean over worlds of the harm that the shield promises at the alert (m2/s2)
+    # The fields from ``replaced`` to ``above_bound`` have values in step mode and its variants only.
+    replaced: float | None = None  # fraction of all decisions of shielded vehicles that the shield replaced
+    bound: Estimate | None = None  # mean over worlds of the shield's bound at the alert (m2/s2)
     vehicles: tuple[VehicleRow, ...] = ()  # results of each vehicle, front to rear
-    # Shares, 0 to 1, of the replaced decisions without which harm would be higher (needed), the same (harmless) and
-    # lower (costly), in this order; None if none was replaced.
+    # Fractions of the replaced decisions that were needed (harm would be higher without the replacement), harmless
+    # (equal) and costly (lower), in this order; None if the shield replaced no decision.
     verdicts: tuple[float, ...] | None = None
     above_bound: int | None = None  # number of worlds whose harm exceeds the bound at the alert
-    left_out: LeftOutRows = ()  # (row, reason) of each world that failed with some agent and mode; no row counts it
+    left_out: LeftOutRows = ()  # (row, reason) of each world that is left out because a simulation failed
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
 
     def to_json(self) -> dict[str, Any]:
-        """Return the row as plain data for JSON; missing values are null, intervals are ``[low, high]``."""
+        """Return the row's JSON object. Missing values are null; intervals are ``[low, high]``."""
         shares = self.verdicts or (None,) * len(VERDICTS)
         return {
             "agent": self.agent,
@@ -87,13 +87,16 @@ class ShieldModes(list[ModeRow]):
 
     @property
     def of_teams(self) -> bool:
-        """Whether several vehicles are controlled; there is no episode mode for them."""
+        """Whether the agents are teams of several vehicles; the shield has no episode mode for teams."""
         return all(row.against_episode is None for row in self)
 
     def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
         """Return the content of a results file of ``ethbrake shield``: one object per row.
 
-        ``sample`` and ``task`` are the worlds and the task that ``compare_modes`` was called with.
+        Args:
+            sample: the worlds that were passed to ``compare_modes``.
+            task: the task that was passed to ``compare_modes``.
+
         """
         left_out = [world for world, _ in self[0].left_out]
         about = result_identity("shield", task.scenario, sample, left_out)
@@ -103,7 +106,7 @@ class ShieldModes(list[ModeRow]):
         return [about | row.to_json() for row in self]
 
     def sheets(self) -> list[Sheet]:
-        """Return the tables for a terminal: harm by agent and mode and, for teams, the harm that each vehicle bears."""
+        """Return tables for a terminal: harm of each agent and mode; for teams also the harm of each vehicle."""
         share, teams = partial(Column, digits=1, scale=100.0, unit=" %"), self.of_teams
         head = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
         head += [Column("minus no shield" if teams else "minus episode mode", sign="+")]
@@ -133,23 +136,23 @@ def compare_modes(
     clusters: Texts | None = None,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> ShieldModes:
-    """Compare every agent without a shield, behind a shield in episode mode, and in step mode, on the same worlds.
+    """Compare every agent without a shield, with a shield in episode mode, and in step mode, in the same worlds.
 
-    Step mode is also tried without later rollouts of the policy (``step-alert``). If several vehicles are controlled,
-    episode mode is replaced by a step mode that caps each vehicle's harm (``step-cap``). Each replaced decision of step
-    mode is simulated again without the shield. A world that cannot be advanced with one agent is left out for all, and
-    listed in ``left_out``.
+    Step mode is also tried with rollouts of the policy at the alert only (``step-alert``). For teams, which have no
+    episode mode, step mode is also tried with a cap of each vehicle's harm (``step-cap``). Each decision that step mode
+    replaced is simulated again without the replacement. If the physics fails in a world with one agent, the world is
+    left out for all agents, and ``left_out`` of each row lists it.
 
     Args:
-        agents: agents or teams by name, without a shield. They are not changed.
+        agents: agents or teams by name, without a shield. The objects themselves do not change.
         worlds: worlds at the alert.
-        task: the scenario, the controlled vehicles, and the harm that the shield bounds.
-        behind: ``agents`` have shields already. Compare the policies inside those that have an episode or step shield,
-            and ignore the others; the result is empty if there is none.
-        clusters: name of each world's cluster, [n]; None: all worlds are independent.
-        on_progress: called with an agent's name and its number of worlds done.
+        task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
+        behind: whether ``agents`` already have shields. The policies behind episode and step shields are then compared;
+            all other agents are ignored. The result is empty if no agent has such a shield.
+        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        on_progress: function that is called with an agent's name and the number of worlds that it has driven so far.
 
-    Raises ``InvalidInput`` where a shield refuses the scenario, ``PhysicsError`` where every world is left out.
+    Raises ``InvalidInput`` if a shield refuses the scenario, ``PhysicsError`` if every world is left out.
 
     """
     if behind:
@@ -174,12 +177,12 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """Results of one chunk of worlds in one mode; the optional fields exist only in step mode."""
+    """Results of one chunk of worlds in one mode. ``shielded`` and ``verdicts`` exist in step mode only."""
 
     harm: Floats  # [n] harm of the line in each world (m2/s2)
-    moving: int  # number of worlds in which something still moves at the horizon
+    moving: int  # number of worlds in which a vehicle still moves at the horizon
     shielded: Shielded | None = None  # harm, bound and replaced decisions of each vehicle
-    verdicts: Ints | None = None  # [3] number of interventions that were needed, harmless and costly
+    verdicts: Ints | None = None  # [3] numbers of interventions that were needed, harmless and costly
 
 
 def _compare(
@@ -189,9 +192,9 @@ def _compare(
     clusters: Texts | None,
     on_progress: Callable[[str, int], None] | None,
 ) -> list[ModeRow]:
-    """Return the rows of all agents and modes, with arguments as in ``compare_modes``.
+    """Return the rows of all agents and modes. The arguments are as in ``compare_modes``.
 
-    Raises ``PhysicsError`` naming the worlds that cannot be advanced.
+    Raises ``PhysicsError`` with the worlds in which the physics failed.
     """
     rows = []
     for name, agent in agents.items():
@@ -237,10 +240,10 @@ def _row(
     Args:
         agent: name of the agent.
         mode: the shield's mode.
-        parts: results of the chunks of worlds in this mode.
-        harm: mode -> harm of the agent in every world [n], to compare this mode with the others.
-        task: the scenario, the controlled vehicles, and the harm that the shield bounds.
-        clusters: name of each world's cluster, [n], or None.
+        parts: results of all chunks of worlds in this mode.
+        harm: mode -> harm of the agent in every world, [n]. The row compares its mode with the other modes.
+        task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
+        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
 
     """
 

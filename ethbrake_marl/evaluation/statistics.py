@@ -1,13 +1,12 @@
-"""Estimates with 95 % intervals, from one number per world.
+"""Means and rates with 95 % intervals, from one number per world.
 
-The worlds of a list are independent draws, and every agent is measured on the same worlds. Rates have Wilson's score
-interval, means have the t interval, and comparisons with a baseline are paired by world, so that the spread between
-easy and hard worlds cancels. Means and their errors come from exact sums, so the order of the worlds does not change a
-bit.
+The worlds of an evaluation list are independent draws, and every agent drives the same worlds. Rates have Wilson's
+score interval, means have the t interval. Comparisons with a baseline are paired by world, which removes the spread
+between easy and hard worlds. Sums are exact, so results do not depend on the order of the worlds.
 
-Worlds whose rows come from the same recording form a *cluster*: only clusters are independent of each other. Errors
-then are cluster-robust with the factor G / (G - 1) for G clusters, and t has G - 1 degrees of freedom (Cameron and
-Miller 2015, "A practitioner's guide to cluster-robust inference", Journal of Human Resources 50(2)).
+Worlds that come from the same recording form a *cluster*, and only clusters are independent of each other. Errors are
+then cluster-robust with the factor G / (G - 1) for G clusters, and t has G - 1 degrees of freedom (Cameron and Miller
+2015, "A practitioner's guide to cluster-robust inference", Journal of Human Resources 50(2)).
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ Texts = NDArray[np.str_]
 
 
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
-    """Return the exact sum of ``values`` [n], or of their products with ``others`` [n], without rounding.
+    """Return the exact sum of ``values`` [n], or of the products ``values * others``, without rounding.
 
-    A float64 is a whole number of 53 bits times a power of two. The whole numbers of each power are added as Python
-    integers, which never overflow. So neither the order of the worlds nor a division into parts changes a bit. By
-    contrast, ``math.fsum`` rounds the sum of each part. Raises ``InvalidInput`` unless all numbers are finite.
+    A float64 is a whole number of 53 bits times a power of two. The whole numbers with the same power are added as
+    Python integers, which never overflow. The result therefore does not depend on the order of the values, and sums of
+    chunks can be added without error. Raises ``InvalidInput`` unless all numbers are finite.
     """
     wholes, powers = _in_wholes(values)
     if others is not None:
@@ -44,13 +43,20 @@ def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
 
 
 def cluster_sums(values: Floats, clusters: Texts) -> dict[str, tuple[int, Fraction]]:
-    """Return the number of ``values`` [n] and their exact sum for each name in ``clusters`` [n], by this name.
+    """Return the number of values in each cluster, and their exact sum, by the cluster's name.
 
-    Raises ``InvalidInput`` unless all values are finite, and there are as many clusters as values.
+    Args:
+        values: the values, [n].
+        clusters: name of the cluster of each value, [n].
+
+    Raises ``InvalidInput`` if a value is not finite, or if the arrays have different lengths.
+
     """
     wholes, powers = _in_wholes(values)
     if clusters.shape != powers.shape:
-        raise InvalidInput(f"statistics: {len(clusters)} clusters of {len(powers)} values; one for each is needed")
+        raise InvalidInput(
+            f"statistics: clusters has {len(clusters)} entries for {len(powers)} values: must have one per value"
+        )
     names, which, counts = np.unique(clusters, return_inverse=True, return_counts=True)
     least, sums = powers.min(), np.zeros(len(names), np.object_)
     np.add.at(sums, which, wholes << (powers - least).astype(np.object_))
@@ -59,10 +65,10 @@ def cluster_sums(values: Floats, clusters: Texts) -> dict[str, tuple[int, Fracti
 
 
 def _in_wholes(values: Floats) -> tuple[NDArray[np.object_], Ints]:
-    """Return integers and powers of two, [n] each, such that ``values = integer * 2 ** power`` exactly."""
+    """Return integers [n] and exponents [n] such that ``values == integers * 2 ** exponents`` exactly."""
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or not np.isfinite(data).all():
-        raise InvalidInput(f"exact sum: shape {data.shape}; finite numbers, as [n], are needed")
+        raise InvalidInput(f"exact sum: values of shape {data.shape}: must be finite numbers of shape [n]")
     fractions, powers = np.frexp(data)
     return np.ldexp(fractions, 53).astype(np.int64).astype(np.object_), powers.astype(np.int64) - 53
 
@@ -74,7 +80,7 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number, exact sum and exact sum of squares of some values; moments of parts can be added in any order.
+    """Number, exact sum and exact sum of squares of values. Moments of chunks can be added in any order.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -85,19 +91,23 @@ class Moments:
 
     count: int = 0  # number of values
     total: Fraction = Fraction()  # sum of the values
-    squares: Fraction = Fraction()  # sum of their squares
-    # Number of negative values. If it is 0, intervals do not reach below 0. For differences (``minus``), whose signs
-    # are not known, it is the number of all values.
+    squares: Fraction = Fraction()  # sum of the squared values
+    # Number of negative values. If it is 0, intervals do not extend below 0. For differences (``minus``), whose signs
+    # are not known, it is set to the number of all values.
     negative: int = field(default=0, compare=False)
-    # Number and exact sum of the values of each cluster, by its name; empty: all values are independent.
+    # Name of a cluster -> number and exact sum of its values; empty: all values are independent.
     clusters: Mapping[str, tuple[int, Fraction]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, values: Floats, clusters: Texts | None = None) -> Moments:
-        """Return the moments (number, sum and sum of squares) of ``values`` [n].
+        """Return the moments (number, sum and sum of squares) of values.
 
-        ``clusters``: name of the cluster of each value, [n]; None: all values are independent. Raises ``InvalidInput``
-        unless all values are finite.
+        Args:
+            values: the values, [n].
+            clusters: name of the cluster of each value, [n]; None: all values are independent.
+
+        Raises ``InvalidInput`` if a value is not finite.
+
         """
         negative, sums = int(np.count_nonzero(values < 0.0)), {} if clusters is None else cluster_sums(values, clusters)
         return cls(len(values), exact_sum(values), exact_sum(values, values), negative, sums)
@@ -111,9 +121,12 @@ class Moments:
         return Moments(self.count + other.count, total, squares, negative, clusters)
 
     def minus(self, other: Moments, products: Fraction) -> Moments:
-        """Return the moments of the differences ``value - other``, paired by world.
+        """Return the moments of the differences ``value - other`` in each world.
 
-        ``products`` is the exact sum over all pairs of ``value * other`` (``exact_sum``).
+        Args:
+            other: moments of the values to subtract, in the same worlds.
+            products: exact sum over all worlds of ``value * other`` (``exact_sum``).
+
         """
         clusters = {name: (n, total - other.clusters[name][1]) for name, (n, total) in self.clusters.items()}
         squares = self.squares - 2 * products + other.squares
@@ -121,20 +134,20 @@ class Moments:
 
     @property
     def independent(self) -> int:
-        """Number of independent draws: of the clusters if there are any, else of the values."""
+        """Number of independent draws: number of clusters if there are clusters, else number of values."""
         return len(self.clusters) or self.count
 
     @property
     def mean(self) -> float:
-        """Mean of the values: exact, then rounded to a float; raises ``ZeroDivisionError`` without values."""
+        """Mean of the values, computed exactly and then rounded. Raises ``ZeroDivisionError`` without values."""
         return float(self.total / self.count)
 
     @property
     def standard_error(self) -> float:
-        """Standard error of the mean, ``s / sqrt(n)`` with n - 1 degrees of freedom.
+        """Standard error of the mean, ``s / sqrt(n)``, where s is the standard deviation with n - 1 degrees of freedom.
 
-        With G clusters, ``sqrt(G / (G - 1) * sum(sum of deviations in the cluster ** 2)) / n``. Raises
-        ``ZeroDivisionError`` for fewer than two values or clusters.
+        With G clusters it is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where D_g is the sum of the deviations from
+        the mean in cluster g. Raises ``ZeroDivisionError`` for fewer than two values or clusters.
         """
         n = self.count
         if self.clusters:
@@ -144,22 +157,20 @@ class Moments:
 
     @property
     def estimate(self) -> Estimate:
-        """Mean with the interval ``mean -+ t s / sqrt(n)``, as the function ``mean`` returns it.
-
-        Raises ``ZeroDivisionError`` without values.
-        """
+        """Mean with its t interval (see the function ``mean``). Raises ``ZeroDivisionError`` without values."""
         estimate = self._around(self.mean, self.standard_error if self.independent > 1 else 0.0)
         return estimate if self.negative else of_amounts(estimate, nothing=not self.squares)
 
     @property
     def share(self) -> Estimate:
-        """Mean of values that are 0 or 1, with Wilson's interval (``rate``).
+        """Mean p of values that are 0 or 1, with Wilson's interval (``rate``).
 
-        With clusters it is the interval of as many independent draws as would have this standard error,
-        ``1 + p (1 - p) / error ** 2``, but at most all and, where all values agree, one for each cluster; times
-        ``(z / t) ** 2``, because the error has G - 1 degrees of freedom (Korn and Graubard 1998, "Confidence intervals
-        for proportions with small expected number of positive counts estimated from survey data", Survey Methodology
-        24). There is no interval for a single cluster.
+        With G clusters, Wilson's interval is computed for an effective number of independent draws. This is the number
+        with which independent draws would have the same standard error, ``1 + p (1 - p) / error ** 2``, but at most the
+        number of values; if all values agree, it is G. It is multiplied by ``(z / t) ** 2``, because the standard error
+        has G - 1 degrees of freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected
+        number of positive counts estimated from survey data", Survey Methodology 24). There is no interval for a single
+        cluster.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -175,13 +186,13 @@ class Moments:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
         The residuals ``values - r * others`` have mean 0, so the error is
-        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. With x the values, y the others, sums S and sums of products
-        Q, its square is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``. With clusters, their sums take
-        the place of the values.
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. Its square is
+        ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where x are the values, y the others, Sx and Sy
+        their sums, and Qxx, Qxy and Qyy the sums of products. With clusters, x and y are the sums of the clusters.
 
         Args:
             others: moments of the denominator, in the same worlds.
-            products: exact sum over all pairs of ``value * other``.
+            products: exact sum over all worlds of ``value * other``.
 
         """
         n, x, y, xx, yy = self.independent, self.total, others.total, self.squares, others.squares
@@ -198,7 +209,7 @@ class Moments:
 
         Args:
             baseline: moments of the baseline, in the same worlds.
-            products: exact sum over all pairs of ``value * baseline``.
+            products: exact sum over all worlds of ``value * baseline``.
 
         """
         if baseline.total == 0:
@@ -207,9 +218,9 @@ class Moments:
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return the estimate ``value`` with the interval ``value -+ t error``; no interval for a single draw.
+        """Return ``value`` with the interval ``value -+ t error``, or without an interval for a single draw.
 
-        ``error`` is the standard error; t has one degree of freedom less than there are independent draws.
+        ``error`` is the standard error. The degrees of freedom of t are the number of independent draws minus 1.
         """
         if self.independent < 2:
             return Estimate(value, None)
@@ -218,12 +229,12 @@ class Moments:
 
 
 def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
-    """Return an estimate of a mean of non-negative values, with its interval cut off below 0.
+    """Return the estimate of a mean of non-negative values, with an interval that does not extend below 0.
 
     Args:
         estimate: the estimate with the usual interval.
-        nothing: whether all values are 0. Then there is no interval, because such a sample bounds the share of worlds
-            with other values (see ``rate``), but not their mean.
+        nothing: whether all values are 0. If so, the result has no interval: the sample shows that other values are
+            rare, but not how large they are.
 
     """
     if nothing or estimate.interval is None:
@@ -232,19 +243,22 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
 
 def root(number: Fraction) -> float:
-    """Return the square root of ``number`` >= 0 as a float, even if ``number`` itself is too large for a float."""
+    """Return the square root of ``number`` (at least 0) as a float, even if ``number`` is too large for a float."""
     shift = (number.numerator.bit_length() - number.denominator.bit_length()) // 2
     return math.ldexp(math.sqrt(number / Fraction(4) ** shift), shift)
 
 
 def rate(successes: int, count: int) -> Estimate:
-    """Return the share ``p = successes / count`` with Wilson's score interval, which stays inside [0, 1].
+    """Return the share ``p = successes / count`` with Wilson's score interval, which lies within [0, 1].
 
-    With z the normal quantile: centre ``(p + z^2/2n) / (1 + z^2/n)``, half-width
-    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``. Raises ``InvalidInput`` unless 0 <= successes <= count >= 1.
+    The interval has the centre ``(p + z^2/2n) / (1 + z^2/n)`` and the half-width
+    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``, where n is the count and z the normal quantile. Raises
+    ``InvalidInput`` unless 0 <= successes <= count and count >= 1.
     """
     if not (count >= 1 and 0 <= successes <= count):
-        raise InvalidInput(f"rate: {successes} of {count}: must be 0 <= successes <= count, and count at least 1")
+        raise InvalidInput(
+            f"rate: successes = {successes}, count = {count}: must be 0 <= successes <= count, and count at least 1"
+        )
     return Estimate(successes / count, wilson(successes / count, count))
 
 
@@ -252,8 +266,8 @@ def wilson(p: float, count: float) -> tuple[float, float]:
     """Return the ends (low, high) of Wilson's 95 % score interval of a share.
 
     Args:
-        p: observed share, 0 to 1; ``p * count`` need not be a whole number.
-        count: number of independent draws, not necessarily whole.
+        p: observed share, 0 to 1. ``p * count`` need not be a whole number.
+        count: number of independent draws, not necessarily a whole number.
 
     """
     z = float(ndtri(_UPPER))
@@ -266,20 +280,28 @@ def wilson(p: float, count: float) -> tuple[float, float]:
 
 
 def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
-    """Return the mean of ``values`` [n] with the interval ``mean -+ t s / sqrt(n)``; t has n - 1 degrees of freedom.
+    """Return the mean of values with the interval ``mean -+ t s / sqrt(n)``; t has n - 1 degrees of freedom.
 
-    With thousands of worlds, the mean is nearly normal whatever the distribution of harm, and the interval equals the
-    bootstrap's. If no value is negative, the interval starts at 0 or above; if all are 0, there is no interval.
-    ``clusters``: name of the cluster of each value, [n]; None: all are independent. Raises ``InvalidInput`` when
-    ``values`` is empty or not finite.
+    The interval assumes that the mean is normally distributed, which is nearly true for thousands of worlds. If no
+    value is negative, the interval does not extend below 0. If all values are 0, there is no interval.
+
+    Args:
+        values: the values, [n].
+        clusters: name of the cluster of each value, [n]; None: all values are independent.
+
+    Raises ``InvalidInput`` if ``values`` is empty or not finite.
+
     """
     return Moments.of(check(values), clusters).estimate
 
 
 def share_of(truths: Bools, clusters: Texts | None = None) -> Estimate:
-    """Return the share of ``truths`` [n] that are true, with the interval of ``Moments.share``.
+    """Return the fraction of true values, with the interval of ``Moments.share``.
 
-    ``clusters``: name of the cluster of each value, [n]; None: all are independent.
+    Args:
+        truths: the values, [n].
+        clusters: name of the cluster of each value, [n]; None: all values are independent.
+
     """
     return Moments.of(check(truths), clusters).share
 
@@ -287,9 +309,13 @@ def share_of(truths: Bools, clusters: Texts | None = None) -> Estimate:
 def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None = None) -> Estimate:
     """Return the mean of ``values - baseline`` with its t interval.
 
-    ``values`` and ``baseline`` are [n] each, in the same worlds, as are ``clusters``, the name of each world's cluster;
-    None: all worlds are independent. Raises ``InvalidInput`` if their lengths differ, or if they are empty or not
-    finite.
+    Args:
+        values: the values, [n].
+        baseline: the values to subtract, in the same worlds, [n].
+        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+
+    Raises ``InvalidInput`` if the lengths differ, or if an array is empty or not finite.
+
     """
     data, reference, products = _check_pair(values, baseline, clusters)
     return data.minus(reference, products).estimate
@@ -298,15 +324,16 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
     """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    The half-width of each mean's t interval, divided by its t quantile, is its standard error (``s1``, ``s2``). The
-    difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
-    degrees of freedom. There is no interval if one of the two means has none.
+    The standard errors s1 and s2 of the two means are the half-widths of their t intervals, divided by the t quantiles.
+    The difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with
+    ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two means has no interval, the
+    difference has none either.
 
     Args:
         value: first mean with its interval.
-        n: number of its worlds, or of the clusters of worlds that its interval is by.
+        n: number of worlds of the first mean; with clusters, number of its clusters.
         baseline: second mean with its interval.
-        m: number of its worlds or clusters.
+        m: number of worlds of the second mean; with clusters, number of its clusters.
 
     """
     difference = value.value - baseline.value
@@ -326,30 +353,37 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
 
 
 def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None = None) -> Estimate | None:
-    """Return ``1 - mean(values) / mean(baseline)`` of two arrays [n] in the same worlds, with its interval.
+    """Return ``1 - mean(values) / mean(baseline)`` with its interval by the delta method (``Moments.ratio_error``).
 
-    ``clusters``: name of the cluster of each world, [n]; None: all worlds are independent.
+    Args:
+        values: the values, [n].
+        baseline: values of the baseline in the same worlds, [n].
+        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
 
-    Returns None if the baseline's mean is 0. Interval by the delta method: with ``r`` the ratio of the means, the
-    residuals ``values - r baseline`` have mean 0 and the standard error of r is
-    ``s_residual / (sqrt(n) mean(baseline))``.
+    Returns None if the baseline's mean is 0. Raises ``InvalidInput`` if the lengths differ, or if an array is empty or
+    not finite.
+
     """
     data, reference, products = _check_pair(values, baseline, clusters)
     return data.decrease(reference, products)
 
 
 def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
-    """Return ``values`` as a float array [n]; raise ``InvalidInput`` unless it is one-dimensional, not empty, finite.
+    """Return ``values`` as an array of floats, [n].
 
     Args:
         values: the numbers.
-        who: name of the caller, for the message.
-        each: what each number belongs to, for the message: ``world`` or ``seed``.
+        who: name of the calling function, for the message.
+        each: what each number belongs to (``world`` or ``seed``), for the message.
+
+    Raises ``InvalidInput`` unless the array is one-dimensional, not empty and finite.
 
     """
     data = np.asarray(values, np.float64)
     if data.ndim != 1 or len(data) < 1 or not np.isfinite(data).all():
-        raise InvalidInput(f"{who}: shape {data.shape}; at least one finite number per {each} is needed, as [n]")
+        raise InvalidInput(
+            f"{who}: values of shape {data.shape}: must be one finite number per {each}, shape [n] with n at least 1"
+        )
     return data
 
 
@@ -357,5 +391,7 @@ def _check_pair(values: Floats, baseline: Floats, clusters: Texts | None) -> tup
     """Return the moments of ``values`` and of ``baseline``, and the exact sum of their products."""
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
-        raise InvalidInput(f"statistics: {len(data)} values cannot be paired with {len(reference)} of the baseline")
+        raise InvalidInput(
+            f"statistics: {len(data)} values and {len(reference)} values of the baseline: must be equally many"
+        )
     return Moments.of(data, clusters), Moments.of(reference, clusters), exact_sum(data, reference)

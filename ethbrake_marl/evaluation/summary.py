@@ -1,4 +1,4 @@
-"""The table of an evaluation: one row per agent, for a terminal, a document and a notebook."""
+"""Results table of an evaluation, with one row per agent, for a terminal, a document or a notebook."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.files.sheet import Column, Row, Sheet, Shown, terminal_text
 
 _HEAD = {
-    "Agent": "The agent that controls the vehicle; all other vehicles follow the scenario. full_brake is the paper's"
-    " non-ethical strategy (Non-E). e_v2x_bm is the best constant deceleration in this simulation;"
-    " e_v2x_bm:pairwise is the paper's closed form, which treats the pairs as independent.",
+    "Agent": "The agent that controls the vehicle. All other vehicles follow the scripts of the scenario. full_brake is"
+    " the paper's non-ethical strategy (Non-E). e_v2x_bm brakes with the constant deceleration that is best in this"
+    " simulation; e_v2x_bm:pairwise uses the paper's closed form, which treats the pairs as independent.",
     "Knows": "What the agent must know about the line. own sensors: its own vehicle and what its sensors see. messages:"
-    " also the messages that have reached it. true state: the others' states, capacities and latencies as they are,"
-    " received or not. true model: also masses, restitution and scripts, enough to simulate the line ahead. Of a policy"
-    " behind a shield or +search both parts are listed. † marks agents that see through a channel that hides"
-    " something here.",
+    " also the messages that have reached it. true state: the true states, capacities and latencies of all vehicles,"
+    " even if no message contained them. true model: also masses, restitution and scripts, so that the agent can"
+    " simulate the line. For a policy behind a shield or +search, the knowledge of both is listed. † marks omniscient"
+    " agents: they read values that the V2X channel hides in these worlds.",
 }
 
-# Columns that a narrow terminal shows, in addition to the ``narrow`` columns of the last set that has values for them.
+# Measures that a narrow terminal always shows. It also shows ``narrow`` of the last set of measures that has values.
 _ALWAYS_SHOWN = ("collision_rate", "first_impact_harm", "total_harm", "sampled_harm", "vehicle_1_shoved_m")
 
 _BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # measures whose intervals a terminal shows
@@ -38,17 +38,19 @@ _BELOW = ("collision_rate", "first_impact_harm", "total_harm")  # measures whose
 
 @dataclass(frozen=True, slots=True)
 class RowsBeside:
-    """Rows from another source, such as the paper, to print below the rows of our own agents."""
+    """Rows from another source, such as the paper, to print below the rows of the evaluated agents."""
 
-    # A row is a pair (name, measure's name -> text of the cell); a plain text is the heading of a section.
+    # A row is a pair (name, texts of the cells by the measure's name). A plain text is the heading of the next rows.
     rows: Sequence[str | tuple[str, Mapping[str, str]]]
     notes: Sequence[Note]  # notes about these rows, to print below the table
 
 
 class SummaryTable(list[SummaryRow]):
-    """Results table of an evaluation: a list of one row per agent, which ``print`` and a notebook show as a table.
+    """List with one row per agent, which ``print`` and notebooks show as a results table.
 
-    ``beside``: rows from another source to print below; None: no such rows.
+    Args:
+        rows: results of each agent.
+        beside: rows from another source to print below; None: no such rows.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -83,10 +85,10 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in shown).html()
 
     def meanings(self) -> dict[str, str]:
-        """Return the explanations of the columns: heading (up to a comma) -> text.
+        """Return the explanations of the columns: heading of the column -> text.
 
-        Columns with the same beginning, such as "Decrease, total" and "Decrease, first-impact", share one. Measures
-        that the user registered come last, by their names.
+        Columns whose headings agree up to a comma, such as "Decrease, total" and "Decrease, first-impact", have one
+        common explanation under the heading "Decrease". Measures that the user registered come last.
         """
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []
@@ -95,8 +97,8 @@ class SummaryTable(list[SummaryRow]):
     def sheet(self) -> Sheet:
         """Return the table with all columns: agent, its knowledge, and every measure that has a heading.
 
-        Measures that the user registered come last. Means that are only lower bounds (``SummaryRow.bounds``) are marked
-        ``≥``. Rows from other sources stand below.
+        Measures that the user registered come last. Means that are lower bounds of the true means
+        (``SummaryRow.bounds``) are marked ``≥``. Rows from other sources follow below the agents.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -120,9 +122,9 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], lines)
 
     def terminal(self) -> Sheet:
-        """Return the table to print in a terminal of 80 columns or more.
+        """Return the table for a terminal with at least 80 columns.
 
-        Below it stand rows from other sources, and a text about worlds, intervals and other notes.
+        It ends with rows from other sources, and a text about the worlds, the intervals and other notes.
         """
         narrow = self._narrow()
         columns = [
@@ -137,10 +139,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Return the names of the measures that a narrow terminal shows.
-
-        These are the usual ones, and the ``narrow`` measures of the last set of measures that has values for them.
-        """
+        """Return the names of the measures that a narrow terminal shows."""
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
@@ -148,30 +147,30 @@ class SummaryTable(list[SummaryRow]):
         return (*_ALWAYS_SHOWN, *last)
 
     def tables(self) -> list[Sheet]:
-        """Return the tables to print: ``terminal`` and, if the user registered measures, a second one with these."""
+        """Return the tables to print, which are ``terminal()`` and, if there are any, the measures of the user."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]
 
     def markdown(self) -> str:
-        """Return the table as Markdown, with a text about worlds, intervals and other notes below it."""
+        """Return the table as Markdown, followed by a text about the worlds, the intervals and other notes."""
         return f"{self.sheet().markdown()}\n\n{self._conditions()}\n"
 
     def _conditions(self) -> str:
         if not self:
             return ""
         ours = (
-            f"Ours: {self[0].parameters.line}. Harms are means per world in m²/s²; in brackets or"
-            " below a value: its 95 % interval; decreases are relative to full braking."
+            f"Ours: {self[0].parameters.line}. Harms are means per world in m²/s². The 95 % interval of a value is in"
+            " brackets or below the value. A decrease is relative to full braking."
         )
         return "\n\n".join([ours, *(text for _, text in self.notes())])
 
     def to_pandas(self) -> Any:
-        """Return a pandas ``DataFrame`` with one row per agent, whose index is the agent's name.
+        """Return a pandas ``DataFrame`` with one row per agent; the index is the agent's name.
 
-        Column ``x`` is the value of measure ``x`` of the JSON results, in the unit that it has there; ``x_low`` and
-        ``x_high`` are the ends of its 95 % interval. NaN stands for a missing number. Raises ``MissingExtra`` if pandas
-        is not installed.
+        The columns are the measures of the JSON results, with the same names and units. For a measure ``x``, the
+        columns ``x_low`` and ``x_high`` are the ends of its 95 % interval. A missing number is NaN. Raises
+        ``MissingExtra`` if pandas is not installed.
         """
         with naming_extras():
             from pandas import DataFrame, Index
@@ -186,9 +185,9 @@ class SummaryTable(list[SummaryRow]):
         return DataFrame(columns, index=Index([row.agent for row in self], name="agent"), dtype=float)
 
     def notes(self) -> list[Note]:
-        """Return the notes to print below the table: those about the agents, then those about rows of other sources.
+        """Return the notes to print below the table: notes about the agents, then notes about rows of other sources.
 
-        Each is a pair: kind (``note`` or ``quiet``) and text.
+        Each note is a pair: kind (``note`` or ``quiet``) and text.
         """
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
@@ -198,7 +197,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
 
     Args:
         evaluation: outcomes of the agents, from ``evaluate``.
-        baseline: name of the agent to compare with; comparisons are missing if it was not evaluated.
+        baseline: name of the agent to compare with. If it was not evaluated, the table has no comparisons.
 
     """
     contexts = contexts_of(evaluation)
@@ -227,16 +226,16 @@ def summarise_sums(
     baseline: str = BASELINE,
     **shared: Any,
 ) -> SummaryTable:
-    """Return the results table, one row per agent, from sums of the measures over the worlds of a list.
+    """Return the results table, one row per agent, computed from sums of the measures over all worlds.
 
     Args:
-        tallies: name of the agent -> sums of its measures.
+        tallies: name of an agent -> sums of its measures.
         conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
-        contexts: name of a set of measures -> what it prepared for these worlds (``contexts_of``).
-        knows: name of the agent -> its statement of what it knows about the line.
-        policies: name of the agent -> vehicle's name -> SHA-256 of its policy.
+        contexts: name of a set of measures -> context that the set prepared for these worlds (``contexts_of``).
+        knows: name of an agent -> what the agent says that it knows about the line.
+        policies: name of an agent -> SHA-256 of the policy of each vehicle, by the vehicle's name.
         baseline: name of the agent to compare with.
-        shared: fields of ``SummaryRow`` with the same value in all rows, such as ``worlds_sha256``.
+        shared: fields of ``SummaryRow`` that are equal in all rows, such as ``worlds_sha256``.
 
     """
     worlds = conditions["count"]

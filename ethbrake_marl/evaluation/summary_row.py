@@ -1,4 +1,4 @@
-"""One agent's row of a results table: the estimate of every measure, and how it was computed."""
+"""Row of a results table: the estimates of all measures of one agent, and the conditions of the evaluation."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from ethbrake_marl.files.sheet import Estimate
 
 @dataclass(frozen=True, slots=True)
 class SummaryRow:
-    """Results of one agent over a list of worlds; harms are means per world, m2/s2.
+    """Results of one agent over all worlds of an evaluation. Harms are means per world, m2/s2.
 
-    ``row["harm_decrease_total"]`` is the estimate of the measure with this name in JSON; None if it does not exist.
+    ``row["harm_decrease_total"]`` is the estimate of the measure that has this name in JSON, or None if the measure is
+    not defined in these worlds.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -34,42 +35,45 @@ class SummaryRow:
     episodes: int  # number of worlds
     estimates: Mapping[str, Estimate | None]  # value and 95 % interval of every measure, by its name in JSON
     collisions: int  # number of worlds with at least one impact
-    horizon_ends: int  # number of worlds in which something still moves at the horizon
+    horizon_ends: int  # number of worlds in which a vehicle still moves at the horizon
     parameters: Conditions  # scenario, seed, controlled vehicles and quantities of the worlds
-    # Share of worlds in which the policy behind a shield drove to the end (``Outcome.chosen_policy``); None: no shield.
+    # Fraction of worlds in which ``Outcome.chosen_policy`` is true; None: the agent has no shield.
     policy_share: float | None = None
-    # Fields that sets of measures add to the JSON object, by name of the set (``MeasureSet.row``).
+    # Name of a set of measures -> fields that the set adds to the JSON object (``MeasureSet.row``).
     more: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    bounds: frozenset[str] = frozenset()  # names of measures whose means are only lower bounds
-    left_out: tuple[LeftOut, ...] = ()  # worlds of the list that could not be advanced; no row counts them
-    knows: Knowledge = UNSTATED  # the agent's statement of what it knows about the line
-    hidden_share: float = 0.0  # share of worlds in which the channel hides something from a controlled vehicle
-    worlds_sha256: str = ""  # hash of the worlds; the same for results on the same worlds
+    bounds: frozenset[str] = frozenset()  # names of measures whose means are lower bounds of the true means
+    left_out: tuple[LeftOut, ...] = ()  # worlds left out because the simulation failed; no number counts them
+    knows: Knowledge = UNSTATED  # what the agent says that it knows about the line
+    hidden_share: float = 0.0  # fraction of worlds in which the V2X channel hides something from a controlled vehicle
+    worlds_sha256: str = ""  # hash of the worlds; equal for results on the same worlds
     scenario_sha256: str = ""  # hash of everything in the scenario that affects an episode
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
-    versions: Mapping[str, str] = field(default_factory=dict)  # package -> version that computed the result
+    versions: Mapping[str, str] = field(default_factory=dict)  # name of a package -> version that computed the result
 
     def __getitem__(self, measure: str) -> Estimate | None:
         return self.estimates[measure]
 
     @property
     def collision_rate(self) -> Estimate:
-        """Share, 0 to 1, of worlds with at least one impact."""
+        """Fraction (0 to 1) of worlds with at least one impact."""
         return self.estimates["collision_rate"]  # type: ignore[return-value]  # every agent has it in every world
 
     @property
     def first_impact_harm(self) -> Estimate:
-        """Mean harm per world, counting only each pair's first impact (m2/s2)."""
+        """Mean first-impact harm per world (m2/s2)."""
         return self.estimates["first_impact_harm"]  # type: ignore[return-value]  # all have it in all worlds
 
     @property
     def total_harm(self) -> Estimate:
-        """Mean harm per world, counting every impact (m2/s2)."""
+        """Mean total harm per world (m2/s2)."""
         return self.estimates["total_harm"]  # type: ignore[return-value]  # all have it in all worlds
 
     @property
     def metrics(self) -> dict[str, Estimate]:
-        """Estimates of the measures that the user registered, by column; a measure by vehicle has ``NAME_1``, ..."""
+        """Estimates of the measures that the user registered, by name.
+
+        A measure with one value per vehicle has the names ``NAME_1``, ``NAME_2`` and so on.
+        """
         registered = {
             name.removeprefix(COLUMN): each for name, each in self.estimates.items() if name.startswith(COLUMN)
         }
@@ -77,22 +81,22 @@ class SummaryRow:
 
     @property
     def sees_through(self) -> bool:
-        """Whether the agent knows something that the V2X channel hides in these worlds."""
+        """Whether the agent is omniscient: it reads values that the V2X channel hides in these worlds."""
         return self.hidden_share > 0.0 and self.knows.sees_through
 
     @property
     def exploits(self) -> Exploits:
-        """How far the agent shoves Vehicle 1, and how often it still moves at the horizon; harm counts neither."""
+        """Behaviour of the agent that harm does not count: shoving Vehicle 1, and moving at the horizon."""
         shoved = self.estimates["vehicle_1_shoved_m"]
         return Exploits(None if shoved is None else shoved.value, self.horizon_ends / self.episodes)
 
     @property
     def marked(self) -> str:
-        """Name of the agent, followed by ‡ if its behaviour does damage that harm does not count (``exploits``)."""
+        """Name of the agent, followed by ‡ if it has exploits."""
         return f"{self.agent} {MARK}" if self.exploits.names else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return the agent's object in JSON results; missing values are null, intervals are ``[low, high]``."""
+        """Return the agent's object in JSON results. Missing values are null; intervals are ``[low, high]``."""
         registered = RegisteredMeasures(n.removeprefix(COLUMN) for n in self.estimates if n.startswith(COLUMN))
         more: dict[str, Any] = {}
         for name, each in MEASURE_SETS.items():
@@ -121,10 +125,7 @@ class SummaryRow:
         }
 
     def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
-        """Return the estimates of one set of measures as JSON entries, values and intervals side by side.
-
-        For instance ``{"total_harm": 37.0, "total_harm_interval": [30.1, 43.9]}``.
-        """
+        """Return JSON entries of a set of measures, such as ``{"total_harm": 37, "total_harm_interval": [30, 44]}``."""
         there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
         optional = {measure.name for measure in of.measures if not measure.always}
         return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})

@@ -1,4 +1,4 @@
-"""Sums of all agents' measures over some worlds of a list; sums of chunks can be added in any order, bit for bit."""
+"""Sums of all agents' measures over a chunk of worlds. Sums of chunks can be added in any order with equal results."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from ethbrake_marl.evaluation.rescores import Rescored, Rescores
 from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.scenario.fields import QUANTITY
 
-Range = tuple[float, float]
+Range = tuple[float, float]  # smallest and largest value
 
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Statistics of all agents in some worlds of a list. ``+`` adds those of other worlds of the same list."""
+    """Sums of all agents' measures over some worlds of an evaluation list. ``+`` adds the sums over other worlds."""
 
-    worlds: int = 0  # number of worlds, without those left out
+    worlds: int = 0  # number of worlds, without left-out worlds
     hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle
     worlds_hash: int = 0  # ``hash_of_chunks`` of the worlds
-    # Smallest and largest value of every quantity, one pair for each vehicle, pair or world, by the quantity's key.
+    # Key of a quantity -> smallest and largest value for each vehicle or pair, or for the whole world.
     ranges: Mapping[str, tuple[Range, ...]] = field(default_factory=dict)
-    recordings: frozenset[str] = frozenset()  # recordings that the worlds come from (``clusters_of``)
-    rejected: int = 0  # number of draws that were rejected for an early impact
-    left_out: tuple[LeftOut, ...] = ()  # worlds that failed with some agent; nothing else counts them
-    agents: Mapping[str, AgentTally] = field(default_factory=dict)  # sums of each agent's measures, by name
-    # ``MeasureSet.because_key`` -> why that set of measures does not apply; None if it applies.
+    recordings: frozenset[str] = frozenset()  # names of the recordings that the worlds come from (``clusters_of``)
+    rejected: int = 0  # number of drawn worlds that were rejected because of an early impact
+    left_out: tuple[LeftOut, ...] = ()  # worlds that could not be simulated with some agent; no sum contains them
+    agents: Mapping[str, AgentTally] = field(default_factory=dict)  # name of an agent -> sums of its measures
+    # ``MeasureSet.because_key`` -> why the set of measures does not apply; None if the set applies.
     silent: Mapping[str, str | None] = field(default_factory=dict)
 
     @classmethod
     def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
-        """Return the statistics of an evaluation of a part of a list.
+        """Return the sums over the worlds of an evaluation.
 
         Args:
-            part: outcomes of the agents.
-            objectives: objectives such as ``"social:45"``, which weigh a vehicle's own harm against the others'. Also
-                sum the harm that each vehicle bears, and its value under each objective; None: neither.
-            long_list: omit sets of measures that do not apply to lists of more than 100,000 worlds.
+            part: outcomes of the agents in a chunk of worlds.
+            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). With a list, even an empty one, the
+                sums include the harm that each vehicle bears, and its value under each of these objectives.
+            long_list: omit sets of measures that do not apply to more than 100,000 worlds.
 
         """
         worlds = part.worlds
@@ -84,11 +84,10 @@ class Tally:
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
-        """Return the mean value of every agent under each objective, for each vehicle and both counts of harm.
+        """Return the mean value of each objective, for every agent, each vehicle and both counts of harm.
 
         Args:
-            objectives: objectives that the tally was computed with, such as ``social:45``, which weighs a vehicle's own
-                harm against the others'.
+            objectives: objectives such as ``social:45``; the tally must have been computed with these objectives.
             vehicles: number of vehicles, N.
 
         """

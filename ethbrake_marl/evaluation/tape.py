@@ -1,4 +1,4 @@
-"""``Tape``: recorder of the steps of a batch of episodes, and of every impact in them."""
+"""``Tape``: recorder of all steps and impacts of a batch of episodes."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Tape:
-    """Recorder of a batch of running episodes; the engine calls ``see`` after each step (protocol ``Watch``).
+    """Recorder of all impacts, and optionally all steps, of a batch of episodes. ``see`` is called after each step.
 
     Args:
         worlds: the n worlds at the alert.
-        steps: also record every step; False: only the impacts.
+        steps: record every step in addition to the impacts.
 
     """
 
     def __init__(self, worlds: Worlds, *, steps: bool = True) -> None:
-        self.worlds = worlds  # the worlds at the alert
-        # Each step: the worlds at its beginning, commands [n, N] in m/s2, time [n] in s at which it ends.
+        self.worlds = worlds
+        # For each step: worlds at its beginning, commands [n, N] (m/s2), time at which the step ends [n] (s).
         self.steps: list[tuple[Worlds, Floats, Floats]] = []
         self._keeps_steps = steps
         self._rows: list[ImpactRows] = []
@@ -30,16 +30,16 @@ class Tape:
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: [n, N] commanded accelerations during the step.
-            until_s: [n] time at which the step ends; equal to the beginning if the world's episode has ended.
+            command_mps2: commanded accelerations during the step, [n, N].
+            until_s: time at which the step ends, [n]; where the episode has ended, the time of its end.
 
         """
         moving = until_s > before.time_s
-        some = np.flatnonzero(moving | (before.time_s == self.worlds.time_s))  # an impact at the very alert
+        some = np.flatnonzero(moving | (before.time_s == self.worlds.time_s))  # includes impacts at the alert itself
         self._rows.append(impacts_within(before, command_mps2, until_s, some))
         if self._keeps_steps:
             self.steps.append((before, command_mps2, until_s))
 
     def episodes(self) -> EpisodeImpacts:
-        """Return all impacts so far, by world and in order of time, with the worlds at the alert."""
+        """Return all impacts so far, ordered by world and time, together with the worlds at the alert."""
         return EpisodeImpacts.of(self.worlds.take(np.arange(self.worlds.n)), self._rows)

@@ -1,4 +1,4 @@
-"""Trial of a scenario before use: whether its scripts can drive, and how often something unusual happens."""
+"""Try a scenario before use: check that its scripts can drive, and count worlds in which something unusual happens."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from ethbrake_marl.scenario.catalogue import load_scenario, scenario_path
 from ethbrake_marl.scenario.roles import ScriptSpec
 from ethbrake_marl.scenario.schema import Scenario
 
-TRIED_CANDIDATES = 16  # number of candidates of a script that searches, when a scenario is only checked
+TRIED_CANDIDATES = 16  # number of candidates of a searching script while a scenario is checked
 
 
 def load_runnable(
     name_or_path: str, settings: Sequence[Override] = (), *, drives: Literal["nobody", "one", "some"] = "nobody"
 ) -> Scenario:
-    """Load a scenario, and try its scripts in one world, because reading the file does not show whether they can drive.
+    """Load a scenario, and let each of its scripts decide once in one world, to find errors in the scripts.
 
     Args:
         name_or_path: name of a scenario, or path of a YAML file.
         settings: settings ``KEY=VALUE`` that override values of the file.
         drives: number of learners that the scenario must have: exactly one (``one``), at least one (``some``), or any
-            number, also none (``nobody``).
+            number (``nobody``).
 
-    Raises ``InvalidInput`` naming file, line, role and script if no agent can play the script, and if the number of
-    learners does not fit ``drives``.
+    Raises ``InvalidInput`` if a script does not work (the message names file, line, vehicle and script), or if the
+    number of learners does not fit ``drives``.
 
     """
     scenario = load_scenario(name_or_path)
@@ -58,27 +58,33 @@ def load_runnable(
             raise InvalidInput(f"{where}: roles.{role} = {script}: {error}") from None
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
     if drives == "one":
-        check_one_learner(scenario.name, learners, "give the others a script: --set roles.vehicle_3=full_brake")
+        check_one_learner(
+            scenario.name, learners, "exactly one is needed; set roles, for instance --set roles.vehicle_3=full_brake"
+        )
     elif drives == "some" and not learners:
         raise InvalidInput(
-            f"scenario {scenario.name!r} has no learner to drive; give the scenario that the agents were trained for"
-            " (--scenario), or say which vehicle is controlled, for instance --set roles.vehicle_2=learner"
+            f"scenario {scenario.name!r} has no learner that the agents could drive; choose the scenario that the"
+            " agents were trained for (--scenario), or make a vehicle a learner, for instance"
+            " --set roles.vehicle_2=learner"
         )
     return scenario
 
 
 def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
-    """Drive ``worlds`` of a scenario to their ends, and count those in which something unusual happens.
+    """Simulate ``worlds`` of a scenario, and count the worlds in which something unusual happens.
 
-    The scripts drive (with few candidates if they search); learners brake fully. The result has the keys:
+    Learners brake fully; the other vehicles follow their scripts. Searching scripts try few candidates. The result has
+    these keys:
 
-    - ``early_impacts``, ``moving_at_horizon``, ``vehicle_1_late``: number of worlds with an impact before a learner may
-      act, with something moving at the horizon, and with a latency of Vehicle 1;
-    - ``commands_out_of_range``: vehicle -> row -> message, for commands beyond the vehicle's capacities;
-    - ``not_state_free``: vehicle -> script that depends on the state;
-    - ``refused_by``: agent, shield or setting that refuses such scripts -> message.
+    - ``early_impacts``: number of worlds with an impact before a learner may act;
+    - ``moving_at_horizon``: number of worlds in which a vehicle still moves at the horizon;
+    - ``vehicle_1_late``: number of worlds in which Vehicle 1 has a latency;
+    - ``commands_out_of_range``: name of a vehicle -> row of a world -> error message, where a script commanded more
+      than the vehicle's capacity;
+    - ``not_state_free``: name of a vehicle -> its script, for scripts that react to the state of the world;
+    - ``refused_by``: name of an agent, shield or setting that refuses such scripts -> error message.
 
-    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds that cannot be advanced.
+    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds in which the physics fails.
     """
     searches = {
         scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
@@ -124,9 +130,9 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Return why agents, shields and settings refuse the scenario: agent's spec, ``+SHIELD`` or setting -> message.
+    """Try all agents, shields and settings on ``worlds``, and return the error messages where one fails.
 
-    Each of them is actually tried on ``worlds``.
+    The keys of the result are specs of agents, ``+SHIELD`` for shields, and names of settings.
     """
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:

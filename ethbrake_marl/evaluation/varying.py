@@ -1,4 +1,4 @@
-"""Initial states of worlds as table rows, and the quantities that differ between worlds."""
+"""Initial states of worlds as rows of a table, and the quantities that differ between worlds."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None]]:
-    """Return the initial state of each world as column -> value: ``{"gap_1_m": 6.6, "speed_1_mps": 19.0, ...}``.
+    """Return the initial state of each world by column, such as ``{"gap_1_m": 6.6, "speed_1_mps": 19.0}``.
 
-    The columns are all gaps and speeds, and every other quantity that the scenario does not fix. The distance to an
-    obstacle is None in worlds without one.
+    The columns are all gaps and speeds, and every other quantity that the scenario does not fix. In a world without an
+    obstacle, the distance to the obstacle is None.
     """
     fixed = {
         rule.column_of(i)
@@ -32,15 +32,16 @@ def states_of(worlds: Worlds, scenario: Scenario) -> list[dict[str, float | None
     ]
 
 
-_LONGEST_OWNERS = 30  # longest list of vehicle or pair names, in characters
+_LONGEST_OWNERS = 30  # longest text of vehicle or pair names, in characters
 
 
 def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Floats]]:
-    """Return the values of every quantity that varies: ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``.
+    """Return the values of every quantity that differs between worlds.
 
-    The result maps the key of a quantity to its groups, and each group's name to values [n, entries]. A group consists
-    of the vehicles (or pairs) for which the scenario declares the same smallest and largest value. Its name lists them,
-    such as ``vehicle_2``; it is "" if they are all vehicles of the line. Worlds without the quantity are omitted.
+    A group consists of the vehicles (or pairs) for which the scenario declares the same smallest and largest value. The
+    result maps the key of a quantity to a dictionary from group to values [n, entries], as in
+    ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``. The name of a group lists its vehicles; "" stands for
+    all vehicles (or pairs) of the line. Worlds without the quantity are omitted.
     """
     of_quantities: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():

@@ -1,1 +1,1 @@
-"""Reading and writing files: strict reading, atomic writing. No other folder knows a file format."""
+"""Strict reading and atomic writing of files. All code that depends on a file format is in this folder."""

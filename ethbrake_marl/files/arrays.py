@@ -1,8 +1,8 @@
 """Read arrays from untrusted files: names, types, shapes and sizes are checked before any array is unpacked.
 
-There are two formats: ``.npz`` (a zip archive of ``.npy``) and safetensors. Nothing in either is evaluated or
-unpickled. The header of a ``.npy`` is a Python expression; only the exact form that numpy writes is accepted, by
-pattern.
+The formats are ``.npz`` (a zip archive of ``.npy`` files) and safetensors. No content of a file is evaluated or
+unpickled. The header of a ``.npy`` file is a Python expression; it is accepted only if it matches a pattern of the form
+that numpy writes.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ _NPY = re.compile(
 
 _SHAPE = re.compile(r"|[0-9]{1,18},|[0-9]{1,18}(, [0-9]{1,18}){1,7}", re.ASCII)
 
-_HARMLESS_FLAGS = 0x808  # flags of a zip member: sizes after the data, name in UTF-8
+_HARMLESS_FLAGS = 0x808  # accepted flags of a zip member: the sizes follow the data, the name is in UTF-8
 
 
 class ArrayHeader(NamedTuple):
-    """Type (in the notation of its format) and shape of an array, as its file states them."""
+    """Type (in the notation of the file format) and shape of an array, as declared in its file."""
 
     dtype: str  # type of the numbers, such as ``<f8`` (.npy) or ``F32`` (safetensors)
     shape: tuple[int, ...]  # length of each axis
@@ -49,31 +49,31 @@ class ArrayHeader(NamedTuple):
 class ArrayRow(NamedTuple):
     """Required name, type and shape of an array.
 
-    A letter in ``shape`` is any length, but the same length wherever the letter occurs.
+    A letter in ``shape`` stands for any length; a letter that occurs several times stands for the same length.
     """
 
     name: str  # name of the array
-    dtype: str  # type of its numbers, as in ``ArrayHeader``
-    shape: tuple[int | str, ...]  # such as ``("n", 3)``
+    dtype: str  # type of the numbers, in the notation of ``ArrayHeader``
+    shape: tuple[int | str, ...]  # lengths of the axes, such as ``("n", 3)``
 
 
 def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], word: str = "array") -> dict[str, int]:
-    """Check that arrays have the required names, types and shapes; return the length of each letter in the shapes.
+    """Check that arrays have the required names, types and shapes; return the length for each letter in the shapes.
 
-    For example ``{"n": 5}`` if a required shape is ``("n", 3)`` and the array is [5, 3]. Raises ``ValueError`` naming
-    the first array that is missing, superfluous or different.
+    The result is ``{"n": 5}`` if a required shape is ``("n", 3)`` and the array is [5, 3]. Raises ``ValueError`` naming
+    the first array that is missing, not required, or of a wrong type or shape.
 
     Args:
         found: headers of the arrays in a file, by name.
-        wanted: required arrays.
-        word: what messages call an array.
+        wanted: required names, types and shapes.
+        word: word for an array in error messages.
 
     """
     names = {row.name for row in wanted}
     for name in sorted(names - found.keys()):
         raise ValueError(f"{word} {name!r} is missing")
     for name in sorted(found.keys() - names):
-        raise ValueError(f"{word} {name!r} does not belong here; there should be {', '.join(sorted(names))}")
+        raise ValueError(f"{word} {name!r} must not be in this file; it must have {', '.join(sorted(names))}")
     lengths: dict[str, int] = {}
     for row in wanted:
         header = found[row.name]
@@ -84,40 +84,40 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
         right = [lengths.get(each, each) if isinstance(each, str) else each for each in row.shape]
         if header.dtype != row.dtype or list(header.shape) != right:
             raise ValueError(
-                f"{word} {row.name!r} is {header.dtype} {list(header.shape)}, should be {row.dtype}"
+                f"{word} {row.name!r} has type and shape {header.dtype} {list(header.shape)}; must be {row.dtype}"
                 f" [{', '.join(map(str, right))}]"
             )
     return lengths
 
 
 def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
-    """Return name -> type and shape of the arrays that a safetensors file declares in its header.
+    """Return type and shape of the arrays in a safetensors file, by name, as the header of the file declares them.
 
     ``data``: bytes of the file. Raises ``ValueError`` for an invalid file.
     """
     length = int.from_bytes(data[:8], "little")
     if not 2 <= length <= min(len(data) - 8, HEADER_LIMIT_BYTES):
-        raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)})")
+        raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)} bytes)")
     table = parse_strict_json(data[8 : 8 + length])
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
-        raise ValueError("not a safetensors file (the header is not a table of tensors)")
+        raise ValueError("not a safetensors file (the header is not a JSON object of tensors)")
     return {name: ArrayHeader(str(entry.get("dtype")), _lengths(entry.get("shape"))) for name, entry in table.items()}
 
 
 def _lengths(shape: object) -> tuple[int, ...]:
-    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which never matches."""
+    """Convert a shape from JSON to a tuple; an invalid length becomes -1, which differs from every required length."""
     return tuple(each if type(each) is int else -1 for each in (shape if isinstance(shape, list) else [None]))
 
 
 class ArrayArchive:
     """An ``.npz`` archive in memory, whose headers have been read and checked.
 
-    Accepts plain archives as ``numpy.savez`` and ``numpy.savez_compressed`` write them: one disk, no comment, no
-    encryption, stored or deflated, every name once. Raises ``ValueError`` for anything else.
+    Accepted are archives such as ``numpy.savez`` and ``numpy.savez_compressed`` write: on one disk, without comment and
+    encryption, stored or deflated, with different names. Raises ``ValueError`` for any other data.
 
     Args:
         data: bytes of the archive.
-        limit_bytes: largest total size of the unpacked arrays.
+        limit_bytes: largest accepted total size of the unpacked arrays.
 
     """
 
@@ -126,18 +126,18 @@ class ArrayArchive:
         with _damage():
             self._zip = zipfile.ZipFile(io.BytesIO(data))
             self._members = self._zip.infolist()
-        self._starts: dict[str, int] = {}  # where each array's numbers start
+        self._starts: dict[str, int] = {}  # byte at which the numbers of each array start
         self.headers: dict[str, ArrayHeader] = {}
         size = sum(member.file_size for member in self._members)
         if size > limit_bytes:
-            raise ValueError(f"would be {size:,} bytes when unpacked; {limit_bytes:,} is the limit")
+            raise ValueError(f"the arrays would have {size:,} bytes when unpacked; at most {limit_bytes:,} are allowed")
         for member in self._members:
             self._read_header(member)
 
     def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
-        """Return the arrays by name, read-only, after checking them against the required arrays ``wanted``.
+        """Return the arrays by name, read-only, after checking their names, types and shapes against ``wanted``.
 
-        Raises ``ValueError`` as ``check_arrays`` does.
+        Raises the same ``ValueError`` as ``check_arrays``.
         """
         check_arrays(self.headers, wanted)
         arrays = {}
@@ -153,9 +153,11 @@ class ArrayArchive:
     def _read_header(self, member: zipfile.ZipInfo) -> None:
         name = _name(member)
         if name in self.headers:
-            raise ValueError(f"array {name!r} is there twice")
+            raise ValueError(f"array {name!r} occurs twice")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ValueError(f"array {name!r} is packed by method {member.compress_type}; deflate is right")
+            raise ValueError(
+                f"array {name!r} has zip compression method {member.compress_type}; only stored or deflated is accepted"
+            )
         if member.flag_bits & ~_HARMLESS_FLAGS:
             raise ValueError(f"array {name!r} is encrypted or patched")
         with _damage(), self._zip.open(member) as stream:
@@ -164,7 +166,7 @@ class ArrayArchive:
         size = start + math.prod(header.shape) * np.dtype(header.dtype).itemsize
         if member.file_size != size:
             raise ValueError(
-                f"array {name!r} is {header.dtype} {list(header.shape)}, {size:,} bytes, in {member.file_size:,}"
+                f"array {name!r} has {member.file_size:,} bytes; {header.dtype} {list(header.shape)} needs {size:,}"
             )
         self.headers[name], self._starts[name] = header, start
 
@@ -174,39 +176,39 @@ def _name(member: zipfile.ZipInfo) -> str:
 
 
 def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
-    """Return type and shape of a ``.npy``, and the byte at which its numbers start.
+    """Return type and shape of an array in a ``.npy`` file, and the byte at which its numbers start.
 
-    ``name``: name of the array, for messages; ``beginning``: first bytes of the ``.npy``, with the whole header.
+    ``name``: name of the array, for error messages. ``beginning``: first bytes of the file, with the whole header.
     """
     length = int.from_bytes(beginning[8:10], "little")
     match = _NPY.fullmatch(beginning[10 : 10 + length])
     if beginning[:8] != b"\x93NUMPY\x01\x00" or length > _NPY_HEADER_LIMIT_BYTES or match is None:
-        raise ValueError(f"array {name!r}: is not a plain .npy of format 1.0, in the order of C")
+        raise ValueError(f"array {name!r}: must be a .npy file of format 1.0 with numbers in C order")
     dtype, shape = match[1].decode(), match[2].decode()
     if dtype[1:] not in ("b1", "f4", "f8", "i4", "i8", "u1", "u2", "u4", "u8"):
-        raise ValueError(f"array {name!r}: holds {dtype}, which is no number that is stored here")
+        raise ValueError(f"array {name!r}: has type {dtype}; must be a boolean, integer or floating-point type")
     if _SHAPE.fullmatch(shape) is None:
-        raise ValueError(f"array {name!r}: has the shape ({shape:.60}), which is none")
+        raise ValueError(f"array {name!r}: ({shape:.60}) is not a valid shape")
     return ArrayHeader(dtype, tuple(int(each) for each in shape.split(",") if each.strip())), 10 + length
 
 
 def _check_directory(data: bytes) -> None:
-    """Raise ``ValueError`` unless the end of a zip archive is plain and its directory is small.
+    """Raise ``ValueError`` unless ``data`` ends like a simple zip archive with a small directory.
 
-    This is checked before a reader creates an object for every entry of the directory.
+    The check comes first because a zip reader creates an object for every entry of the directory.
     """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
         raise ValueError("not a plain .npz archive")
     disk, first_disk, here, members, size, start, comment = struct.unpack("<4H2LH", data[-18:])
     if disk or first_disk or comment or here != members or data[-42:-38] == b"PK\x06\x07":
-        raise ValueError("not a plain .npz archive (of several disks, with a comment, or zip64)")
+        raise ValueError("not a plain .npz archive (it has several disks or a comment, or is a zip64 archive)")
     if members > _MEMBERS_LIMIT or size > _DIRECTORY_LIMIT_BYTES or start + size != len(data) - 22:
-        raise ValueError(f"not a plain .npz archive (a directory of {members} members in {size:,} bytes)")
+        raise ValueError(f"not a plain .npz archive (its directory has {members} members in {size:,} bytes)")
 
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Context manager: an error of the zip reader that is raised in the block becomes a ``ValueError``."""
+    """Context manager: raise ``ValueError`` for an error of the zip reader in the block."""
     try:
         yield
     except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, OverflowError) as error:

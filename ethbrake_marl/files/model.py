@@ -1,6 +1,6 @@
-"""Pydantic models of files, and one clear error message for the first mistake in a file.
+"""Pydantic models of files, and the error message for the first mistake in a file.
 
-The message says where the mistake is, the value, and what would be right. All such messages are made here.
+The message contains the place of the mistake, the invalid value, and what would be valid.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
-    """Base class of pydantic models of a file's content: immutable; unknown keys and wrong types are errors.
+    """Base class of pydantic models of a file's content; a subclass declares a field for each key.
 
-    A subclass declares a field for each key.
+    Its objects are immutable. Unknown keys and values of the wrong type are errors.
     """
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
@@ -51,7 +51,7 @@ class FileModel(BaseModel):
 
 Model = TypeVar("Model", bound=BaseModel)
 
-UNSHOWN = object()  # marker: do not show the value in the message
+UNSHOWN = object()  # passed as a value, means: do not show the value in the error message
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
@@ -59,7 +59,7 @@ def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
 
     Args:
         at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.
-        value: the value, shown in the message; ``UNSHOWN``: do not show it.
+        value: the invalid value, shown in the message; ``UNSHOWN``: do not show a value.
         right: what would be valid, for example ``must be above 0``.
 
     """
@@ -76,13 +76,13 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 class Wording:
     """Texts for error messages about one kind of file.
 
-    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` to say more about the keys of this file.
+    A subclass may override ``needed``, ``instead``, ``owner`` and ``right`` with texts about the keys of this file.
 
-    A *path* is the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
+    A *path* is a tuple of the keys and indices that lead to a value, for example ``("mixture", 0, "weight")``.
 
     Args:
-        model: the pydantic model of the file.
-        needed: text that says what a missing key needs.
+        model: pydantic model of the file.
+        needed: text that says what must be written for any missing key.
 
     """
 
@@ -98,15 +98,15 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Return a text that says what is needed at ``path`` (keys and indices inside the file), if it is missing."""
+        """Return a text that says what must be written for the missing key at ``path`` (keys and indices)."""
         return self._needed
 
     def instead(self, key: str) -> str:
-        """Return a text that says what replaces the unknown ``key``; empty if nothing is known about it."""
+        """Return a text that says what to write instead of the unknown ``key``; empty if there is no such advice."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair that the value at ``path`` belongs to, in words; empty if that is obvious.
+        """Return the vehicle or pair to which the value at ``path`` belongs; empty if the message need not name it.
 
         ``path``: keys and indices inside the file.
         """
@@ -115,24 +115,24 @@ class Wording:
     def right(self, detail: ErrorDetails) -> str:
         """Return what would be valid instead of the value in ``detail`` (a mistake, as pydantic reports it).
 
-        Empty if a general message says enough.
+        An empty text means that the general message is used.
         """
         return ""
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """Return the ``InvalidInput`` for a document that does not fit its schema.
+    """Return the ``InvalidInput`` for a document that does not match its pydantic model.
 
-    It shows the first mistake, unknown keys before all others, and counts the rest: "(and k more mistakes)". If an
-    unknown key is probably the misspelt name of a missing key, only the unknown key counts.
+    The message shows one mistake (an unknown key, if there is one) and counts the others: "(and k more mistakes)". If
+    an unknown key is probably the misspelt name of a missing key, the missing key is not counted.
 
     Args:
-        document: the parsed file, which knows the line of each value.
-        error: pydantic's error for its content.
+        document: the parsed file, with the line of each value.
+        error: pydantic's error for the content of the file.
         wording: texts about this kind of file.
 
     """
-    # A default that depends on a field with an error is no further mistake.
+    # A default that depends on an invalid field is not counted as a mistake.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     unknown = [d for d in details if d["type"] == "extra_forbidden"]
     meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(path_of(d))) for d in unknown)
@@ -162,7 +162,7 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
         source: path of the file, or the parsed document.
         model: pydantic model of the content.
         wording: texts about this kind of file.
-        advice: what the file must contain, for the message if it is not a mapping.
+        advice: end of the sentence "must be a mapping ...", used if the content is not a mapping.
 
     """
     document = source if isinstance(source, Document) else read_yaml(source)
@@ -175,11 +175,11 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """Parse a JSON file that a program wrote; return its plain content, and the content as ``model``.
+    """Parse a JSON file that a program wrote; return its content as plain data, and as an object of class ``model``.
 
-    ``data``: the bytes of the file. Raises ``ValueError`` with a one-line reason for invalid content.
+    ``data``: bytes of the file. Raises ``ValueError`` with a one-line reason for invalid content.
     """
-    content = parse_strict_json(data)  # no key twice, no NaN
+    content = parse_strict_json(data)  # refuses repeated keys and NaN
     try:
         return content, model.model_validate_json(data)
     except ValidationError as error:
@@ -187,9 +187,9 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """The first error that pydantic found in data from a program; its text is ``place: right``."""
+    """The first mistake that pydantic found in data from a program; ``str`` gives ``place: right``."""
 
-    place: str  # keys joined by dots; empty for the whole
+    place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value
     right: str  # what would be valid
 
@@ -198,16 +198,16 @@ class Mistake(NamedTuple):
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Return the first mistake that pydantic found, for files that programs write and for settings in code."""
+    """Return the first mistake in ``error``, for files that programs write and for settings in code."""
     detail = error.errors(include_url=False)[0]
-    right = {"missing": "is missing", "extra_forbidden": "unknown key"}.get(detail["type"])
+    right = {"missing": "is missing", "extra_forbidden": "is an unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
     """Return the path (keys and indices inside the file) of a mistake that pydantic reports.
 
-    Pydantic's tags are left out; the path that ``refuse`` reports is appended.
+    The tags of unions are removed from pydantic's path, and the path given to ``refuse`` is appended.
     """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
@@ -218,7 +218,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
     if detail["type"] == "extra_forbidden":
         inside = wording.known(path)
         if path[-1] in inside:
-            return f"{place}: does not go with what stands beside it; a quantity has one distribution"
+            return f"{place}: cannot be combined with the other keys here; a quantity has only one distribution"
         hint = wording.instead(str(path[-1])) or suggestion(str(path[-1]), inside) or f"known: {', '.join(inside)}"
         return f"{place}: unknown key; {hint}"
     if detail["type"] == "missing":
@@ -232,7 +232,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 def _show(detail: ErrorDetails) -> str:
     """Return the invalid value as text for the message, or an empty text if the whole file is invalid.
 
-    A float instead of a whole number keeps its decimal point.
+    A float where a whole number is required is shown with its decimal point.
     """
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
@@ -247,7 +247,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """Return advice for a number that stands in quotes and so is a text; empty for any other mistake."""
+    """Return advice for a number in quotes, which is a text in YAML; empty for any other mistake."""
     value = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(value, str) and parse_numeral(value) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""
@@ -276,10 +276,9 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Return "did you mean ...?" for an unknown ``key``, or its new name; empty if no known key is close.
+    """Return a hint for an unknown ``key``: "did you mean ...?" or its new name; empty if no known key is similar.
 
-    ``known``: the valid keys. A key that differs from one of these only in its unit is recognised: ``gaps_km``,
-    ``mass``.
+    ``known``: the valid keys. A key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
     """
     names = sorted(known)
     if new := new_name(key, names):

@@ -1,4 +1,4 @@
-"""Command-line settings ``key.path=value``: parsed as YAML and inserted into plain data."""
+"""Settings ``key.path=value`` from the command line: parse the values as YAML, and insert them into plain data."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One setting from the command line, such as ``reward.harm=0.5``: its path and its value."""
+    """A setting from the command line, such as ``reward.harm=0.5``, split into path and value."""
 
     text: str  # the setting as written
-    path: tuple[str, ...]  # keys from the outermost on; for a list the index, from 0
-    value: Any  # value parsed as YAML
+    path: tuple[str, ...]  # keys that lead to the value, the outermost first; indices (from 0) inside lists
+    value: Any  # the value, parsed as YAML
 
     @property
     def top(self) -> str:
@@ -26,7 +26,7 @@ class Override:
 
     @property
     def key(self) -> str:
-        """The path with dots, as written: ``reward.harm`` for ``reward.harm=0.5``."""
+        """The path, with dots between the keys: ``reward.harm`` for ``reward.harm=0.5``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
@@ -35,9 +35,9 @@ class Override:
 
     @staticmethod
     def parse(texts: Sequence[str]) -> list[Override]:
-        """Parse settings ``key.path=value``; a value is YAML on one line: ``0.2`` or ``{uniform: [1, 2]}``.
+        """Parse settings ``key.path=value``, whose values are YAML on one line, such as ``{uniform: [1, 2]}``.
 
-        Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated key, and a value that is not valid
+        Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated path, and a value that is not valid
         YAML.
         """
         overrides: list[Override] = []
@@ -47,17 +47,17 @@ class Override:
             if not equals or not all(path):
                 raise InvalidInput(f"--set {text!r}: must be KEY=VALUE or KEY.KEY=VALUE, for instance gamma=0.99")
             if any(each.path == path for each in overrides):
-                raise InvalidInput(f"--set {'.'.join(path)}: is given twice")
+                raise InvalidInput(f"--set {'.'.join(path)}: this setting is given twice; give it once")
             overrides.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
         return overrides
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Apply settings to plain data; return the changed top-level keys with their new values.
+        """Apply settings to a copy of ``content``; return only the changed top-level keys, with their new values.
 
-        ``content`` itself is not changed. With ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting
-        ``reward.harm=2`` the result is ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` for a path into a value
-        that is neither a mapping nor a list.
+        For ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting ``reward.harm=2`` the result is
+        ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` if a path leads into a value that is neither a mapping nor
+        a list.
         """
         changed: dict[str, Any] = {}
         for override in overrides:
@@ -70,7 +70,7 @@ class Override:
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
     """Return a copy of ``part`` (a mapping, list or other value) with the value of ``override`` at ``path`` inside it.
 
-    ``path``: the last keys of ``override.path``; ``()``: the value replaces ``part``. A missing mapping is created.
+    ``path``: last keys of ``override.path``; if it is empty, the value replaces ``part``. Missing mappings are created.
     """
     if not path:
         return override.value
@@ -81,8 +81,11 @@ def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
         return {**part, key: _placed(part.get(key), rest, override)}
     if isinstance(part, list | tuple):
         if not (key.isascii() and key.isdigit() and int(key) < len(part)):
-            raise InvalidInput(f"--set {override.key}: {key!r} must be an entry from 0 to {len(part) - 1}")
+            raise InvalidInput(f"--set {override.key}: {key!r} must be an index from 0 to {len(part) - 1}")
         entries = list(part)
         entries[int(key)] = _placed(entries[int(key)], rest, override)
         return entries
-    raise InvalidInput(f"--set {override.key}: there is nothing inside {flow_text(part, 60)}; set the whole value")
+    raise InvalidInput(
+        f"--set {override.key}: {key!r} cannot be set, because {flow_text(part, 60)} is neither a mapping nor a list;"
+        " set the whole value"
+    )

@@ -1,4 +1,4 @@
-"""Safe reading of untrusted files: plain files only, of limited size, and strict JSON."""
+"""Safe reading of untrusted files: only plain files of limited size are read, and JSON is parsed strictly."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def read_plain(
 ) -> bytes:
     """Return the content of a plain file of at most ``limit_bytes``; raise ``refusal`` if it cannot be read.
 
-    The limit also holds for a file that grows while it is read.
+    The limit also applies to a file that grows while it is read.
 
     Args:
         path: path of the file.
-        limit_bytes: largest accepted size.
-        refusal: class of the error to raise, with path and reason; see ``open_plain``.
+        limit_bytes: largest accepted size of the file.
+        refusal: class of the error to raise; its message has path and reason, see ``open_plain``.
         follow_links: whether a symbolic link is accepted.
 
     """
@@ -53,15 +53,14 @@ def open_plain(
 ) -> Iterator[BufferedReader]:
     """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
 
-    Kind and size are checked before anything is opened, so a pipe or device is never opened. Nothing waits for a
-    writer, and no device is affected. If the file is replaced in between, the new one is opened without waiting and
-    checked again.
+    Kind and size of the file are checked before it is opened, so a pipe or device is not opened. They are checked again
+    after opening, in case another process has replaced the file. Opening never waits.
 
     Args:
         path: path of the file.
-        limit_bytes: largest accepted size.
-        refusal: class of the error to raise, with path and reason: the file does not exist, is a folder, device or
-            pipe, is too large, or cannot be read (also inside the block).
+        limit_bytes: largest accepted size of the file.
+        refusal: class of the error to raise if the file does not exist, is not a plain file, is too large, or cannot be
+            read (also inside the block). The message has path and reason.
         follow_links: whether a symbolic link is accepted.
 
     """
@@ -75,7 +74,7 @@ def open_plain(
             _check_kind(file, os.fstat(stream.fileno()), limit_bytes, refusal)
             yield stream
     except FileNotFoundError:
-        raise refusal(f"{file}: no such file") from None
+        raise refusal(f"{file}: the file does not exist") from None
     except OSError as error:
         raise refusal(f"{file}: cannot be read ({error.strerror})") from None
     except ValueError as error:
@@ -85,7 +84,7 @@ def open_plain(
 
 
 def _read(descriptor: int, most_bytes: int) -> bytes:
-    """Read up to ``most_bytes`` from a file descriptor; raise ``OSError`` if reading would have to wait."""
+    """Read at most ``most_bytes`` bytes from a file descriptor; raise ``OSError`` if reading would have to wait."""
     parts: list[bytes] = []
     while most_bytes > 0 and (part := os.read(descriptor, min(most_bytes, 1 << 20))):
         parts.append(part)
@@ -95,18 +94,18 @@ def _read(descriptor: int, most_bytes: int) -> bytes:
 
 def _check_kind(file: Path, found: os.stat_result, limit_bytes: int, refusal: type[EthBrakeError]) -> None:
     if stat.S_ISLNK(found.st_mode):
-        raise refusal(f"{file}: is a symbolic link; give the file it points to")
+        raise refusal(f"{file}: is a symbolic link; give the path of the file to which it points")
     if stat.S_ISDIR(found.st_mode):
-        raise refusal(f"{file}: is not a plain file but a folder")
+        raise refusal(f"{file}: is a folder; must be a plain file")
     if not stat.S_ISREG(found.st_mode):
-        raise refusal(f"{file}: is not a plain file but a device, a pipe or a socket")
+        raise refusal(f"{file}: is a device, a pipe or a socket; must be a plain file")
     if found.st_size > limit_bytes:
         raise _too_large(file, limit_bytes, refusal)
 
 
 def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> EthBrakeError:
     size = f"{limit_bytes >> 20} MiB" if limit_bytes >= 1 << 20 else f"{limit_bytes >> 10} KiB"
-    return refusal(f"{file}: larger than {size}, the limit for such a file")
+    return refusal(f"{file}: is larger than {size}, the limit for this kind of file")
 
 
 def parse_strict_json(data: bytes) -> Any:
@@ -120,16 +119,16 @@ def parse_strict_json(data: bytes) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file of a training run; raise ``InvalidInput`` naming the file and what is wrong."""
+    """Return the JSON object in a file of a training run; raise ``InvalidInput`` if the file is missing or damaged."""
     if not os.path.lexists(file):
-        raise InvalidInput(f"{file}: is missing; nothing goes on without it")
+        raise InvalidInput(f"{file}: is missing, but the run cannot be used without it")
     data = read_plain(file, LARGEST_OBJECT_BYTES)
     try:
         content = parse_strict_json(data)
     except ValueError as error:
         raise InvalidInput(f"{file}: is damaged: {error}") from None
     if not isinstance(content, dict):
-        raise InvalidInput(f"{file}: is damaged: holds no JSON object")
+        raise InvalidInput(f"{file}: is damaged: the content is not a JSON object")
     return content
 
 
@@ -137,7 +136,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     parsed: dict[str, Any] = {}
     for key, value in pairs:
         if key in parsed:
-            raise ValueError(f"key {key!r} stands twice")
+            raise ValueError(f"key {key!r} occurs twice")
         parsed[key] = value
     return parsed
 

@@ -1,7 +1,7 @@
-"""Python files of the user: run once when the user names one, and recorded with their SHA-256.
+"""Run Python files of the user, and record their SHA-256.
 
-A file runs only if the user names it (``--agents my_file.py:make_agent``). A file named in a run's folder, a recipe or
-a scenario never runs.
+A Python file runs only if the user names it on the command line (``--agents my_file.py:make_agent``) or in code. A file
+that a run's folder, a recipe or a scenario names is never run.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from ethbrake_marl.files.plain import read_plain
 
 _LIMIT_BYTES = 1 << 20
 
-_RUN: dict[Path, tuple[str, ModuleType]] = {}  # files that this process ran, with their SHA-256
+_RUN: dict[Path, tuple[str, ModuleType]] = {}  # SHA-256 and module of each Python file that this process ran
 
-_BEING_RUN: set[Path] = set()
+_BEING_RUN: set[Path] = set()  # Python files that are running now
 
-_READ: dict[str, set[str]] = {}
+_READ: dict[str, set[str]] = {}  # SHA-256 of the other files that Python files read, by file name
 
 
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
-    """Run a Python file, once per process, and return the object ``name`` that it defines. The file can do anything.
+    """Run a Python file, once per process, and return the object ``name`` that it defines.
 
-    ``reads`` is the path of a file that it uses, such as weights; its SHA-256 is recorded if the file exists. Raises
-    ``InvalidInput`` for a Python file that is missing, raises an error (with its line), was changed since it ran, or
-    does not define ``name``.
+    The file runs without restrictions. ``reads`` is the path of a file that the Python file uses, such as weights; its
+    SHA-256 is recorded if it exists. Raises ``InvalidInput`` if the Python file is missing, raises an error (the
+    message has the line), has changed since it ran, or does not define ``name``.
     """
     _, module = _run_file(Path(path), f"file {path!r}")
     if not hasattr(module, name):
-        raise InvalidInput(f"file {path!r}: has no {name!r}; name what it defines: {path}:NAME")
+        raise InvalidInput(f"file {path!r}: does not define {name!r}; after the colon, give a name that it defines")
     if reads is not None and Path(reads).is_file():
         _READ.setdefault(Path(reads).name, set()).add(file_sha256(Path(reads)))
     return getattr(module, name)
@@ -46,7 +46,7 @@ def file_sha256(path: Path) -> str:
 
 
 def files_run() -> dict[str, str]:
-    """Return name -> SHA-256 of every Python file that this process ran, and of the files that these read.
+    """Return the SHA-256 of every Python file that this process ran, and of the files that they use, by file name.
 
     If several files have the same name, their hashes are joined by commas.
     """
@@ -57,18 +57,18 @@ def files_run() -> dict[str, str]:
 
 
 def _run_file(path: Path, what: str) -> tuple[str, ModuleType]:
-    """Return SHA-256 and module of a Python file; run it unless it ran before.
+    """Return SHA-256 and module of a Python file; run the file unless this process has run it already.
 
     ``what``: how error messages name the file.
     """
     if not path.is_file():
-        raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'there is no such file'}")
+        raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'does not exist'}")
     content = read_plain(path, _LIMIT_BYTES)
     sha256, resolved = hashlib.sha256(content).hexdigest(), path.resolve()
     if resolved not in _RUN:
         _RUN[resolved] = sha256, _run(content, resolved, sha256, what)
     if _RUN[resolved][0] != sha256:
-        raise InvalidInput(f"{what}: was changed since it was loaded; begin a new process")
+        raise InvalidInput(f"{what}: has changed since it was loaded; start a new Python process")
     return _RUN[resolved]
 
 
@@ -79,8 +79,8 @@ def _run(content: bytes, path: Path, sha256: str, what: str) -> ModuleType:
 
     Args:
         content: bytes of the file.
-        path: its resolved path.
-        sha256: hash of the content, used in the module's name.
+        path: resolved path of the file.
+        sha256: SHA-256 of the content, part of the module's name.
         what: how error messages name the file.
 
     """

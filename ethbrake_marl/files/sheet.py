@@ -1,4 +1,4 @@
-"""A table of estimates and texts, and its output for terminal, document, notebook, CSV and JSON."""
+"""``Sheet``: a table of estimates and texts, with output for terminal, Markdown, HTML, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -20,41 +20,41 @@ if TYPE_CHECKING:
 
 DASH = "–"  # shown for a missing value
 _AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
-WIDE = 120  # width of a terminal (characters) from which on every column is shown
+WIDE = 120  # smallest width of a terminal (characters) in which every column is shown
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A value and its confidence interval; the interval is None if the data do not allow one (a single world)."""
+    """An estimate and its confidence interval; the interval is None if it cannot be computed (a single world)."""
 
-    value: float  # the estimate itself
-    interval: tuple[float, float] | None  # low and high end
+    value: float  # estimated value
+    interval: tuple[float, float] | None  # low and high end of the confidence interval
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Low and high end of the interval; the value twice if there is none."""
+        """Low and high end of the interval; both equal the value if there is no interval."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
         """Format value and interval as text: ``24.19 [23.85, 24.53]``.
 
         Args:
-            digits: digits after the decimal point.
-            scale: factor that all numbers are multiplied by, for example 100 for per cent.
-            unit: text directly after the value.
+            digits: number of digits after the decimal point.
+            scale: factor that multiplies all numbers, for example 100 for per cent.
+            unit: text directly after the value, such as a unit.
 
         """
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
+        """Return the estimate as plain data for JSON: ``value``, and ``interval`` as ``[low, high]`` or null."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
         """Return estimates by name as flat plain data: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
 
-        A missing estimate becomes None under both keys.
+        For an estimate that is None, both values are None.
         """
         cells: dict[str, Any] = {}
         for name, estimate in estimates.items():
@@ -64,7 +64,7 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """A cell of a table as text: its value, and the interval of an estimate."""
+    """Text of a table cell: the value, and the interval if the cell is an estimate."""
 
     value: str  # the number, with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
@@ -80,29 +80,30 @@ Cell = Estimate | Shown | float | int | str | None
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column, and the format of its numbers: multiplied by ``scale``, with ``digits``, then ``unit``.
+    """A column of a table, with the format of its numbers.
 
-    Whole numbers and texts are written unchanged.
+    A number is multiplied by ``scale``, rounded to ``digits`` digits and followed by ``unit``. Integers and texts are
+    not changed.
     """
 
     heading: str  # heading in documents
     key: str = ""  # name in CSV and JSON; "": the heading
-    digits: int = 2  # digits after the decimal point
-    scale: float = 1.0  # numbers are multiplied by this
+    digits: int = 2  # number of digits after the decimal point
+    scale: float = 1.0  # factor that multiplies the numbers
     unit: str = ""  # text directly after the number
     sign: Literal["z", "+"] = "z"  # format option: "z" never shows -0.00, "+" always shows a sign
-    text: bool = False  # left-aligned, and wrapped in a narrow terminal
+    text: bool = False  # whether the cells are left-aligned texts, which a narrow terminal wraps
     short: str = ""  # heading in a terminal; "": the heading
-    wide: bool = False  # shown only in a terminal of ``WIDE`` characters
+    wide: bool = False  # whether the column is shown only in terminals of at least ``WIDE`` characters
     interval: Literal["beside", "below", "hidden"] = "beside"  # where a terminal shows the interval of an estimate
 
     @property
     def name(self) -> str:
-        """Name in CSV and JSON."""
+        """Name of the column in CSV and JSON."""
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
-        """Format a cell of this column as text: a number, estimate or text; None is shown as a dash."""
+        """Format a cell of this column (a number, estimate or text) as text; None becomes a dash."""
         if cell is None or isinstance(cell, Shown):
             return cell or Shown(DASH)
         if isinstance(cell, str | int):
@@ -116,15 +117,15 @@ class Column:
         return f"{self.scale * value:{self.sign}.{self.digits}f}"
 
 
-Row = Sequence[Any] | str  # a row of cells, or the name of a section
+Row = Sequence[Any] | str  # a row of cells, or the name of a section that begins here
 
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
     """A table: title, columns, rows of cells, and a note below.
 
-    A column given as a string is a column of texts with that heading. A row given as a string begins a section of that
-    name. A row may be shorter than the table; the missing cells are empty.
+    A string in ``columns`` is the heading of a column of texts. A string in ``rows`` is the name of a section that
+    begins there. If a row has fewer cells than the table has columns, the missing cells are empty.
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
@@ -137,9 +138,9 @@ class Sheet:
 
     """
 
-    title: str  # "": no title
-    columns: Sequence[Column | str]  # a string: a column of texts with this heading
-    rows: Sequence[Row]  # a sequence of cells, or a string that begins a section
+    title: str  # title above the table; "": no title
+    columns: Sequence[Column | str]  # columns; a string is the heading of a column of texts
+    rows: Sequence[Row]  # rows of cells; a string is the name of a section that begins there
     note: str = ""  # text below the table
     gap: Literal[1, 2, 3] = 3  # spaces between two columns in a terminal
 
@@ -157,7 +158,7 @@ class Sheet:
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Yield each row as a tuple of formatted cells, one per column; a section is yielded as its name (a string)."""
+        """Yield each row as a tuple of formatted cells, one per column, and each section as its name (a string)."""
         columns = self._columns()
         for row in self.rows:
             if isinstance(row, str):
@@ -167,22 +168,23 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Return the table with only these columns, by index from 0."""
+        """Return the table reduced to the given ``columns`` (indices from 0)."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the indices of the columns in which some row has a value; without rows, all indices."""
+        """Return the indices of the columns in which some row has a value; all indices if there are no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
     def rich(self, width: int = WIDE) -> RenderableType:
-        """Return the table as an object for ``rich``, for a terminal of ``width`` characters, with the note below.
+        """Return the table, with the note below, as an object of ``rich`` for a terminal of ``width`` characters.
 
-        Lines of a cell after the first are dim. Columns marked ``wide`` are left out of a narrow terminal.
+        In a cell, all lines of text after the first are dim. Columns marked ``wide`` are omitted if ``width`` is below
+        ``WIDE``.
         """
         from rich import box
         from rich.console import Group
@@ -221,7 +223,8 @@ class Sheet:
     def markdown(self) -> str:
         """Return the table as Markdown, without title and note.
 
-        Markdown has no sections: the first cell of each row begins with the name of its section, ``Section: cell``.
+        Because Markdown tables have no sections, the first cell of a row begins with the section's name:
+        ``Section: cell``.
         """
         columns, section = self._columns(), ""
         lines = [[column.heading for column in columns], ["---" if column.text else "---:" for column in columns]]
@@ -234,10 +237,10 @@ class Sheet:
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
     def html(self) -> str:
-        """Return the table as HTML, for a notebook or a page: title above, note below, intervals in brackets.
+        """Return the table as HTML for a notebook or a page, with the title above and the note below.
 
-        All content is escaped unless it has a method ``__html__``. The first cell of a row is its heading. Text columns
-        after it may wrap.
+        All content is escaped unless it has a method ``__html__``. The first cell of a row is the heading of the row.
+        Intervals are in brackets. Texts in the other columns may wrap.
         """
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
@@ -264,7 +267,7 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """Return one object per row, without sections: cells by column name, estimates with their intervals."""
+        """Return one mapping per row: cells by column name, estimates with their intervals. Sections are omitted."""
         columns, rows = self._columns(), []
         for row in self.rows:
             cells = {} if isinstance(row, str) else dict(zip(columns, row, strict=False))
@@ -276,17 +279,17 @@ class Sheet:
         return rows
 
     def csv(self) -> str:
-        """Return CSV text, one line per row.
+        """Return the table as CSV text, one line per row.
 
-        The interval of column ``x`` becomes ``x_low`` and ``x_high``; missing values are empty.
+        The interval of a column ``x`` becomes the columns ``x_low`` and ``x_high``. Missing values are empty.
         """
         return csv_text(self.json())
 
 
 def terminal_text(*shown: RenderableType, whole_rows: bool = False) -> str:
-    """Return tables and texts as ``print`` would show them, as wide as the terminal.
+    """Return tables and texts as they look when printed in this terminal.
 
-    ``whole_rows``: never break a cell of a table; the text is then wider than the terminal if a table needs it.
+    ``whole_rows``: True: do not wrap the cells of tables; the text may then be wider than the terminal.
     """
     from rich.console import Console
     from rich.measure import measure_renderables
@@ -302,13 +305,13 @@ def terminal_text(*shown: RenderableType, whole_rows: bool = False) -> str:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Return rows, each a mapping of column names to values, as CSV text with a header line.
+    """Return rows as CSV text with a header line.
 
-    The interval of ``x``, in ``x_interval``, becomes ``x_low`` and ``x_high``. None and missing values are empty.
+    A column ``x_interval`` with pairs becomes two columns ``x_low`` and ``x_high``. None and missing values are empty.
 
     Args:
-        rows: the rows.
-        columns: names of the columns to write, in order, after intervals are split; None: all, in order of appearance.
+        rows: rows, each a mapping from column names to values.
+        columns: names of the columns to write, in order, such as ``x_low``; None: all, in order of appearance.
 
     """
     flat: list[dict[str, Any]] = []
@@ -333,14 +336,14 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = 
 def parquet_file(
     path: Path, *, told: Callable[[], Mapping[str, str]] | None = None, **options: Any
 ) -> Iterator[Callable[..., None]]:
-    """Context manager: write a Parquet file with the function ``add(columns)``, which it yields.
+    """Context manager: yield a function ``add(columns)`` that appends rows to a new Parquet file.
 
-    ``add`` appends arrays of equal length by column name; ``together=True`` keeps them in one row group. The file
-    appears only if the block ends without error. Raises ``MissingExtra`` without pyarrow.
+    ``columns`` maps column names to arrays of equal length; ``add(columns, together=True)`` writes them as one row
+    group. The file appears only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not installed.
 
     Args:
-        path: the file.
-        told: called at the end of the block; returns metadata for the file. None: no metadata.
+        path: path of the new file.
+        told: function that returns metadata for the file, called at the end of the block; None: no metadata.
         **options: options of ``pyarrow.parquet.ParquetWriter``.
 
     """
@@ -368,9 +371,9 @@ def parquet_file(
 
 
 def _html(value: object) -> str:
-    """Escape a value for HTML; control and direction characters are shown as Python escapes.
+    """Return ``value`` escaped for HTML, with control and direction characters as Python escapes.
 
-    An object with a method ``__html__`` supplies its own HTML.
+    For an object with a method ``__html__``, return the result of that method.
     """
     known: Callable[[], str] | None = getattr(value, "__html__", None)
     return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

@@ -1,4 +1,4 @@
-"""Atomic writing: files and folders appear completely or not at all, even after a crash. Locks end with the process."""
+"""Atomic writing of files and folders, which appear completely or not at all, even after a crash; and lock files."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from filelock import FileLock, Timeout
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 
-LARGEST_OBJECT_BYTES = 16 << 20
+LARGEST_OBJECT_BYTES = 16 << 20  # largest accepted size of a JSON file of a training run
 
-_HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"  # not the target's name: file names have a maximum length
+# beginning and end of a temporary name; it does not contain the target's name, because names have a maximum length
+_HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write ``data`` to ``path`` in one step, replacing an existing file; readers see the old or the new content."""
+    """Write ``data`` to ``path``, replacing an existing file; a reader sees either the old or the new content."""
     with new_file(path) as partial:
         partial.write_bytes(data)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Context manager: yield the path of a temporary file that replaces ``path`` if the block succeeds.
+    """Context manager: yield the path of a temporary file, which is renamed to ``path`` if the block succeeds.
 
-    Otherwise the temporary file is deleted.
+    If the block raises an error, the temporary file is deleted.
     """
     descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
     os.close(descriptor)
@@ -47,30 +48,32 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 def check_writable(folder: Path) -> None:
-    """Raise ``OSError`` unless ``folder`` is writable, tested by creating and deleting a file."""
+    """Raise ``OSError`` unless a file can be created in ``folder``; creates and deletes a temporary file."""
     descriptor, name = tempfile.mkstemp(dir=folder, prefix=_HIDDEN, suffix=_UNFINISHED)
     os.close(descriptor)
     Path(name).unlink()
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check that the file ``path`` may be written; return it as a ``Path``. Call this before long work.
+    """Check that a file can be written to ``path``; return ``path`` as a ``Path``. Call this before a long computation.
 
-    Raises ``AlreadyExists`` for an existing file unless ``force``; ``InvalidInput`` if it cannot be written. Even
-    ``force`` replaces plain files only, not a folder, device, pipe or symbolic link.
+    Raises ``AlreadyExists`` if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be
+    written, or if ``path`` is a folder, device, pipe or symbolic link, which ``force`` does not replace.
     """
     target = Path(path)
     try:
         if target.is_symlink():
-            raise InvalidInput(f"{target}: is a symbolic link; give the file it points to")
+            raise InvalidInput(f"{target}: is a symbolic link; give the path of the file to which it points")
         if target.is_dir():
-            raise InvalidInput(f"{target}: is a folder; give the name of a file")
+            raise InvalidInput(f"{target}: is a folder; give the path of a file")
         if os.access(target, os.F_OK) and not target.is_file():  # unlike exists(), it raises for a NUL in the name
             raise InvalidInput(f"{target}: is a device or a pipe, not a plain file; give another name")
         if not target.parent.is_dir():
-            raise InvalidInput(f"{target}: there is no folder {target.parent}; make it first")
+            raise InvalidInput(f"{target}: the folder {target.parent} does not exist; create it first")
         if os.path.lexists(target) and not force:
-            raise AlreadyExists(f"{target}: is there already; give another name or use force (--force)")
+            raise AlreadyExists(
+                f"{target}: already exists; give another name, or replace the file with force (--force)"
+            )
         check_writable(target.parent)
     except (InvalidInput, AlreadyExists):
         raise
@@ -81,10 +84,10 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
-    """Check that ``path`` can be a folder for results, without creating anything.
+    """Check that ``path`` can be used as a folder for results; it need not exist yet and is not created.
 
-    Raises ``InvalidInput`` if it is not a folder or cannot be written to; ``AlreadyExists`` if it already contains one
-    of the file names in ``files``, unless ``force``.
+    Raises ``InvalidInput`` if the path is not a folder or is not writable. Raises ``AlreadyExists`` if the folder
+    contains one of the file names in ``files`` and ``force`` is False.
     """
     try:
         places = (path, *path.absolute().parents)
@@ -96,25 +99,25 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
             f"{path!s:.200}: cannot be written to ({getattr(error, 'strerror', None) or error})"
         ) from None
     if not there.is_dir():
-        raise InvalidInput(f"{path}: {there} is no folder; give a folder of its own (--output)")
+        raise InvalidInput(f"{path}: {there} is not a folder; give a new folder (--output)")
     for name in files if there == path else ():
         check_target(path / name, force=force)
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write ``data`` to ``path`` in one step; ``force`` replaces an existing file.
+    """Write ``data`` to ``path``; ``force`` allows replacing an existing file.
 
-    Raises ``AlreadyExists`` or ``InvalidInput`` like ``check_target``.
+    Raises ``AlreadyExists`` or ``InvalidInput`` in the same cases as ``check_target``.
     """
     write_file(check_target(path, force=force), data)
 
 
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Context manager: yield a temporary folder that becomes ``path`` if the block succeeds, else is deleted.
+    """Context manager: yield a temporary folder, which is renamed to ``path`` if the block succeeds, else deleted.
 
-    Raises ``AlreadyExists`` if ``path`` exists, at the start or at the end. With ``replace`` an existing folder is
-    deleted, but only after the block has succeeded.
+    With ``replace``, an existing folder ``path`` is deleted after the block has succeeded. Otherwise ``AlreadyExists``
+    is raised if ``path`` exists before or after the block.
     """
     if not replace:
         _refuse_existing(path)
@@ -142,14 +145,14 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete the folder ``path``, after renaming it, so that no half-deleted folder has its name."""
+    """Delete the folder ``path``. It is renamed first, so an interruption does not leave a half-deleted ``path``."""
     aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
     path.rename(aside / path.name)
     shutil.rmtree(aside)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files that killed writers left in ``folder``; no other process may be writing there."""
+    """Delete temporary files that killed processes left in ``folder``; no other process may be writing there now."""
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)
@@ -159,10 +162,10 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
-    """Context manager: hold the lock file ``lock`` while the block runs.
+    """Context manager: hold the lock file ``lock`` while the block runs. The lock also ends if the process ends.
 
-    Raises ``InvalidInput`` if another process holds it, or if the file cannot be used as a lock. ``other``: reason in
-    the message in the first case.
+    Raises ``InvalidInput`` if another process holds the lock, or if the file cannot be used as a lock. ``other``: error
+    message for a lock that another process holds.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:
@@ -170,7 +173,7 @@ def hold_lock(lock: Path, other: str) -> Iterator[None]:
     except Timeout:
         raise InvalidInput(f"{lock.parent}: {other}") from None
     except OSError as error:
-        raise InvalidInput(f"{lock}: cannot be used as a lock ({error.strerror}); delete it") from None
+        raise InvalidInput(f"{lock}: cannot be used as a lock ({error.strerror}); delete this file") from None
     try:
         yield
     finally:
@@ -179,11 +182,11 @@ def hold_lock(lock: Path, other: str) -> Iterator[None]:
 
 def _refuse_existing(path: Path) -> None:
     if path.is_symlink() or path.exists():
-        raise AlreadyExists(f"{path}: is there already; give another name")
+        raise AlreadyExists(f"{path}: already exists; give another name")
 
 
 def _folder_to_disk(path: Path) -> None:
-    """Flush the folder ``path``, so that renames in it survive a power failure (POSIX only)."""
+    """Write the entries of the folder ``path`` to disk, so that renames survive a power failure (POSIX only)."""
     if os.name == "posix":
         descriptor = os.open(path, os.O_RDONLY)
         try:
@@ -193,7 +196,7 @@ def _folder_to_disk(path: Path) -> None:
 
 
 def _umask() -> int:
-    """Return the permission bits that new files do not get. Temporary files are private until they are renamed."""
+    """Return the permission bits that this process removes from new files."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -1,4 +1,4 @@
-"""Strict YAML: every value has its line number, and one rule says what is a number."""
+"""Strict reader of YAML files that records the line number of every value."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """Return the number that ``text`` represents, infinite if it is too large; None if it is not a number."""
+    """Return the number that ``text`` represents (infinity if it is too large), or None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
@@ -30,10 +30,10 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Write ``value`` in YAML's flow style, so that reading it back gives an equal value.
+    """Return ``value`` as text in YAML's flow style; reading the text gives an equal value.
 
-    Supports printable text, lists, mappings with text keys, finite or infinite numbers, true, false and null.
-    ``longest``: number of characters after which the text is cut off, for messages only; None: never.
+    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null.
+    ``longest``: number of characters after which the text is cut off, for error messages; None: do not cut it off.
     """
     text = _flow(value)
     return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
@@ -63,9 +63,9 @@ def _number(value: int | float) -> str:
     return {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}.get(text, text)
 
 
-SIZE_LIMIT = 64 * 1024  # largest size of a file in bytes
+SIZE_LIMIT = 64 * 1024  # largest accepted size of a file (bytes)
 
-DEPTH_LIMIT = 16  # largest depth of nested mappings and lists
+DEPTH_LIMIT = 16  # largest accepted depth of nested mappings and lists
 
 YamlPath = tuple[str | int, ...]
 
@@ -86,20 +86,21 @@ _LARGEST_INTEGER = 2**63
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """Content of a YAML file, and the line of each value.
+    """Content of a YAML file, and the line number of each value.
 
-    A *path* is the keys and indices that lead to a value: ``("roles", "vehicle_2")``; ``()`` is the whole content.
+    A *path* is a tuple of the keys and indices that lead to a value, such as ``("roles", "vehicle_2")``; ``()`` leads
+    to the whole content.
     """
 
-    file: str  # path or name of the file, for messages
-    content: Any  # dict, list, str, int, float, bool or None, nested
-    lines: Mapping[YamlPath, int]  # path of a value -> its line, from 1
+    file: str  # path or name of the file, for error messages
+    content: Any  # content as plain data: dict, list, str, int, float, bool or None, nested
+    lines: Mapping[YamlPath, int]  # line number (from 1) of each value, by path
 
     def line_of(self, path: YamlPath) -> int | None:
-        """Return the line (from 1) of the value at ``path``; None if it is unknown.
+        """Return the line number (from 1) of the value at ``path``; None if no line is known.
 
-        ``path``: keys and indices that lead to the value. If there is no such value, the line of the innermost value
-        around it is returned.
+        ``path``: keys and indices that lead to the value. If the value does not exist, return the line of the innermost
+        mapping or list around the path.
         """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
@@ -107,18 +108,15 @@ class Document:
         return None
 
     def where(self, path: YamlPath) -> str:
-        """Return file and line of the value at ``path`` (keys and indices), as the beginning of a message.
-
-        For example ``my.yaml, line 7``.
-        """
+        """Return file and line number of the value at ``path`` (keys and indices), such as ``my.yaml, line 7``."""
         line = self.line_of(path)
         return self.file if line is None else f"{self.file}, line {line}"
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Context manager: an ``InvalidInput`` raised in the block is raised again, beginning with file and line.
+        """Context manager: if the block raises ``InvalidInput``, put file and line number in front of its message.
 
-        The line is that of the value at ``path``: keys and indices that lead to it.
+        ``path``: keys and indices that lead to the value whose line number is used.
         """
         try:
             yield
@@ -127,9 +125,9 @@ class Document:
 
 
 def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
-    """Read one YAML file of at most ``limit`` bytes.
+    """Read a YAML file of at most ``limit`` bytes.
 
-    Raises ``InvalidInput`` with file, line, column and reason for every defect.
+    Raises ``InvalidInput`` with file, line, column and reason if the file is not valid.
     """
     return parse_yaml(read_plain(path, limit), str(Path(path)), limit)
 
@@ -138,22 +136,22 @@ def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT)
     """Parse one YAML document.
 
     Args:
-        text: the document, text or UTF-8 bytes.
-        file: name of the document in messages.
+        text: the document, as text or as UTF-8 bytes.
+        file: name of the document in error messages.
         limit: largest accepted size in bytes.
 
-    Raises ``InvalidInput`` with file, line, column and reason for every defect.
+    Raises ``InvalidInput`` with file, line, column and reason if the document is not valid.
 
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if len(data) > limit:
-        _fail(file, None, f"larger than {limit // 1024} KiB, the limit for these files")
+        _fail(file, None, f"is larger than {limit // 1024} KiB, the limit for this kind of file")
     try:
         decoded = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = data[: error.start]
         at = (before.count(b"\n"), error.start - before.rfind(b"\n") - 1)
-        _fail(file, at, f"not UTF-8 text (byte 0x{data[error.start]:02x})")
+        _fail(file, at, f"byte 0x{data[error.start]:02x} is not valid UTF-8 text")
     return _parse(decoded, file)
 
 
@@ -182,22 +180,22 @@ def _fail(file: str, at: tuple[int, int] | None, reason: str) -> NoReturn:
 
 
 class _Reader:
-    """Reader of one document's content from YAML events."""
+    """Reader that builds the content of a document from YAML events."""
 
     def __init__(self, file: str, text: str) -> None:
         self.file, self.lines, self.at = file, dict[YamlPath, int](), (0, 0)  # line and column of the current event
         self._events = yaml.parse(text, Loader=yaml.SafeLoader)
 
     def read(self) -> Any:
-        """Return the value of the whole document; None if it is empty."""
+        """Return the content of the whole document; None if it is empty."""
         content, documents = None, 0
         for event in iter(self._next, None):
             if isinstance(event, yaml.DocumentStartEvent):
                 documents += 1
                 if documents > 1:
-                    self._fail("a second document starts here; one file holds one document")
+                    self._fail("a second document starts here; a file must contain only one document")
                 if event.tags or (event.version or (1, 2)) != (1, 2):
-                    self._fail("directives are not supported here")
+                    self._fail("YAML directives are not supported; remove them")
             elif isinstance(event, yaml.NodeEvent):
                 content = self._value(event, ())
         return content
@@ -212,13 +210,13 @@ class _Reader:
         _fail(self.file, self.at, reason)
 
     def _value(self, event: Any, path: YamlPath) -> Any:
-        """Return the value that begins with the YAML event ``event`` and belongs at ``path``."""
+        """Return the value at ``path``, which begins with the YAML event ``event``."""
         self._check_plain(event)
         self.lines.setdefault(path, self.at[0] + 1)
         if isinstance(event, yaml.ScalarEvent):
             return self._scalar(event)
         if len(path) >= DEPTH_LIMIT:
-            self._fail(f"nested deeper than {DEPTH_LIMIT} levels")
+            self._fail(f"mappings and lists must not be nested more than {DEPTH_LIMIT} deep")
         if isinstance(event, yaml.SequenceStartEvent):
             entries: list[Any] = []
             while not isinstance(inner := self._next(), yaml.SequenceEndEvent):
@@ -234,28 +232,28 @@ class _Reader:
 
     def _check_plain(self, event: Any) -> None:
         if isinstance(event, yaml.AliasEvent):
-            self._fail(f"alias *{event.anchor} is not supported; write the value out")
+            self._fail(f"alias *{event.anchor} is not supported; write the value itself")
         if event.anchor is not None:
-            self._fail(f"anchor &{event.anchor} is not supported; write the value out where it is needed")
+            self._fail(f"anchor &{event.anchor} is not supported; write the value wherever it is needed")
         if event.tag is not None:
-            self._fail(f"tag {event.tag} is not supported; write a plain value")
+            self._fail(f"tag {event.tag} is not supported; write the value without a tag")
 
     def _key(self, event: Any, before: Collection[str], path: YamlPath) -> str:
         if not isinstance(event, yaml.ScalarEvent):
             self._fail("a key must be text, not a list or a mapping")
         key = self._scalar(event)
         if event.implicit[0] and event.value == "<<":
-            self._fail("merge key << is not supported; write the values out")
+            self._fail("merge key << is not supported; write the keys and values themselves")
         if not isinstance(key, str):
-            self._fail(f"key {event.value!r} must be text; quote it if that is what is meant")
+            self._fail(f"key {event.value!r} must be text; if it is meant as text, put it in quotes")
         if key in before:
-            self._fail(f"key {key!r} is given twice, first on line {self.lines[(*path, key)]}")
+            self._fail(f"key {key!r} occurs twice; the first is on line {self.lines[(*path, key)]}")
         return key
 
     def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
-        """Convert the scalar of a YAML event by the core schema of YAML 1.2.
+        """Convert a YAML scalar to a Python value by the core schema of YAML 1.2.
 
-        A quoted or block scalar is always text.
+        A quoted or block scalar always becomes text.
         """
         text = str(event.value)
         if not event.implicit[0]:

@@ -1,6 +1,6 @@
-"""Conversion between an action in [-1, 1] and a commanded acceleration.
+"""Conversion between actions in [-1, 1] and commanded accelerations.
 
--1 is full braking capacity, 0 coasts, +1 is full driving capacity; linear on each side.
+Action -1 means full braking, 0 coasting and +1 full driving. Between these values the command is linear in the action.
 """
 
 from __future__ import annotations
@@ -15,33 +15,45 @@ from ethbrake_marl.game.discrete_actions import checked_indices, index_to_action
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Vehicles, real_numbers
 
-LARGEST = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # 1 plus one float32 step, accepted as a rounded 1
+# largest absolute value of an action that is accepted: the next float32 number above 1, which counts as 1
+LARGEST = float(np.nextafter(np.float32(1.0), np.float32(2.0)))
 
 
 def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str, count: int | None = None) -> Floats:
-    """Return the action as float64 of ``shape``; raise ``InvalidInput`` unless it fits and is in [-1, 1].
+    """Return the action as float64 of shape ``shape``; raise ``InvalidInput`` for a wrong shape or invalid values.
 
-    Axes of length 1 may be missing or added: a single action may be a number, [1] or [1, 1]. Rounding in a network can
-    exceed the bounds by one float32 step; such a value counts as -1 or 1. ``names`` names the vehicles in the message.
-    With a ``count``, ``action`` holds indices of ``count`` discrete actions instead (``index_to_action``).
+    Axes of length 1 may be missing or added: a single action may be a number, [1] or [1, 1]. Values outside [-1, 1] are
+    invalid, but a rounding error of one float32 step is accepted and clipped.
+
+    Args:
+        action: the actions of the vehicles; with ``count``, indices of discrete actions (``index_to_action``).
+        shape: required shape.
+        names: names of the vehicles, for error messages.
+        count: number of discrete actions; None: the actions are continuous.
+
     """
     number = _numbers(action, names) if count is None else index_to_action(action, count, names)
     if number.shape != shape and _longer_axes(number.shape) != _longer_axes(shape):
-        raise InvalidInput(f"action of {names}: shape {number.shape}; {shape} is needed")
+        raise InvalidInput(f"action of {names}: has shape {number.shape}; must have shape {shape}")
     good = (number >= -LARGEST) & (number <= LARGEST)
     if not good.all():
         raise InvalidInput(
-            f"action of {names}: {float(number[~good].flat[0])!r}; must be in [-1, 1], from full braking to full"
-            " driving"
+            f"action of {names}: {float(number[~good].flat[0])!r}; must be from -1 (full braking) to 1 (full driving)"
         )
     return number.reshape(shape).clip(-1.0, 1.0)
 
 
 def own_actions(actions: ArrayLike, names: str, count: int | None = None) -> NDArray[Any]:
-    """Return a copy of the actions as an array, which later changes by the caller do not affect.
+    """Return a copy of the actions as an array; later changes of ``actions`` by the caller do not affect it.
 
-    Raises ``InvalidInput`` for a list or tensor with values that are not numbers; a NumPy array is copied unchecked.
-    ``names``: names of the vehicles, for the message. With a ``count``, they are indices of ``count`` discrete actions.
+    A NumPy array is copied without checks. Raises ``InvalidInput`` for a list or tensor with values that are not
+    numbers, and, with ``count``, for invalid indices.
+
+    Args:
+        actions: the actions of the vehicles; with ``count``, indices of discrete actions.
+        names: names of the vehicles, for error messages.
+        count: number of discrete actions; None: the actions are continuous.
+
     """
     if isinstance(actions, np.ndarray):
         return actions.copy()
@@ -52,7 +64,7 @@ def _numbers(action: ArrayLike, names: str) -> Floats:
     try:
         return real_numbers(action)
     except ValueError as error:
-        raise InvalidInput(f"action of {names}: {action!r} {error}; a number in [-1, 1] is needed") from None
+        raise InvalidInput(f"action of {names}: {action!r} {error}; must be a number in [-1, 1]") from None
 
 
 def _longer_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -60,11 +72,11 @@ def _longer_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
-    """Return the acceleration that an action commands, [n] m/s2.
+    """Return the commanded acceleration of a vehicle for its action in every world, [n] m/s2.
 
     Args:
-        action: actions of one vehicle, [n] in [-1, 1].
-        vehicles: parameters of the n worlds, with the capacities.
+        action: action of the vehicle in each world, [n] in [-1, 1].
+        vehicles: parameters of the vehicles in n worlds, which include the capacities.
         vehicle: index of the vehicle, from 0.
 
     """
@@ -73,11 +85,11 @@ def action_to_command(action: Floats, vehicles: Vehicles, vehicle: int) -> Float
 
 
 def command_to_action(command_mps2: Floats, vehicles: Vehicles, vehicle: int) -> Floats:
-    """Return the action that commands an acceleration, [n]; clipped to [-1, 1], and 0 if the capacity is 0.
+    """Return the action of a vehicle for its command in every world, [n]; clipped to [-1, 1], 0 if the capacity is 0.
 
     Args:
-        command_mps2: commanded accelerations of one vehicle, [n] m/s2.
-        vehicles: parameters of the n worlds, with the capacities.
+        command_mps2: commanded acceleration of the vehicle in each world, [n] m/s2.
+        vehicles: parameters of the vehicles in n worlds, which include the capacities.
         vehicle: index of the vehicle, from 0.
 
     """
@@ -96,7 +108,7 @@ def command_of(action: float, braking: float, driving: float) -> float:
 
 @compiled
 def action_of(command: float, braking: float, driving: float) -> float:
-    """Return the action for a command (m/s2); clipped to [-1, 1], and 0 if the capacity is 0.
+    """Return the action for a command (m/s2); it is clipped to [-1, 1], and 0 if the capacity is 0.
 
     ``braking`` and ``driving`` are the largest deceleration and acceleration of the vehicle (m/s2).
     """
@@ -106,9 +118,9 @@ def action_of(command: float, braking: float, driving: float) -> float:
 
 @compiled
 def commands_of(action: Floats, braking: Floats, driving: Floats) -> Floats:
-    """Return the commanded acceleration for the action in every world, [n] m/s2.
+    """Return the commanded acceleration of a vehicle for its action in every world, [n] m/s2.
 
-    ``action`` [n] is in [-1, 1]; ``braking`` and ``driving`` [n] are the capacities of the vehicle (m/s2).
+    ``action``: action in [-1, 1], [n]. ``braking``, ``driving``: capacities of the vehicle, [n] m/s2.
     """
     command = np.empty(action.shape[0])
     for k in range(action.shape[0]):

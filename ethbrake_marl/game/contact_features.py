@@ -1,9 +1,9 @@
-"""Contact features: the next impacts that a vehicle forecasts under three commands of its own.
+"""Contact features: a vehicle forecasts its next impacts for three own commands, full braking, coasting, full driving.
 
-The vehicle considers the part of the line that it knows, as in its other features. It forecasts full braking, coasting
-and full driving of its own, which start once its own latency has elapsed. Every other vehicle of that part keeps its
-observed command. A vehicle without a command in force is assumed to brake fully once its latency has elapsed. So is a
-vehicle whose brakes build up and that brakes, because the present force does not show its command.
+A forecast covers only the vehicles that the observer knows. The observer's own command starts after its latency. The
+other vehicles continue with their observed commands, with two exceptions. A vehicle without a command in force is
+assumed to brake fully after its latency. A vehicle that brakes with brakes that build up is also assumed to brake
+fully, because its present deceleration does not show its command.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.rows import FLAG, ROW, place_obstacle, place_rates
 from ethbrake_marl.physics.state import Bools, Floats, Ints
 
-FORECAST_S = 10.0  # length of a forecast (s); also the reported time if there is no impact
+FORECAST_S = 10.0  # length of a forecast (s); without an impact, also the value of the feature time
 
-_OF_PAIR, _HARMS = 4, 2  # number of features per pair, and of the line
+_OF_PAIR, _HARMS = 4, 2  # number of features per pair, and number of features of the line's harm
 
 _OF_COMMAND = len(CONTACT_SIDES) * _OF_PAIR + _HARMS
 
-_NEAR = len(CONTACT_COMMANDS) * _OF_COMMAND  # number of columns of contact; those of contact_far follow
+_NEAR = len(CONTACT_COMMANDS) * _OF_COMMAND  # number of columns of contact; the columns of contact_far follow
 
 _FAR = len(CONTACT_SIDES) + _HARMS  # number of contact_far features per command
 
 
 class Contacts(NamedTuple):
-    """Which contact features to compute, and their scaling."""
+    """Arguments of the kernel that computes contact features: time step, commands and scaling."""
 
     time_step_s: float  # time between two decisions (s)
     commands: Ints  # commands to forecast, as indices into CONTACT_COMMANDS
-    # [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high; a column per contact feature
+    # scaling, [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high, one column per contact feature
     features: Floats
 
 
@@ -48,27 +48,27 @@ def observe_contacts(
     state: Floats, params: Floats, observers: Ints, time_step: float, commands: Ints, features: Floats,
     out: NDArray[np.float32], failed: Bools,
 ) -> None:  # fmt: skip
-    """Fill ``out`` [n, observers, features] with contact features, and set ``failed`` [n] where the kernel failed.
+    """Write the contact features of each observer into ``out``, and mark worlds whose forecast failed in ``failed``.
 
     Args:
         state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: their parameter rows.
+        params: parameter rows of the worlds, in the same layout.
         observers: indices of the observing vehicles.
         time_step: time between two decisions, s.
         commands: commands to forecast, as indices into CONTACT_COMMANDS.
-        features: scaling, [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high, a column per feature.
-        out: result; columns of commands that are not forecast stay as they are.
-        failed: set to True where a check of the kernel failed, [n].
+        features: scaling, [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high, one column per feature.
+        out: result, [n, observers, features]; columns of commands that are not forecast are not changed.
+        failed: set to True for each world in which a check of the kernel failed, [n].
 
     """
     of = columns(state)
     N, at = (
         of.vehicles,
         1 if state.shape[1] > of.obstacle else 0,
-    )  # vehicle i is column at + i; an obstacle is column 0
+    )  # vehicle i has column at + i; an obstacle has column 0
     line, table = np.zeros((ROW.OF_BUILD_UP, N + at)), np.zeros((ROW.OF_BUILD_UP, N + at))
     contacts, value = np.zeros((CONTACT.WIDTH, N + at)), np.zeros(_OF_COMMAND + _FAR)
-    no_pieces = np.zeros((N, 0))  # no vehicle knows the future pieces of another one
+    no_pieces = np.zeros((N, 0))  # no vehicle knows the future commands of another vehicle's profile script
     for k in range(out.shape[0]):
         for o in range(observers.shape[0]):
             i = observers[o]
@@ -90,7 +90,7 @@ def observe_contacts(
                 if forecast_contacts(table, params[k, of.restitution], FORECAST_S, contacts) != FLAG.DONE:
                     failed[k] = True
                     break
-                _tell(table, contacts, at + i, first, last, time_step, value)
+                _write_features(table, contacts, at + i, first, last, time_step, value)
                 for f in range(_OF_COMMAND + _FAR if out.shape[2] > _NEAR else _OF_COMMAND):
                     column = c * _OF_COMMAND + f if f < _OF_COMMAND else _NEAR + c * _FAR + f - _OF_COMMAND
                     scaled = value[f] * features[0, column]
@@ -99,18 +99,18 @@ def observe_contacts(
 
 @compiled
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
-    """Write the part of a world that a vehicle knows into a table; return the first and last column that it knows.
+    """Write the vehicles that a vehicle knows into a table; return the first and last column that it knows.
 
-    Unknown vehicles are placed far away, and so are those of which a piece is unknown that a forecast needs. If an
-    obstacle is known, it is the first column.
+    A vehicle is placed far away if it is unknown, or if some of its data that a forecast needs are unknown. The column
+    of a known obstacle counts as known.
 
     Args:
         table: table to fill, in the layout of ``physics.rows``, [rows, N + at].
         state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: their parameter rows.
-        k: row of the world.
+        params: parameter rows of the worlds, in the same layout.
+        k: index of the world.
         i: index of the vehicle.
-        at: 1 if the rows have an obstacle, which is then column 0 of the table; otherwise 0.
+        at: 1 if the worlds have an obstacle, which then has column 0 of the table; otherwise 0.
 
     """
     of = columns(state)
@@ -138,7 +138,7 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
         if j == i or in_force == 0.0:
             table[ROW.ONSET, at + j] = max(params[k, own_part + j] - time, 0.0)
             table[ROW.COMMAND, at + j] = -params[k, braking + j] if known else 0.0
-        elif known and in_force < 0.0 and params[k, of.brake_rate + j] < math.inf:  # its force may still be building up
+        elif known and in_force < 0.0 and params[k, of.brake_rate + j] < math.inf:  # its brakes may still build up
             table[ROW.COMMAND, at + j] = -params[k, braking + j]
         table[ROW.FORCE, at + j] = in_force if known else 0.0
         if j < N - 1:
@@ -152,20 +152,22 @@ def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, a
 
 
 @compiled
-def _tell(table: Floats, found: Floats, own: int, first: int, last: int, time_step: float, value: Floats) -> None:
-    """Compute the unscaled contact features of one forecast into ``value``.
+def _write_features(
+    table: Floats, found: Floats, own: int, first: int, last: int, time_step: float, value: Floats
+) -> None:
+    """Compute the contact features of one forecast, before scaling, and write them into ``value``.
 
-    A feature is 0 for a pair whose other vehicle is unknown or does not exist. An impact at the very end of a decision
-    step belongs to that step, as in the engine.
+    The features of a pair are 0 if the other vehicle is unknown or does not exist. An impact exactly at the end of a
+    decision step belongs to this step, as in the engine.
 
     Args:
         table: the world after the forecast, in the layout of ``physics.rows``.
-        found: next impact of each pair, as ``forecast_contacts`` wrote it.
+        found: next impact of each pair, the result of ``forecast_contacts``.
         own: column of the observing vehicle.
         first: first column that the vehicle knows.
-        last: last column that it knows.
+        last: last column that the vehicle knows.
         time_step: time between two decisions, s.
-        value: result.
+        value: result, one number per feature.
 
     """
     for side in range(2):

@@ -1,4 +1,4 @@
-"""``Game``: what an engine needs to know of the game that it plays."""
+"""``Game``: the properties of a game that the engine uses."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from ethbrake_marl.physics.state import Worlds
 
 
 class Drawn(Protocol):
-    """What ``Game.sample`` returns: an object with the drawn worlds in ``worlds``, such as a ``Sample``."""
+    """Result of ``Game.sample``: an object with the drawn worlds in its attribute ``worlds``, such as a ``Sample``."""
 
     @property
     def worlds(self) -> Worlds:
-        """The drawn worlds [n], at the alert (time 0)."""
+        """The n drawn worlds at the alert (time 0)."""
 
 
 class Game(Protocol):
-    """The definition of a game: its players, its clock, and where its worlds come from. A ``Scenario`` is one."""
+    """Definition of a game: vehicles, times, objectives, observations and worlds. A ``Scenario`` is a game."""
 
     @property
     def name(self) -> str:
-        """Name of the game, for messages."""
+        """Name of the game, for error messages."""
 
     @property
     def vehicles(self) -> int:
@@ -50,11 +50,11 @@ class Game(Protocol):
 
     @property
     def objective(self) -> Declared:
-        """Whose harm each vehicle minimises: one name for all vehicles or one per vehicle; a reward may override it."""
+        """Objective of the vehicles: one name for all or one name per vehicle; a reward may replace it."""
 
     @property
     def observation(self) -> Any:
-        """The features that vehicles observe: a list for all, or lists by vehicle; None: see ``observations_of``."""
+        """Features that vehicles observe: one list, or lists by vehicle name; None: see ``observations_of``."""
 
     @property
     def has_obstacle(self) -> bool:
@@ -62,14 +62,14 @@ class Game(Protocol):
 
     @property
     def by_link(self) -> bool:
-        """Whether messages reach each vehicle over a link of its own, with its own delay and losses."""
+        """Whether vehicles get news over links with their own delays and losses, not from their own latency on."""
 
     @property
     def builds_up(self) -> bool:
-        """Whether the brakes of a vehicle may build up gradually instead of acting at once."""
+        """Whether the brakes of some vehicle may build up gradually instead of acting at once."""
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
         """Draw worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
 
-        ``channel``: ``"list"`` for evaluation, ``"training"`` for training; the two lists are independent.
+        ``channel``: ``"list"`` (worlds for evaluation) or ``"training"``, two independent lists.
         """

@@ -1,4 +1,4 @@
-"""Discrete actions: indices of evenly spaced actions from -1 (index 0) to 1 (the last index)."""
+"""Discrete actions: an index selects one of K evenly spaced actions, from -1 (index 0) to 1 (index K - 1)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from ethbrake_marl.physics.state import Floats, Ints, real_numbers
 
 
 def index_to_action(indices: ArrayLike, count: int, names: str = "the learners") -> Floats:
-    """Return the action in [-1, 1] of each index, float64 of the same shape: (2 k - K + 1) / (K - 1).
+    """Return the action in [-1, 1] for each index k, float64 of the same shape: (2 k - K + 1) / (K - 1).
 
-    k is an index, K the ``count``. An odd K has an action that is exactly 0, in the middle.
+    K is ``count``, the number of actions. If K is odd, the action in the middle is exactly 0.
 
     Args:
-        indices: whole numbers from 0 (full braking capacity) to ``count - 1`` (full driving capacity), of any shape.
+        indices: whole numbers from 0 (full braking) to ``count - 1`` (full driving), of any shape.
         count: number of actions, at least 2.
-        names: whose actions these are, for error messages.
+        names: names of the vehicles, for error messages.
 
-    Raises ``InvalidInput`` as ``checked_indices`` does.
+    Raises the same ``InvalidInput`` as ``checked_indices``.
 
     >>> from ethbrake_marl.game.discrete_actions import index_to_action
     >>> index_to_action([0, 1, 4, 8], 9)
@@ -32,10 +32,10 @@ def index_to_action(indices: ArrayLike, count: int, names: str = "the learners")
 def checked_indices(indices: ArrayLike, count: int, names: str) -> Ints:
     """Return the indices as int64 of the same shape.
 
-    Raises ``InvalidInput`` for a value that is not a whole number from 0 to ``count - 1``. A float is refused, also
-    3.0: it would be an action in [-1, 1] without ``actions=``.
+    Raises ``InvalidInput`` for a value that is not a whole number from 0 to ``count - 1``. A float such as 1.0 is also
+    invalid, because it is probably meant as a continuous action. ``names``: names of the vehicles, for error messages.
     """
-    right = f"with actions={count} an index is needed, a whole number from 0 to {count - 1}"
+    right = f"with actions={count}, an action must be an index, a whole number from 0 to {count - 1}"
     try:
         real_numbers(indices)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""The named features of an observation, built in or registered."""
+"""The features that an observation can have: built-in features in groups, and registered features."""
 
 from __future__ import annotations
 
@@ -26,29 +26,29 @@ Of = Literal["own", "neighbour"]
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """One number of an observation: ``clip(value / scale, low, high)``."""
+    """A feature, one number of an observation; the number that is observed is ``clip(value / scale, low, high)``."""
 
-    name: str  # full name, such as ``own.speed``, or the name inside a group
+    name: str  # full name, such as ``own.speed``, or name inside a group, such as ``speed``
     unit: str  # unit of the value
-    scale: float  # the value is divided by this, in ``unit``
-    low: float  # least number that is observed
+    scale: float  # number by which the value is divided, in ``unit``
+    low: float  # smallest number that is observed
     high: float  # largest number that is observed
-    meaning: str  # what it is, in words
+    meaning: str  # meaning of the value, in words
 
 
 CONTACT_COMMANDS = ("brake", "coast", "drive")  # own commands of the forecasts: full braking, coasting, full driving
 
-CONTACT_SIDES = ("front", "rear")  # the vehicle's pairs; in front of Vehicle 1 an obstacle
+CONTACT_SIDES = ("front", "rear")  # the vehicle's two pairs; the front pair of Vehicle 1 is with the obstacle
 
 
 class Groups(NamedTuple):
-    """The built-in features by group; contact features exist for each of ``CONTACT_COMMANDS``."""
+    """The built-in features by group. Contact features exist for each of ``CONTACT_COMMANDS``."""
 
-    own: tuple[Feature, ...]  # the vehicle itself
-    role: tuple[Feature, ...]  # its place in the line
-    obstacle: tuple[Feature, ...]  # the obstacle ahead of the line
-    contact: tuple[Feature, ...]  # next impacts that it forecasts under own commands
-    contact_far: tuple[Feature, ...]  # late or hard impacts, beyond the bounds of ``contact``
+    own: tuple[Feature, ...]  # features of the vehicle itself
+    role: tuple[Feature, ...]  # place of the vehicle in the line
+    obstacle: tuple[Feature, ...]  # features of the obstacle ahead of the line
+    contact: tuple[Feature, ...]  # next impacts that the vehicle forecasts for each own command
+    contact_far: tuple[Feature, ...]  # the same for impacts so late or hard that features of ``contact`` are clipped
     neighbour: tuple[Feature, ...]  # features of each neighbour (``front_1``, ...)
 
 
@@ -56,73 +56,96 @@ _contact: list[Feature] = []
 
 _far: list[Feature] = []
 
-for _command, _held in zip(CONTACT_COMMANDS, ("braking fully", "coasting", "driving fully"), strict=True):
-    for _side, _where in zip(CONTACT_SIDES, ("in front", "behind"), strict=True):  # four features per pair
-        _pair, _told = f"{_command}_{_side}", f"{_held}: time to the first impact {_where}"
-        _contact += [
-            Feature(f"{_pair}_time", "s", 2.0, 0.0, 2.0, _told),
-            Feature(f"{_pair}_closing_speed", "m/s", 10.0, 0.0, 4.0, "its closing speed; 0 without one"),
-            Feature(f"{_pair}_fraction", "1", 1.0, 0.0, 1.0, "where in its decision step it falls"),
-            Feature(f"{_pair}_steps", "1", 10.0, 0.0, 2.0, "whole decision steps before that one"),
+for _command, _held in zip(CONTACT_COMMANDS, ("full braking", "coasting", "full driving"), strict=True):
+    for _side, _where in zip(CONTACT_SIDES, ("the vehicle ahead", "the vehicle behind"), strict=True):
+        _pair, _impact = f"{_command}_{_side}", f"forecast for {_held}, first impact with {_where}"
+        _contact += [  # four features per pair
+            Feature(f"{_pair}_time", "s", 2.0, 0.0, 2.0, f"{_impact}: time until this impact"),
+            Feature(f"{_pair}_closing_speed", "m/s", 10.0, 0.0, 4.0, f"{_impact}: closing speed; 0 without impact"),
+            Feature(f"{_pair}_fraction", "1", 1.0, 0.0, 1.0, f"{_impact}: time within its decision step, 0 to 1"),
+            Feature(f"{_pair}_steps", "1", 10.0, 0.0, 2.0, f"{_impact}: number of full decision steps before it"),
         ]
-        _far += [Feature(f"{_pair}_time", "s", 5.0, 0.0, 2.0, _told)]
-    _contact += [  # features of the whole line
-        Feature(f"{_command}_first_impact_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: first-impact harm of the line"),
-        Feature(f"{_command}_total_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_held}: total harm of the line"),
+        _far += [Feature(f"{_pair}_time", "s", 5.0, 0.0, 2.0, f"{_impact}: time until this impact")]
+    _line = f"forecast for {_held}:"
+    _contact += [  # features of all pairs that the vehicle knows
+        Feature(f"{_command}_first_impact_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_line} first-impact harm of known pairs"),
+        Feature(f"{_command}_total_harm", "m2/s2", 50.0, 0.0, 4.0, f"{_line} total harm of known pairs"),
     ]
-    _far += [  # late or hard impacts, beyond the bounds of the features above
-        Feature(f"{_command}_first_impact_speed", "m/s", 10.0, 0.0, 6.0, "square root of the first-impact harm"),
-        Feature(f"{_command}_total_speed", "m/s", 10.0, 0.0, 6.0, "square root of the total harm"),
+    _far += [
+        Feature(f"{_command}_first_impact_speed", "m/s", 10.0, 0.0, 6.0, f"{_line} square root of first-impact harm"),
+        Feature(f"{_command}_total_speed", "m/s", 10.0, 0.0, 6.0, f"{_line} square root of total harm"),
     ]
 
 GROUPS = Groups(
     own=(
         Feature("speed", "m/s", 20.0, -2.0, 4.0, "own speed"),
-        Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "own command in force"),
+        Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "own acceleration in force"),
         Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest deceleration"),
         Feature("driving_capacity", "m/s2", 10.0, 0.0, 2.0, "own largest forward acceleration"),
         Feature("mass", "t", 10.0, 0.0, 8.0, "own mass"),
         Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until own commands take effect"),
-        Feature("restitution", "1", 1.0, 0.0, 1.0, "coefficient of restitution"),
+        Feature("restitution", "1", 1.0, 0.0, 1.0, "coefficient of restitution of all impacts"),
     ),
     role=(
-        Feature(
-            "vehicles_ahead", "1", 1.0, 0.0, 2.0, "how many vehicles are ahead in the line; 2 stands for 2 or more"
-        ),
-        Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "how many are behind"),
+        Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "number of vehicles ahead in the line; 2 means 2 or more"),
+        Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "number of vehicles behind in the line; 2 means 2 or more"),
     ),
     obstacle=(
         Feature(
             "known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"
         ),
-        Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, vehicles between not counted as length"),
-        Feature("hit", "1", 1.0, 0.0, 1.0, "1 if Vehicle 1 has had an impact with it"),
+        Feature("gap", "m", 10.0, 0.0, 10.0, "sum of the gaps from this vehicle to the obstacle"),
+        Feature("hit", "1", 1.0, 0.0, 1.0, "1 if Vehicle 1 has had an impact with the obstacle"),
         Feature(
-            "stopping_margin", "m", 10.0, -15.0, 20.0, "distance left at rest after braking fully as soon as possible"
+            "stopping_margin",
+            "m",
+            10.0,
+            -15.0,
+            20.0,
+            "distance to the obstacle at rest if this vehicle brakes fully as soon as possible",
         ),
-        Feature(
-            "fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own constant deceleration that ends at rest, touching it"
-        ),
-    ),
-    contact=tuple(_contact),
-    contact_far=tuple(_far),
-    neighbour=(
-        Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists and its message has arrived"),
-        Feature("gap", "m", 10.0, 0.0, 10.0, "free distance to it, other vehicles between not counted as length"),
-        Feature("closing_speed", "m/s", 10.0, -4.0, 4.0, "positive when the two approach"),
-        Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "its command in force"),
-        Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "its largest deceleration"),
-        Feature("mass", "t", 10.0, 0.0, 8.0, "its mass"),
-        Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until its commands take effect"),
-        Feature("hit", "1", 1.0, 0.0, 1.0, "1 if the pair on its side has had an impact"),
-        Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "gap left at rest if both brake fully as soon as they can"),
         Feature(
             "fitting_deceleration",
             "m/s2",
             10.0,
             0.0,
             2.0,
-            "own constant deceleration with which the two would come to rest touching, the neighbour braking fully",
+            "own constant deceleration with which this vehicle stops exactly at the obstacle",
+        ),
+    ),
+    contact=tuple(_contact),
+    contact_far=tuple(_far),
+    neighbour=(
+        Feature("known", "1", 1.0, 0.0, 1.0, "1 if this neighbour exists and its state is known"),
+        Feature("gap", "m", 10.0, 0.0, 10.0, "sum of the gaps between this vehicle and the neighbour"),
+        Feature("closing_speed", "m/s", 10.0, -4.0, 4.0, "closing speed of the two vehicles, above 0 if they approach"),
+        Feature("acceleration", "m/s2", 10.0, -2.0, 2.0, "acceleration in force of the neighbour"),
+        Feature("braking_capacity", "m/s2", 10.0, 0.0, 2.0, "largest deceleration of the neighbour"),
+        Feature("mass", "t", 10.0, 0.0, 8.0, "mass of the neighbour"),
+        Feature("latency_left", "s", 1.0, 0.0, 4.0, "time until the neighbour's commands take effect"),
+        Feature(
+            "hit",
+            "1",
+            1.0,
+            0.0,
+            1.0,
+            "1 if this vehicle has had an impact with the next vehicle on the neighbour's side",
+        ),
+        Feature(
+            "stopping_margin",
+            "m",
+            10.0,
+            -15.0,
+            20.0,
+            "gap to the neighbour at rest if both vehicles brake fully as soon as possible",
+        ),
+        Feature(
+            "fitting_deceleration",
+            "m/s2",
+            10.0,
+            0.0,
+            2.0,
+            "own constant deceleration with which both vehicles stop with gap 0 if the neighbour brakes fully",
         ),
     ),
 )
@@ -132,14 +155,14 @@ _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 @dataclass(frozen=True, slots=True)
 class RegisteredFeature:
-    """A registered feature, or a built-in one that belongs to no group."""
+    """A feature that a function of its own computes: a registered feature, or a built-in one outside the groups."""
 
-    feature: Feature  # name, unit, scale, bounds and meaning
+    feature: Feature  # name, unit, scale, bounds and meaning of the feature
     function: Callable[..., Floats]  # (worlds, vehicle) or (worlds, vehicle, neighbour) -> value, [n]
-    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
+    of: Of  # vehicle that the feature describes: ``own``, the observer itself; ``neighbour``, a neighbour
     unknown: float  # value for an unknown neighbour, in the feature's unit
-    tried: tuple[float, ...]  # values in a few test worlds, which reveal a changed function
-    reads: tuple[Piece, ...] | None = None  # pieces of a neighbour's message that the function reads; None: not said
+    tried: tuple[float, ...]  # values in a few test worlds; a changed function gives other values
+    reads: tuple[Piece, ...] | None = None  # data of the neighbour that the function reads; None: not specified
 
     def scaled(self, value: Floats) -> Floats:
         """Return the observed number ``clip(value / scale, low, high)`` for a ``value`` in the feature's unit."""
@@ -147,17 +170,17 @@ class RegisteredFeature:
         return np.clip(value * (1.0 / feature.scale), feature.low, feature.high)
 
     def checked(self, worlds: Worlds, vehicle: int, neighbour: int | None, counts: Any, steps: Floats | None) -> Floats:
-        """Compute the feature in n worlds and return it scaled, [n].
+        """Compute the feature in n worlds and return the scaled and clipped values, [n].
 
         Raises ``InvalidInput`` naming feature, vehicle and world for a result of wrong shape or a value that is not
         finite.
 
         Args:
-            worlds: the n worlds.
+            worlds: worlds in which to compute the feature, n of them.
             vehicle: index of the observing vehicle, from 0.
             neighbour: index of the neighbour; None for a feature of the vehicle itself.
-            counts: whether to use the value, a mask [n] or one truth value; other worlds get ``unknown``.
-            steps: number of steps so far, [n], for messages, if known.
+            counts: worlds in which the value is used, a mask [n] or one truth value; in all others it is ``unknown``.
+            steps: number of steps so far, [n], for error messages; None: unknown.
 
         """
         name = self.feature.name
@@ -165,8 +188,8 @@ class RegisteredFeature:
         value = np.asarray(self.function(*arguments))
         if value.shape != (worlds.n,) or value.dtype.kind not in "fiub":
             raise InvalidInput(
-                f"feature {name!r}: gave {value.dtype} of shape {value.shape}; must be numbers of shape ({worlds.n},),"
-                " one per world"
+                f"feature {name!r}: its function returned {value.dtype} of shape {value.shape}; must return numbers of"
+                f" shape ({worlds.n},), one per world"
             )
         values = np.where(counts, value, self.unknown)
         if not np.isfinite(values).all():
@@ -182,39 +205,39 @@ class RegisteredFeature:
 def age(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
     """Return the age of the newest state that ``vehicle`` has received from ``neighbour``, [n] s.
 
-    It is 0 if the present state is known. Both are indices from 0.
+    The age is 0 if the present state is known. ``vehicle`` and ``neighbour`` are indices from 0.
     """
     ages = Messages.of(worlds).age_s(worlds.time_s)[:, vehicle, neighbour]
     return np.where(np.isfinite(ages), ages, 0.0)
 
 
 def intent(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
-    """Return the command that the neighbour chose at its last decision, as its newest message told it, [n] m/s2."""
+    """Return the intent in the neighbour's newest message, [n] m/s2: the command that it chose at its last decision."""
     return Messages.of(worlds).intents(vehicle)[:, neighbour]
 
 
 def build_up_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the time in which the brakes of the neighbour build up from 0 to full, [n] s; 0: at once.
+    """Return the time in which the brakes of a vehicle build up from 0 to full, [n] s; 0 for brakes that act at once.
 
-    Both vehicles are indices from 0; ``neighbour`` None: the brakes of ``vehicle`` itself.
+    The vehicle is ``neighbour``, or ``vehicle`` if ``neighbour`` is None (indices from 0).
     """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.brake_rate_mps3[:, i]
 
 
 def release_time(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the time in which the fully applied brakes of the neighbour are released, [n] s; 0: at once.
+    """Return the time in which fully applied brakes of a vehicle are released, [n] s; 0 for release at once.
 
-    Both vehicles are indices from 0; ``neighbour`` None: the brakes of ``vehicle`` itself.
+    The vehicle is ``neighbour``, or ``vehicle`` if ``neighbour`` is None (indices from 0).
     """
     i, v = vehicle if neighbour is None else neighbour, worlds.vehicles
     return v.braking_capacity_mps2[:, i] / v.release_rate_mps3[:, i]
 
 
 def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> Floats:
-    """Return the weight of the neighbour's harm in the objective ``preference``, as a share of the line's, [n].
+    """Return the weight of a vehicle's harm in the objective ``preference``, divided by the sum of all weights, [n].
 
-    Both vehicles are indices from 0; ``neighbour`` None: the weight of ``vehicle`` itself.
+    The vehicle is ``neighbour``, or ``vehicle`` if ``neighbour`` is None (indices from 0).
     """
     weight = worlds.vehicles.harm_weight
     share: Floats = weight[:, vehicle if neighbour is None else neighbour] / weight.sum(axis=1)
@@ -224,7 +247,7 @@ def harm_weight(worlds: Worlds, vehicle: int, neighbour: int | None = None) -> F
 def place(worlds: Worlds, vehicle: int) -> Floats:
     """Return the number of vehicles ahead of ``vehicle`` (index from 0) in the line, [n].
 
-    It distinguishes the vehicles of a shared policy.
+    With this feature a policy that several vehicles share can distinguish them.
     """
     return np.full(worlds.n, float(vehicle))
 
@@ -236,8 +259,8 @@ def _single(
 
 
 def _knows(piece: Piece) -> RegisteredFeature:
-    """Return the feature that is 1 where the vehicle knows this piece of the neighbour."""
-    meaning = f"1 if its {piece.replace('_', ' ')} is known: a message told it, or, where sensors can, it is measured"
+    """Return the feature that is 1 if the vehicle knows this ``piece`` of the neighbour's data, such as its mass."""
+    meaning = f"1 if the neighbour's {piece.replace('_', ' ')} is known, from a message or from sensors"
     feature = Feature(f"{piece}_known", "1", 1.0, 0.0, 1.0, meaning)
     return RegisteredFeature(feature, _certain, "neighbour", 0.0, (1.0, 1.0, 1.0), (piece,))
 
@@ -248,19 +271,28 @@ def _certain(worlds: Worlds, vehicle: int, neighbour: int) -> Floats:
 
 _BUILT_IN: dict[str, RegisteredFeature] = {
     "age": _single(
-        "age", 8.0, age, "neighbour", "time since the sample that was last told of it; 0 where the present is known"
+        "age",
+        8.0,
+        age,
+        "neighbour",
+        "age of the newest state received from the neighbour; 0 if its present state is known",
     ),
     "build_up_time": _single(
         "build_up_time",
         4.0,
         build_up_time,
         "neighbour",
-        "time in which its brakes build up from 0 to full; 0: at once",
+        "time in which the neighbour's brakes build up from 0 to full; 0 if they act at once",
         "braking_capacity",
     ),
     "intent": RegisteredFeature(
         Feature(
-            "intent", "m/s2", 10.0, -2.0, 2.0, "command that it chose at its last decision; where messages tell it"
+            "intent",
+            "m/s2",
+            10.0,
+            -2.0,
+            2.0,
+            "command that the neighbour chose at its last decision, if its messages contain it",
         ),
         intent,
         "neighbour",
@@ -274,17 +306,32 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
         4.0,
         release_time,
         "neighbour",
-        "time in which its full brakes are released; 0: at once",
+        "time in which the neighbour's fully applied brakes are released; 0 if at once",
         "braking_capacity",
     ),
     "own_build_up_time": _single(
-        "own_build_up_time", 4.0, build_up_time, "own", "time in which own brakes build up from 0 to full; 0: at once"
+        "own_build_up_time",
+        4.0,
+        build_up_time,
+        "own",
+        "time in which own brakes build up from 0 to full; 0 if they act at once",
     ),
     "own_release_time": _single(
-        "own_release_time", 4.0, release_time, "own", "time in which own full brakes are released; 0: at once"
+        "own_release_time",
+        4.0,
+        release_time,
+        "own",
+        "time in which fully applied own brakes are released; 0 if at once",
     ),
     "harm_weight": RegisteredFeature(
-        Feature("harm_weight", "1", 1.0, 0.0, 1.0, "weight of its harm in objective: preference, share of all weights"),
+        Feature(
+            "harm_weight",
+            "1",
+            1.0,
+            0.0,
+            1.0,
+            "weight of the neighbour's harm in objective: preference, divided by the sum of all weights",
+        ),
         harm_weight,
         "neighbour",
         0.0,
@@ -292,14 +339,21 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
         (),
     ),
     "own_harm_weight": RegisteredFeature(
-        Feature("own_harm_weight", "1", 1.0, 0.0, 1.0, "weight of own harm there, share of all weights"),
+        Feature(
+            "own_harm_weight",
+            "1",
+            1.0,
+            0.0,
+            1.0,
+            "weight of own harm in objective: preference, divided by the sum of all weights",
+        ),
         harm_weight,
         "own",
         0.0,
         (1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0),
     ),
     "place": RegisteredFeature(
-        Feature("place", "1", 1.0, 0.0, 63.0, "how many vehicles are ahead in the line"),
+        Feature("place", "1", 1.0, 0.0, 63.0, "number of vehicles ahead in the line"),
         place,
         "own",
         0.0,
@@ -311,22 +365,22 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
 def listed_features(listed: object) -> tuple[str, ...]:
     """Return the full names of the features in a list of groups and single features, in order.
 
-    For example ``("own.speed", ..., "front_1.gap")`` for ``["own", "front_1.gap"]``. Raises ``UnknownName`` with a
-    suggestion; ``InvalidInput`` if it is not a list, is empty, or has a feature twice.
+    The result for ``["own", "front_1.gap"]`` is ``("own.speed", ..., "front_1.gap")``. Raises ``UnknownName`` with a
+    suggestion for an unknown name, and ``InvalidInput`` if ``listed`` is not a list, is empty, or has a feature twice.
     """
     if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
     names = [name for each in listed for name in _expanded(each)]
     for name, times in Counter(names).items():
         if times > 1:
-            raise InvalidInput(f"observation: {name} is listed twice")
+            raise InvalidInput(f"observation: {name} is listed twice; list it once")
     return tuple(names)
 
 
 class _ListSchema:
-    """Annotation of a field that lists the features of an observation: its JSON schema names all features.
+    """Pydantic annotation of a list of features: the field's JSON schema has the names of all features.
 
-    Features that are registered before the schema is made are included.
+    The schema includes features that are registered before it is generated.
     """
 
     @classmethod
@@ -340,7 +394,7 @@ ListedFeatures = Annotated[tuple[str, ...], Field(strict=False), _ListSchema]
 
 
 def feature_named(name: str) -> Feature:
-    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` if none has it."""
+    """Return the feature with the full name ``name``, such as ``front_1.gap``; raise ``UnknownName`` for any other."""
     group, dot, own = name.partition(".")
     if name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
@@ -353,22 +407,22 @@ def feature_named(name: str) -> Feature:
 
 
 def side_of(name: str) -> tuple[str, int] | None:
-    """Return the neighbour in a full feature name, for example ``("front", 1)``; None if the name has none."""
+    """Return side and number of the neighbour in a full feature name, such as ``("front", 1)``; None without one."""
     match = _SIDE.fullmatch(name.partition(".")[0])
     return (match[1], int(match[2])) if match and int(match[2]) <= MOST_NEIGHBOURS else None
 
 
 def registered_in(names: Iterable[str]) -> dict[str, RegisteredFeature]:
-    """Return name -> feature of the registered features among these full names.
+    """Return the registered features among these full names, by their names without neighbour.
 
-    The key is the feature's own name: ``age`` for ``front_1.age``.
+    For example, the key of ``front_1.age`` is ``age``.
     """
     own = [name.partition(".")[2] or name for name in names]
     return {name: FEATURES[name] for name in own if name in FEATURES}
 
 
 def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
-    """Return what an ``observation:`` list may contain: names of groups, then of single features.
+    """Return the names that an ``observation:`` list may contain: groups first, then single features.
 
     ``sides``: neighbours whose features are included, such as ``front_1``.
     """
@@ -382,7 +436,7 @@ def choices(sides: Iterable[str] = ("front_1", "rear_1")) -> list[str]:
 
 def _expanded(each: object) -> tuple[str, ...]:
     if not isinstance(each, str):
-        raise InvalidInput(f"observation: {each!r:.60}: must be the name of a group or a feature")
+        raise InvalidInput(f"observation: {each!r:.60}: must be the name of a group or of a feature")
     if group := _group(each):
         return tuple(f"{each}.{feature.name}" for feature in group)
     return (feature_named(each).name,)
@@ -400,12 +454,12 @@ def _is_side(name: str) -> bool:
 
 def _unknown(name: str) -> InvalidInput:
     if name in FEATURES:
-        return InvalidInput(f"feature {name!r} is of a neighbour: write front_1.{name} or rear_1.{name}")
+        return InvalidInput(f"feature {name!r} describes a neighbour; write front_1.{name} or rear_1.{name}")
     side = name.partition(".")[0]
     sides = ["front_1", "rear_1"] + ([side] if _is_side(side) else [])
     known = choices(dict.fromkeys(sides))
     if not get_close_matches(name, known, n=1):
-        known = [each for each in known if "." not in each]  # a hundred single features would hide the groups
+        known = [each for each in known if "." not in each]  # about a hundred features of groups are too many to list
     return unknown_name("feature", name, known, may_be_own=True)
 
 
@@ -424,45 +478,51 @@ def register_feature(
     unknown: float = 0.0,
     reads: Sequence[Piece] | None = None,
 ) -> None:
-    """Register ``name`` as a feature that an ``observation:`` may list; its meaning is the function's docstring.
+    """Register a feature, so that an ``observation:`` list can contain it. The function's docstring is its meaning.
 
-    An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``: a ``Part``
-    with the arguments after ``name``.
+    An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``. The entry
+    point names a ``Part`` with the arguments after ``name``.
+
+    The channel does not restrict a feature of kind ``own``: its function can read data of other vehicles that no
+    message has delivered. Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is
+    in use. Raises ``InvalidInput`` for invalid arguments, and if the function, called for a few test worlds, fails or
+    returns a wrong shape or a number that is not finite.
 
     Args:
-        name: lower case letters, digits and ``_``. A feature of the vehicle itself is listed under this name, a feature
-            of a neighbour as ``front_1.name``.
-        function: ``function(worlds, vehicle)`` returns the value [n] in ``unit``; vehicle 0 is in front. For a
-            neighbour: ``function(worlds, vehicle, neighbour)``. It must work for lines of any length, and depend on
-            nothing but its arguments.
+        name: name of the feature, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. An
+            observation lists a feature of the vehicle itself as ``name``, a feature of a neighbour as ``front_1.name``.
+        function: ``function(worlds, vehicle)``, or ``function(worlds, vehicle, neighbour)`` for a feature of a
+            neighbour. It returns the value in each world, [n], in ``unit``. Index 0 is the front vehicle. The function
+            must work for any number of vehicles and must not depend on anything but its arguments.
         unit: unit of the value.
-        scale: the observed number is ``clip(value / scale, low, high)``; above 0.
-        low: see ``scale``.
-        high: see ``scale``; above ``low``.
-        of: ``own`` or ``neighbour``. A neighbour's feature is observed only if the vehicle has its news.
-        unknown: value of a neighbour's feature if the vehicle knows nothing of the neighbour, in ``unit``.
-        reads: pieces of the neighbour's message that the function needs (``v2x: tells``); where one is not known, the
-            value is ``unknown``. None: not said, so scenarios whose messages lack a piece refuse the feature.
-
-    A channel hides nothing from a feature of kind ``own``: its author decides what it reveals of other vehicles.
-    Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is taken; ``InvalidInput``
-    for invalid arguments, or if in a few test worlds the function fails, or returns a wrong shape or a number that is
-    not finite.
+        scale: number above 0; the observed number is ``clip(value / scale, low, high)``.
+        low: smallest observed number.
+        high: largest observed number, above ``low``.
+        of: vehicle that the feature describes: ``own``, the observer itself; ``neighbour``, a neighbour. The value for
+            a neighbour is observed only if the vehicle knows the neighbour.
+        unknown: value for an unknown neighbour, in ``unit``; must be 0 if ``of`` is ``own``.
+        reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``); if some of them
+            are unknown, the value is ``unknown``. None: not specified; a scenario whose messages do not contain all
+            data then rejects the feature.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise InvalidInput(f"feature {name!r:.80}: must be 1 to 64 of a-z, 0-9 and _, beginning with a letter")
+        raise InvalidInput(
+            f"feature {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter"
+        )
     if not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"feature {name!r}: needs a function with a docstring that says what it means")
+        raise InvalidInput(f"feature {name!r}: must be a function with a docstring that describes the feature")
     _check_numbers(name, scale=scale, low=low, high=high, unknown=unknown)
     if of not in get_args(Of) or (of == "own" and unknown != 0.0):
         raise InvalidInput(
-            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: must be own, or neighbour (with any unknown)"
+            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: of must be own or neighbour; with own, unknown must"
+            " be 0"
         )
 
     if reads is not None and not (of == "neighbour" and not isinstance(reads, str) and set(reads) <= set(PIECES)):
         raise InvalidInput(
-            f"feature {name!r}: reads = {reads!r}: a neighbour's feature names some of {', '.join(PIECES)}"
+            f"feature {name!r}: reads = {reads!r}: must be a list of names from {', '.join(PIECES)}; only a feature of"
+            " a neighbour can have reads"
         )
 
     feature = Feature(name, str(unit), float(scale), float(low), float(high), " ".join(str(function.__doc__).split()))
@@ -471,7 +531,7 @@ def register_feature(
     sides = (f"{side}_{k}" for side in ("front", "rear") for k in range(MOST_NEIGHBOURS + 1))
     taken = {*GROUPS._fields[:-1], *sides, *(feature.name for group in GROUPS for feature in group)}
     if name in taken:
-        raise AlreadyExists(f"feature {name!r} is registered already; give another name")
+        raise AlreadyExists(f"feature {name!r}: this name is already in use; give another name")
     FEATURES.add(name, entry, lambda other: other == entry)
 
 

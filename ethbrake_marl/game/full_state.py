@@ -1,4 +1,4 @@
-"""Full state of a line as one vector, for centralised critics: all vehicles, all pairs, the time."""
+"""Full state of a world as one vector, for centralised critics: all vehicles, all pairs, and the time."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ethbrake_marl.game.features import GROUPS, Feature
 from ethbrake_marl.game.observations import Observations, ObservationSpec, observe
 from ethbrake_marl.physics.state import Vehicles, Worlds
 
-Appended = Literal["number", "state"]  # what a row holds behind the vehicle's own observation
+Appended = Literal["number", "state"]  # what training appends to a vehicle's own observation
 
 _OWN_ONLY = ObservationSpec(front=0, rear=0)
 
-_PAIR_MEANING = {"gap": "free distance between the two", "hit": "1 if the pair has had an impact"}
+_PAIR_MEANING = {"gap": "gap between the two vehicles", "hit": "1 if the pair has had an impact"}
 
 _OBSTACLE_FEATURES = tuple(
     replace(f, name=f"obstacle.{f.name}", meaning=meaning)
@@ -30,9 +30,10 @@ _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS
 
 
 def state_features(scenario: Game) -> tuple[Feature, ...]:
-    """Return the features of the full state in order: own features of each vehicle, then pairs, then time.
+    """Return the features of the full state in order: own features of each vehicle, features of each pair, and time.
 
-    A pair has the features gap and hit flag. With an obstacle ahead of Vehicle 1, its gap and hit flag follow.
+    The features of a pair are its gap and its hit flag. If there is an obstacle ahead of Vehicle 1, the gap and hit
+    flag of Vehicle 1 and the obstacle come last.
     """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
@@ -42,8 +43,11 @@ def state_features(scenario: Game) -> tuple[Feature, ...]:
 
 
 def full_state(worlds: Worlds, scenario: Game) -> Observations:
-    """Return the full state of every world, [n, S] float32; S = 7 N + 2 P + 1, plus 2 with an obstacle ahead."""
-    latency = worlds.vehicles.latency_s  # whole, with what a channel has drawn
+    """Return the full state of every world, [n, S] float32.
+
+    For N vehicles and P = N - 1 pairs, S is 7 N + 2 P + 1, plus 2 if there is an obstacle ahead.
+    """
+    latency = worlds.vehicles.latency_s  # includes the delays of the channel
     whole_latency = replace(worlds.vehicles, own_latency_s=latency, known_from_s=Vehicles.known_at_once(latency))
     vehicles = [observe(replace(worlds, vehicles=whole_latency), i, _OWN_ONLY) for i in range(worlds.N)]
     pair_values = {"gap": worlds.gaps_m, "hit": worlds.pair_hit.astype(np.float64)}
@@ -57,13 +61,14 @@ def full_state(worlds: Worlds, scenario: Game) -> Observations:
 
 
 def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: Game) -> tuple[Feature, ...]:
-    """Return the features of a learner's whole observation, in order: its own, then what training appends to them.
+    """Return the features that a learner's network receives, in order: ``own``, then the features that are appended.
 
     Raises ``InvalidInput`` for an invalid ``appended``.
 
     Args:
         own: features of the learner's own observation.
-        appended: ``"number"``: the learner's place among the learners; ``"state"``: the full state; None: nothing.
+        appended: what is appended: ``"number"``, the learner's index among the learners; ``"state"``, the full state;
+            None, nothing.
         scenario: the game, which determines the features of the full state.
 
     """
@@ -74,4 +79,4 @@ def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: 
     if appended == "state":
         return (*own, *state_features(scenario))
     last = len(scenario.learners) - 1
-    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "the learner's place among the learners"))
+    return (*own, Feature("learner", "1", 1.0, 0.0, float(max(last, 1)), "index of the learner among the learners"))

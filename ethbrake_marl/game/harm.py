@@ -1,12 +1,14 @@
-"""The harm ledger: the harm of every vehicle, under both counting rules.
+"""The harm ledger: the harm that each vehicle bears, by two counts, first-impact harm and total harm.
 
-The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2). It is shared by mass (the paper's
-eq. harm): ``H_i = m_{i+1} / (m_i + m_{i+1}) w^2`` and ``H_{i+1} = w^2 - H_i``, so the shares add up exactly.
+The harm of an impact of pair (i, i + 1) with closing speed ``w`` is ``w^2`` (m2/s2). The two vehicles bear it in
+inverse proportion to their masses (the paper's eq. harm): ``H_i = m_{i+1} / (m_i + m_{i+1}) w^2`` and ``H_{i+1} = w^2 -
+H_i``.
 
-An impact of Vehicle 1 with an immovable obstacle ahead (``obstacle_gap_m``) has harm ``v_1^2``, all borne by Vehicle 1.
+An impact of Vehicle 1 with an immovable obstacle ahead has the harm ``v_1^2``, where ``v_1`` is its speed. Vehicle 1
+bears all of it.
 
-*First-impact harm* counts each pair's first impact only (the paper's rule); *total harm* counts every impact. The first
-can be gamed, because a light early touch makes the later, harder impact free. So both are always kept.
+*First-impact harm* counts only the first impact of each pair, as the paper does. *Total harm* counts every impact. An
+agent can exploit first-impact harm: after a light early impact, a harder impact of the same pair costs nothing.
 """
 
 from __future__ import annotations
@@ -36,11 +38,11 @@ def check_harm_count(harm_count: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """Harm and number of impacts of ``n`` worlds since the start of the episode, by pair."""
+    """Harm and number of impacts of each pair in ``n`` worlds since the start of the episode."""
 
     first_impact_harm: Floats  # [n, P] harm of each pair's first impact (m2/s2)
     total_harm: Floats  # [n, P] harm of all impacts of each pair (m2/s2)
-    count: Ints  # [n, P] number of impacts
+    count: Ints  # [n, P] number of impacts of each pair
     obstacle_first_harm: Floats  # [n] first-impact harm of Vehicle 1 with the obstacle ahead (m2/s2)
     obstacle_total_harm: Floats  # [n] total harm of Vehicle 1 with the obstacle (m2/s2)
     obstacle_count: Ints  # [n] number of impacts with the obstacle
@@ -54,7 +56,7 @@ class Ledger:
         )
 
     def add(self, impacts: Impacts) -> Ledger:
-        """Return the ledger with the ``impacts`` of the next segment of the same episodes added."""
+        """Return the ledger after adding the ``impacts`` of the next segment of the same episodes."""
         return Ledger(
             self.first_impact_harm + impacts.first_impact_harm,
             self.total_harm + impacts.total_harm,
@@ -68,14 +70,16 @@ class Ledger:
         )
 
     def since(self, before: Ledger) -> Ledger:
-        """Return the harm that was added after ``before``, an earlier ledger of the same episodes.
+        """Return the harm and impacts since ``before``, an earlier ledger of the same episodes.
 
-        The difference is exact to the last rounding. Raises ``InvalidInput`` if ``before`` has another shape or more
-        impacts, for example because a row holds a new episode.
+        Raises ``InvalidInput`` if ``before`` has another shape or more impacts, for example because a new episode has
+        begun in one of the rows.
         """
         names = [column.name for column in fields(self) if column.name not in ("mass_t", "restitution", "harm_weight")]
         if before.count.shape != self.count.shape or (before.count > self.count).any():
-            raise InvalidInput("since: these are not the same worlds; ask before a row is renewed")
+            raise InvalidInput(
+                "since: the earlier ledger is not of the same episodes; call since before a new episode begins"
+            )
         return replace(self, **{name: getattr(self, name) - getattr(before, name) for name in names})
 
     def take(self, rows: Ints | Bools | Sequence[int]) -> Ledger:
@@ -83,38 +87,40 @@ class Ledger:
         return Ledger(*(getattr(self, column.name)[rows] for column in fields(self)))
 
     def pair_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of each pair, [n, P] m2/s2: of its ``"first"`` impact, or of all impacts (``"total"``).
+        """Return the harm of each pair, [n, P] m2/s2.
 
-        Raises ``InvalidInput`` for another ``harm_count``.
+        ``harm_count``: ``"first"``, first-impact harm, or ``"total"``, total harm; raises ``InvalidInput`` for any
+        other value.
         """
         check_harm_count(harm_count)
         return self.first_impact_harm if harm_count == "first" else self.total_harm
 
     def obstacle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of Vehicle 1 with the obstacle ahead, [n] m2/s2: of the ``"first"`` impact, or ``"total"``.
+        """Return the harm of impacts of Vehicle 1 with the obstacle ahead, [n] m2/s2.
 
-        Raises ``InvalidInput`` for another ``harm_count``.
+        ``harm_count``: ``"first"``, first-impact harm, or ``"total"``, total harm; raises ``InvalidInput`` for any
+        other value.
         """
         check_harm_count(harm_count)
         return self.obstacle_first_harm if harm_count == "first" else self.obstacle_total_harm
 
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm that each vehicle bears, [n, N] m2/s2: its shares (``split``) of the harm of both its pairs.
+        """Return the harm that each vehicle bears, [n, N] m2/s2.
 
-        Vehicle 1 also bears the harm with the obstacle. ``harm_count``: ``"first"`` impact of each pair, or
-        ``"total"``.
+        A vehicle bears its share (``split``) of the harm of the pair in front and of the pair behind. Vehicle 1 also
+        bears the harm of impacts with the obstacle. ``harm_count``: ``"first"``, first-impact harm, or ``"total"``.
         """
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)
         return harm
 
     def speed_changes(self, harm_count: HarmCount) -> tuple[Floats, Floats]:
-        """Return two changes of speed of each vehicle, [n, N] m/s each: by impacts in front, and at the rear.
+        """Return the changes of speed of each vehicle by impacts at its front and at its rear, [n, N] m/s each.
 
-        They are computed from the harm of the pair, as if it came from one single impact of these two vehicles alone.
-        This is exact for a first impact in which no third vehicle takes part. If ``"total"`` counts several impacts of
-        a pair, the result exceeds the change in the hardest one. ``harm_count``: ``"first"`` impact of each pair, or
-        ``"total"``.
+        They are computed from the harm of the pair, on the assumption that a single impact of these two vehicles caused
+        all of it. The result is exact for a first impact without a third vehicle. If ``"total"`` counts several impacts
+        of a pair, the result is larger than the change of speed in the hardest impact. ``harm_count``: ``"first"``,
+        first-impact harm, or ``"total"``, total harm.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
         rebound = (1.0 + self.restitution[:, np.newaxis]) * np.sqrt(with_obstacle)
@@ -125,30 +131,31 @@ class Ledger:
         return front, rear
 
     def world_harm(self, harm_count: HarmCount) -> Floats:
-        """Return the harm of all vehicles of a world together, [n] m2/s2.
+        """Return the harm of each world, summed over all vehicles, [n] m2/s2.
 
-        It is summed in a fixed order: obstacle, then pairs front to rear. ``harm_count``: ``"first"`` impact of each
-        pair, or ``"total"``.
+        The order of summation is fixed: obstacle, then pairs front to rear. ``harm_count``: ``"first"``, first-impact
+        harm, or ``"total"``, total harm.
         """
         return line_sum(self.pair_harm(harm_count), self.obstacle_harm(harm_count))
 
     @property
     def impacts(self) -> Ints:
-        """Number of impacts of all pairs and with the obstacle, [n]."""
+        """Number of impacts in each world, of all pairs and with the obstacle, [n]."""
         number: Ints = self.count.sum(axis=1) + self.obstacle_count
         return number
 
     @property
     def collided(self) -> Bools:
-        """Whether any impact happened, [n]."""
+        """Whether each world has had at least one impact, [n]."""
         return self.impacts > 0
 
 
 @compiled
 def line_sum(pair_values: Floats, obstacle_values: Floats) -> Floats:
-    """Return the sum over obstacle and pairs of each world, [n], in a fixed order: the same bits in any batch.
+    """Return the sum of the values of obstacle and pairs in each world, [n].
 
-    ``pair_values`` is [n, P], ``obstacle_values`` [n]; the obstacle comes first, then the pairs front to rear.
+    The order of summation is fixed, so the result does not depend on the batch: obstacle first, then pairs front to
+    rear. ``pair_values`` has shape [n, P], ``obstacle_values`` has shape [n].
     """
     n, pairs = pair_values.shape
     total = np.zeros(n)
@@ -169,9 +176,10 @@ def empty_ledger(worlds: Worlds) -> Ledger:
 
 @compiled
 def split(pair_harm: Floats, mass_t: Floats) -> Floats:
-    """Share the harm of each pair between its two vehicles by mass; return the harm of each vehicle, [n, N] m2/s2.
+    """Divide the harm of each pair between its two vehicles; return the harm that each vehicle bears, [n, N] m2/s2.
 
-    The lighter vehicle bears more. ``pair_harm`` is [n, P] in m2/s2, ``mass_t`` [n, N] in t.
+    The lighter vehicle bears more. ``pair_harm``: harm of each pair, [n, P] m2/s2. ``mass_t``: mass of each vehicle,
+    [n, N] t.
     """
     n, vehicles = mass_t.shape
     harm = np.zeros((n, vehicles))
@@ -185,10 +193,11 @@ def split(pair_harm: Floats, mass_t: Floats) -> Floats:
 
 @compiled
 def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
-    """Return the front vehicle's share of a pair's ``harm``: ``m_rear / (m_front + m_rear) harm``.
+    """Return the part of a pair's ``harm`` that the front vehicle bears: ``m_rear / (m_front + m_rear) harm``.
 
-    The larger share is computed and the smaller one is the rest, an exact subtraction: the two add up to the last bit.
-    Masses must have the same unit; the result has the unit of ``harm``.
+    The larger of the two parts is computed by this formula, and the smaller part by subtraction, which is exact; so
+    both parts add up to ``harm`` without rounding error. The masses must have the same unit. The result has the unit of
+    ``harm``.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
@@ -197,7 +206,7 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
 
 @compiled
 def _powers(shares: Floats, exponent: float) -> Floats:
-    """Return ``x^exponent`` of each x >= 0 in ``shares`` [k], limited to 1, [k]; the same bits on every processor."""
+    """Return ``min(x^exponent, 1)`` for each x >= 0 in ``shares`` [k], [k]; it is the same on every processor."""
     result = np.zeros(len(shares))
     for i in range(len(shares)):
         if shares[i] > 0.0:
@@ -208,42 +217,46 @@ def _powers(shares: Floats, exponent: float) -> Floats:
 class InjuryCurve(NamedTuple):
     """Probability of an injury in a rear-end collision, as a function of the vehicle's change of speed dv (m/s)."""
 
-    injury: str  # least severity, on the abbreviated injury scale
-    formula: str  # the probability as a formula in dv
-    source: str  # where the curve comes from
-    front: Callable[[Floats], Floats]  # probability in the striking vehicle, which is hit in front
-    rear: Callable[[Floats], Floats]  # probability in the struck vehicle, which is hit at the rear
+    injury: str  # least severity of the injury, on the abbreviated injury scale
+    formula: str  # formula of the probability in terms of dv
+    source: str  # publication that the curve is taken from
+    front: Callable[[Floats], Floats]  # probability in the striking vehicle, which is hit at its front
+    rear: Callable[[Floats], Floats]  # probability in the struck vehicle, which is hit at its rear
 
 
 _GEISSLINGER = "Geisslinger, Poszler and Lienkamp 2023, doi:10.1038/s42256-022-00607-z, parameters of its code"
 
 INJURY_CURVES = {
     "lr4s": InjuryCurve(
-        "MAIS3+", "1 / (1 + exp(4.457 - 0.177 dv - c)), c = 0 in front, -0.431 at the rear", _GEISSLINGER,
+        "MAIS3+", "1 / (1 + exp(4.457 - 0.177 dv - c)), with c = 0 if the front is hit, c = -0.431 if the rear is hit",
+        _GEISSLINGER,
         lambda dv: logistic(-4.457 + 0.177 * dv), lambda dv: logistic(-4.888 + 0.177 * dv),
     ),
     "reference": InjuryCurve(
-        "MAIS3+", "(dv / s)^1.531, at most 1, s = 51.287 m/s in front, 66.956 m/s at the rear", _GEISSLINGER,
+        "MAIS3+",
+        "min((dv / s)^1.531, 1), with s = 51.287 m/s if the front is hit, s = 66.956 m/s if the rear is hit",
+        _GEISSLINGER,
         lambda dv: _powers(dv / 51.287, 1.531), lambda dv: _powers(dv / 66.956, 1.531),
     ),
     "gidas": InjuryCurve(
-        "MAIS2+", "1 / (1 + exp(5.820 - 0.292 dv))", "GIDAS, as the same code has it",
+        "MAIS2+", "1 / (1 + exp(5.820 - 0.292 dv))", "GIDAS, from the code of Geisslinger et al. 2023",
         lambda dv: logistic(-5.820 + 0.292 * dv), lambda dv: logistic(-5.820 + 0.292 * dv),
     ),
 }  # fmt: skip
 
 
 def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"], curve: str = "lr4s") -> Floats:
-    """Return the probability that a vehicle's occupant is injured in a rear-end impact, [k].
+    """Return the probability that an occupant of a vehicle is injured in a rear-end impact, [k].
 
-    Logistic curves give about 1 % for no change of speed; do not use them for a vehicle that was not hit.
+    The logistic curves ``lr4s`` and ``gidas`` give a probability above 0 even without a change of speed, so do not use
+    them for a vehicle that was not hit.
 
     Args:
-        speed_change_mps: change of the vehicle's speed in the impact, [k] m/s; its sign is ignored.
-        side: side that is hit: ``"front"`` of the striking vehicle, ``"rear"`` of the struck one.
-        curve: key of ``INJURY_CURVES``, which give formula and source.
+        speed_change_mps: change of the vehicle's speed in the impact, [k] m/s; the sign is ignored.
+        side: side of the vehicle that is hit: ``"front"`` for the striking vehicle, ``"rear"`` for the struck vehicle.
+        curve: name of the curve, a key of ``INJURY_CURVES``.
 
-    Raises ``UnknownName`` for another side or curve.
+    Raises ``UnknownName`` for an unknown side or curve.
 
     """
     if curve not in INJURY_CURVES:

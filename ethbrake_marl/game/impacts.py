@@ -1,4 +1,4 @@
-"""Every impact of a batch of episodes, as arrays, from which measures by impacts are computed."""
+"""``EpisodeImpacts``: every impact of a batch of episodes, the input of measures by impacts."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _NO_ROWS = ImpactRows(_NO_INTS, _NO_INTS, _NO_FLOATS, _NO_FLOATS, np.empty(0, np
 
 @dataclass(frozen=True, slots=True)
 class EpisodeImpacts:
-    """The impacts of n episodes of N vehicles so far; its arrays are read-only."""
+    """All impacts so far in n episodes of N vehicles, as read-only arrays."""
 
     worlds: Worlds  # the n worlds at the alert, when the episodes began
-    rows: ImpactRows  # every impact so far, ordered by world and then by time; arrays [k]
+    rows: ImpactRows  # all k impacts so far, ordered by world and then by time
 
     @classmethod
     def of(cls, worlds: Worlds, parts: Sequence[ImpactRows] = ()) -> EpisodeImpacts:
-        """Return the impacts of the episodes that began as ``worlds``.
+        """Return the impacts of the episodes that began with ``worlds``.
 
-        ``parts``: their impacts, in parts that follow each other in time.
+        ``parts``: impacts of the episodes in consecutive intervals of time.
         """
         whole = [np.concatenate([getattr(rows, name) for rows in (_NO_ROWS, *parts)]) for name in _OF_ROWS]
         order = np.argsort(whole[0], kind="stable")
@@ -43,23 +43,22 @@ class EpisodeImpacts:
 
     @property
     def largest_speed_change_mps(self) -> Floats:
-        """Largest change of speed of each vehicle in one impact (delta-v), [n, N] m/s; 0 without an impact.
+        """Largest change of speed of each vehicle in a single impact (delta-v), [n, N] m/s; 0 without an impact.
 
-        A vehicle that is pushed by one that already touches it has no impact of its own, and so no change from the
-        push.
+        A push by a vehicle that is already in contact is not an impact, so its change of speed does not count.
         """
         rows, change = self.rows, np.zeros(self.worlds.speeds_mps.shape)
         np.maximum.at(change, (rows.world, rows.pair + 1), np.abs(rows.rear_speed_change_mps))
-        pairs = rows.pair >= 0  # an obstacle ahead is no vehicle
+        pairs = rows.pair >= 0  # False for an impact with an obstacle
         np.maximum.at(change, (rows.world[pairs], rows.pair[pairs]), np.abs(rows.front_speed_change_mps[pairs]))
         return change
 
     def and_then(self, way: Iterable[tuple[Worlds, Floats, Floats]], some: Bools) -> EpisodeImpacts:
-        """Return the impacts after the episodes have gone on: these impacts, and the new ones of some worlds.
+        """Return these impacts together with the new impacts of some worlds in the next segments of the episodes.
 
         Args:
-            way: consecutive parts of the new motion: worlds at its start, constant commands [n, N] m/s2, and end [n] s,
-                as ``Engine.segments`` yields them.
+            way: consecutive segments from ``Engine.segments``: worlds at the start, constant commands [n, N] m/s2, and
+                end of the segment [n] s.
             some: worlds whose new impacts are added, a mask [n].
 
         """
@@ -67,20 +66,20 @@ class EpisodeImpacts:
         for k, (before, command_mps2, until_s) in enumerate(parts, 1):
             moving = until_s > before.time_s
             if k == len(parts):
-                moving |= until_s == 0.0  # an impact at the very alert
+                moving |= until_s == 0.0  # an impact at the time of the alert
             blocks.append(impacts_within(before, command_mps2, until_s, np.flatnonzero(some & moving)))
         return EpisodeImpacts.of(self.worlds, blocks)
 
     def renewed(self, rows: Ints, alert: Worlds) -> EpisodeImpacts:
-        """Return the impacts after new episodes have begun in some rows; these have no impacts yet.
+        """Return the impacts after new episodes, without impacts yet, have begun in some rows.
 
-        ``rows``: indices of the new episodes, [k]; ``alert``: their k worlds at the alert.
+        ``rows``: indices of the new episodes, [k]. ``alert``: worlds of the new episodes at the alert, k of them.
         """
         others = ~np.isin(self.rows.world, rows)
         return EpisodeImpacts.of(self.worlds.assign(rows, alert), [_some(self.rows, others)])
 
     def take(self, rows: Ints) -> EpisodeImpacts:
-        """Return the impacts of the episodes at the indices ``rows`` [k]; an index may occur several times."""
+        """Return the impacts of the episodes with the indices ``rows`` [k]; an index may occur several times."""
         first = np.searchsorted(self.rows.world, rows)
         count = np.searchsorted(self.rows.world, rows, side="right") - first
         at = np.repeat(first - np.cumsum(count) + count, count) + np.arange(count.sum())
@@ -95,23 +94,23 @@ class EpisodeImpacts:
         return EpisodeImpacts.of(Worlds.concatenate([part.worlds for part in parts]), shifted)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return all data as arrays by name, for a snapshot; ``read`` restores it."""
+        """Return all data as arrays by name, for a snapshot; ``read`` restores the impacts from them."""
         arrays = {name: getattr(self.worlds, name) for name in _OF_WORLDS}
         arrays |= {name: getattr(self.worlds.vehicles, name) for name in _OF_VEHICLES}
         arrays["rows"] = np.stack([getattr(self.rows, name) for name in _OF_ROWS], axis=1, dtype=np.float64)
         return {f"impacts.{name}": np.array(array, order="C") for name, array in arrays.items()}
 
     def read(self, arrays: Mapping[str, NDArray[Any]]) -> EpisodeImpacts:
-        """Return the impacts that ``arrays``, made by ``EpisodeImpacts.arrays``, hold.
+        """Return the impacts from ``arrays``, a result of ``EpisodeImpacts.arrays``.
 
-        They must be of the same number of episodes as this object. Raises ``InvalidInput`` for an array that is missing
-        or has another shape.
+        The arrays must have the same number of episodes as this object. Raises ``InvalidInput`` if an array is missing
+        or has a wrong shape.
         """
         for name, own in self.arrays().items():
             have = arrays.get(name)
             if have is None or have.ndim != own.ndim or (len(have) != len(own) and name != "impacts.rows"):
-                shape = "nothing" if have is None else have.shape
-                raise InvalidInput(f"engine snapshot: {name} is {shape}; {own.shape} is needed")
+                fault = "is missing" if have is None else f"has shape {have.shape}"
+                raise InvalidInput(f"engine snapshot: the array {name} {fault}; must have shape {own.shape}")
         columns = zip(_OF_ROWS, np.array(arrays["impacts.rows"]).T, strict=True)
         rows = ImpactRows(**{name: column.astype(getattr(_NO_ROWS, name).dtype) for name, column in columns})
         vehicles = Vehicles(**{name: arrays[f"impacts.{name}"] for name in _OF_VEHICLES})
@@ -124,15 +123,17 @@ def _some(rows: ImpactRows, index: NDArray[Any]) -> ImpactRows:
 
 
 def impacts_within(before: Worlds, command_mps2: Floats, until_s: Floats, rows: Ints) -> ImpactRows:
-    """Return every impact of some worlds during a segment; ``world`` in the result is the row in the whole batch.
+    """Return every impact of some worlds during a segment (a time interval of constant commands).
+
+    ``ImpactRows.world`` in the result is the index of a world in the whole batch ``before``.
 
     Args:
         before: n worlds at the start of the segment.
         command_mps2: constant commands, [n, N] m/s2.
-        until_s: end of the segment, [n] s.
+        until_s: end of the segment in each world, [n] s.
         rows: indices of the worlds to simulate, [k].
 
     """
     impacts = advance(before.take(rows), command_mps2[rows], until_s=until_s[rows], record=True)[1].rows
-    assert impacts is not None  # they were asked for
+    assert impacts is not None  # because of record=True
     return replace(impacts, world=rows[impacts.world])

@@ -1,15 +1,16 @@
-"""Measures by name: what is reported can be rewarded, and what is rewarded can be reported.
+"""Measures by name: every measure can be shown in evaluations and can be a term of a reward.
 
 A measure is computed either from each step or from all impacts of an episode:
 
-=======  ==================  ===================================  ===========================
-by       computed from       a reward counts in each step         an evaluation shows
-=======  ==================  ===================================  ===========================
-step     ``StepOutcome``     its value                            its sum over the episode
-impacts  ``EpisodeImpacts``  its change by the step's impacts     its value for all impacts
-=======  ==================  ===================================  ===========================
+=======  ==================  ==========================================  ===================================
+``by``   computed from       amount that a reward counts in a step       number that an evaluation shows
+=======  ==================  ==========================================  ===================================
+step     ``StepOutcome``     value of the measure in the step            sum of the values over the episode
+impacts  ``EpisodeImpacts``  change of the value by impacts of the step  value for all impacts
+=======  ==================  ==========================================  ===================================
 
-So the rewards of an episode add up to what evaluations show, minus the value before the first decision.
+The amounts that a reward counts in an episode add up to the number that an evaluation shows, minus the value of the
+measure before the first decision.
 """
 
 from __future__ import annotations
@@ -28,43 +29,45 @@ from ethbrake_marl.physics.left_out import ImpactRows
 from ethbrake_marl.physics.state import Bools, Floats, Ints, make_worlds
 from ethbrake_marl.registry import Registry
 
-_NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")  # column x_2 is that of vehicle 2
+# names must not end like the columns of results: x_2 is the value of measure x for vehicle 2
+_NAME = re.compile(r"(?!.*_([0-9]+|interval|low|high)\Z)[a-z][a-z0-9_]{0,63}")
 
 By = Literal["step", "impacts"]
 
-MeasureFunction = Callable[[Any], Any]  # from a ``StepOutcome`` or ``EpisodeImpacts`` to numbers
+MeasureFunction = Callable[[Any], Any]  # maps a ``StepOutcome`` or ``EpisodeImpacts`` to numbers
 
 
 @dataclass(frozen=True, slots=True)
 class NamedMeasure:
-    """A measure that can be reported and rewarded under its name."""
+    """A measure that evaluations can show and rewards can count under its name."""
 
-    name: str  # key of its weight in a reward
+    name: str  # name of the measure, and key of its weight in a reward
     meaning: str  # what it measures, in words
-    unit: str  # unit of its value; ``1`` for a plain number
-    by: By  # ``step`` or ``impacts``: what it is computed from
-    function: Callable[..., Any] | None = None  # computes the measure; None: the engine does
+    unit: str  # unit of the value; ``1`` for a plain number
+    by: By  # what the measure is computed from: ``step`` or ``impacts``
+    function: Callable[..., Any] | None = None  # function that computes the measure; None: the engine computes it
     settings: tuple[str, ...] = ()  # fields of RewardParams that a built-in function takes as further arguments
-    form: str = ""  # result of a registered function, such as ``a number per vehicle`` or ``a truth per world``
+    form: str = ""  # kind of a registered function's result: ``a number per vehicle``, ``a truth value per world``, ...
 
     def built_in(self, step: StepOutcome, params: Any) -> Floats:
         """Return the value of a built-in measure in one step, [n] or [n, N].
 
-        ``params``: the ``RewardParams`` whose settings the measure takes.
+        ``params``: the ``RewardParams`` whose fields ``settings`` are passed to the function.
         """
         assert self.function is not None
         value: Floats = self.function(step, *(getattr(params, name) for name in self.settings))
         return value
 
     def of(self, given: StepOutcome | EpisodeImpacts, counts: Bools | None = None, steps: Ints | None = None) -> Any:
-        """Return the value of a registered measure: [n], or [n, N] for a measure of each vehicle.
+        """Return the value of a registered measure: [n] for one number per world, [n, N] for one number per vehicle.
 
-        Raises ``InvalidInput`` naming the measure, world, vehicle and step of a number that is not finite.
+        Raises ``InvalidInput`` naming the measure, world, vehicle and step if a value is not finite, and for a result
+        of the wrong shape or type.
 
         Args:
-            given: what the measure is computed from: a step, or the impacts of an episode.
-            counts: worlds to compute, a mask [n]; all others get 0. None: all worlds.
-            steps: number of steps that each world has made, [n], for messages.
+            given: a step, or the impacts of an episode, from which the measure is computed.
+            counts: worlds whose values are used, a mask [n]; the value is 0 in all others. None: all worlds.
+            steps: number of steps that each world has made, [n], for error messages.
 
         """
         if isinstance(given, StepOutcome):
@@ -80,14 +83,14 @@ class NamedMeasure:
             number = value[(world, *vehicle)]
             raise InvalidInput(f"measure {self.name!r}: is {number}{whose} in world {world}{when}; must be finite")
         if self.form not in ("", form := _form(value)):
-            raise InvalidInput(f"{what}: gave {form}; when it was registered it gave {self.form}")
+            raise InvalidInput(f"{what}: its function returned {form}, but {self.form} when it was registered")
         return value
 
     def _numbers(self, given: StepOutcome | EpisodeImpacts, what: str) -> Any:
         """Call the measure's function and return its result, [n] or [n, N]; raise ``InvalidInput`` if it is unusable.
 
-        The result is float64; truth values of a measure by impacts stay truth values. Values per learner are filled up
-        with 0 for other vehicles. ``what``: how messages name the measure.
+        Numbers are converted to float64; truth values of a measure by impacts are not converted. Values per learner are
+        completed with 0 for the other vehicles. ``what``: how error messages name the measure.
         """
         assert self.function is not None
         learners = given.learners if isinstance(given, StepOutcome) else None
@@ -102,7 +105,10 @@ class NamedMeasure:
             right.setdefault((n, len(learners)), "one per learner")
         if value.shape not in right or value.dtype.kind not in "fiub":
             shapes = " or ".join(f"{shape}, {each}" for shape, each in right.items())
-            raise InvalidInput(f"{what}: gave {value.dtype} of shape {value.shape}; must be numbers of shape {shapes}")
+            raise InvalidInput(
+                f"{what}: its function returned {value.dtype} of shape {value.shape}; must return numbers of shape"
+                f" {shapes}"
+            )
         if learners is None:
             return value if value.dtype == np.bool_ else value.astype(np.float64)
         if right[value.shape] != "one per learner":
@@ -112,9 +118,10 @@ class NamedMeasure:
         return whole
 
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
-        """Return how much the new impacts in ``after`` change a measure by impacts, [n] or [n, N].
+        """Return the change of a measure by impacts from ``before`` to ``after``, [n] or [n, N].
 
-        ``before`` and ``after`` are the same episodes; ``steps`` [n] is the number of steps so far, for messages.
+        ``before`` and ``after``: impacts of the same episodes at two times. ``steps``: number of steps so far, [n], for
+        error messages.
         """
         if len(before.rows.world) == len(after.rows.world):
             return np.zeros(after.worlds.speeds_mps.shape[: 2 if self.form.endswith("vehicle") else 1])
@@ -122,24 +129,26 @@ class NamedMeasure:
 
 
 def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
-    """Register a measure: rewards may give ``name`` a weight, and every evaluation from now on shows it.
+    """Register a measure: rewards can give it a weight under ``name``, and later evaluations show it.
 
-    An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``: its function,
-    a ``Part`` of it, or a mapping of names to such. Evaluations show such a measure only on request.
+    An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``. The entry
+    point names the function, a ``Part`` that contains it, or a mapping from names to functions or parts. Evaluations
+    show a measure of a package only on request.
+
+    Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure.
+    Raises ``InvalidInput`` for invalid arguments, and if the function, called for two test worlds, fails or returns a
+    wrong shape or a number that is not finite.
 
     Args:
-        name: 1 to 64 of ``a-z``, digits and ``_``, beginning with a letter, not ending in ``_`` and a number,
-            ``_interval``, ``_low`` or ``_high``. It is the key of the weight in a reward; columns of results are called
-            ``metric_NAME``, infos of a step ``reward_NAME``.
-        function: takes an ``EpisodeImpacts`` or, by step, a ``StepOutcome``; returns one number for each world [n] or
-            each vehicle [n, N]; by step also for each learner [n, L]. Its docstring describes the measure. It must work
-            for lines of any length. Truth values by impacts are shown as a rate.
+        name: name of the measure, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. It must not
+            end in ``_interval``, ``_low``, ``_high``, or ``_`` and a number. It is the key of the weight in a reward,
+            ``metric_NAME`` in results, and ``reward_NAME`` in the infos of a step.
+        function: function of an ``EpisodeImpacts`` (``by="impacts"``) or a ``StepOutcome`` (``by="step"``). It returns
+            one number per world [n] or per vehicle [n, N]; with ``by="step"`` also one per learner [n, L]. It must work
+            for any number of vehicles. Its docstring describes the measure. Evaluations show truth values of a measure
+            by impacts as a rate.
         unit: unit of the numbers.
-        by: ``impacts`` or ``step``, what it is computed from.
-
-    Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure,
-    ``InvalidInput`` for invalid arguments, or if in two test worlds the function fails, or returns another shape or a
-    number that is not finite.
+        by: what the measure is computed from: ``impacts`` or ``step``.
 
     """
     _add(name, function, unit=unit, by=by)
@@ -147,18 +156,18 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
 
 def _add(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
-    """Add a measure to the registry, without showing it in evaluations. Arguments are those of ``register_measure``."""
+    """Add a measure that evaluations do not show by themselves. The arguments are those of ``register_measure``."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(
-            f"measure {name!r:.80}: must be 1 to 64 of a-z, 0-9 and _, beginning with a letter, not ending in _"
-            " and a number, _interval, _low or _high"
+            f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, begin with a letter, and not"
+            " end in _interval, _low, _high, or _ and a number"
         )
     if by not in get_args(By):
         raise InvalidInput(f"measure {name!r}: by = {by!r}: must be {' or '.join(get_args(By))}")
     if not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"measure {name!r}: needs a function with a docstring that says what it is")
+        raise InvalidInput(f"measure {name!r}: must be a function with a docstring that describes the measure")
     if name in (*SETTINGS, *BUILT_IN):
-        raise AlreadyExists(f"measure {name!r} is registered already; give another name")
+        raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
     measure = NamedMeasure(name, " ".join((function.__doc__ or "").split()), str(unit), by, function)
     value = measure.of(_a_step() if by == "step" else _some_impacts())
     measure = replace(measure, form=_form(value))
@@ -166,11 +175,12 @@ def _add(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "imp
 
 
 def _form(value: Any) -> str:
-    return f"a {'truth' if value.dtype == np.bool_ else 'number'} per {'world' if value.ndim == 1 else 'vehicle'}"
+    kind = "truth value" if value.dtype == np.bool_ else "number"
+    return f"a {kind} per {'world' if value.ndim == 1 else 'vehicle'}"
 
 
 def _some_impacts() -> EpisodeImpacts:
-    """Return the impacts of two test lines of three vehicles; one line has an impact of its second pair."""
+    """Return the impacts of two test worlds of three vehicles; world 0 has an impact of its second pair."""
     worlds = make_worlds(
         [[8.0, 6.0], [3.0, 21.0]],
         [[20.0, 18.0, 22.0], [9.0, 13.0, 11.0]],
@@ -185,7 +195,7 @@ def _some_impacts() -> EpisodeImpacts:
 
 
 def _a_step() -> StepOutcome:
-    """Return a step of these two test lines, in which two vehicles learn."""
+    """Return a step of the two test worlds of ``_some_impacts``, in which Vehicles 2 and 3 learn."""
     w = _some_impacts().worlds
     v, command = w.vehicles, np.array([[-6.0, 0.0, 1.5], [-6.0, -7.0, -2.5]])
     return StepOutcome(
@@ -197,22 +207,25 @@ def _a_step() -> StepOutcome:
 
 _OF_RISK = ("ttc_scale_s", "safety_buffer_m", "target_gap_m", "distance_slope_per_m")
 
-# Terms of ``RewardParams`` that have a weight of their own.
+# Built-in terms of a reward, whose weights are fields of ``RewardParams``.
 BUILT_IN = {
     each.name: each
     for each in (
         NamedMeasure("harm", "minus the harm of the step, as `harm_count` and `objective` count it", "m2/s2", "step"),
         NamedMeasure(
-            "collision", "minus `k_energy` times the harm of every impact of the step", "m2/s2", "step", collision,
+            "collision", "minus `k_energy` times the total harm of the step", "m2/s2", "step", collision,
             ("k_energy",),
         ),
         NamedMeasure(
-            "risk", "minus how near and how soon a collision of each own pair is, 0 to 2 a pair", "1", "step", risk,
-            _OF_RISK,
+            "risk", "minus the collision risk of the vehicle's pairs, from 0 (no risk) to 1.5 (imminent) per pair", "1",
+            "step", risk, _OF_RISK,
         ),
-        NamedMeasure("jerk", "minus the squared rate of change of the own command", "m2/s6", "step", jerk),
-        NamedMeasure("terminal", "1 when an episode ends without any collision", "1", "step"),
-        NamedMeasure("shaping", "difference of potentials: minus the least harm ahead, for learners", "m2/s2", "step"),
+        NamedMeasure("jerk", "minus the squared rate of change of the vehicle's acceleration", "m2/s6", "step", jerk),
+        NamedMeasure("terminal", "1 in the last step of an episode without collision, otherwise 0", "1", "step"),
+        NamedMeasure(
+            "shaping", "discounted potential after the step minus potential before it; the potential is minus the least"
+            " harm that the learners can reach by constant braking", "m2/s2", "step",
+        ),
     )
 }  # fmt: skip
 

@@ -1,18 +1,22 @@
-"""Objectives: whose harm counts. Each turns the harm of the line, from the one ledger, into an amount per vehicle.
+"""Objectives: the amount that each vehicle should minimise, computed from the harm in a ledger.
 
-Every objective but the last is an amount of harm (m2/s2) to be minimised; ``H_i`` is the harm that vehicle i bears,
-``H`` the harm of all vehicles:
+In these formulas ``H_i`` is the harm that vehicle i bears (m2/s2), ``H`` the harm of all N vehicles, and ``m_i`` the
+mass of vehicle i. All amounts are in m2/s2, except the injuries:
 
 ==================  ================================================================================================
-total               ``H``: everybody's harm alike; the same number for all vehicles
-own                 ``H_i``
-social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientation: phi from 0 (own harm only)
-                    over 45 (prosocial) to 90 degrees (the others' only)
-maximin             ``max_j H_j``: the harm of the vehicle that bears most
-mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: harm in a heavy vehicle counts for more
-weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``: a weight (0, or 1e-6 to 1e6) per vehicle, such as its occupants
-preference          the same, with the weights ``harm_weight`` that the scenario gives or draws for each world
-injury:curve        injuries in 1,000 lines, by the pair that injures a vehicle more (``Ledger.speed_changes``)
+objective           amount for vehicle i
+==================  ================================================================================================
+total               ``H``, the harm of all vehicles
+own                 ``H_i``, the harm of the vehicle itself
+social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``, social value orientation; the angle phi is 0 for own harm
+                    only, 45 degrees for a prosocial vehicle, and 90 degrees for the harm of the other vehicles only
+maximin             ``max_j H_j``, the harm of the vehicle that bears most
+mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: the harm of a heavy vehicle has a larger weight
+weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j`` with one weight per vehicle (0, or 1e-6 to 1e6), for example its
+                    number of occupants
+preference          the formula of ``weighted``, with the weights ``harm_weight`` that the scenario declares
+injury:curve        expected injuries in 1,000 lines; a vehicle's injury risk is the larger one of its two pairs
+                    (``Ledger.speed_changes``)
 ==================  ================================================================================================
 """
 
@@ -33,7 +37,8 @@ from ethbrake_marl.game.harm import INJURY_CURVES, HarmCount, Ledger, injury_pro
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.registry import Registry
 
-STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")  # objectives that fit every scenario
+# objectives without parameters that depend on the scenario, so that every scenario can use them
+STANDARD = ("total", "own", "social:45", "maximin", "mass-weighted")
 
 _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
@@ -41,27 +46,27 @@ Declared = str | tuple[str, ...]  # one objective for all vehicles, or one per v
 
 
 class Objective(NamedTuple):
-    """An objective that ``parse_objective`` has read from a text such as ``social:45``."""
+    """An objective parsed from a text such as ``social:45``; see ``parse_objective``."""
 
     kind: str  # name before the colon, such as ``social``
-    angle_deg: float = 0.0  # angle of ``social`` (degrees)
-    weights: tuple[float, ...] = ()  # weights of ``weighted``, one per vehicle
-    curve: str = ""  # curve of ``injury``, a key of ``INJURY_CURVES``
+    angle_deg: float = 0.0  # angle phi of the objective ``social`` (degrees)
+    weights: tuple[float, ...] = ()  # weights of the objective ``weighted``, one per vehicle
+    curve: str = ""  # injury curve of the objective ``injury``, a key of ``INJURY_CURVES``
 
 
 class HarmSoFar(NamedTuple):
-    """Read-only input of an objective: harm, masses and changes of speed in n worlds of N vehicles."""
+    """Read-only input of an objective: harm, masses, changes of speed and weights in n worlds of N vehicles."""
 
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
     whole: Floats  # [n] harm of all vehicles, m2/s2
     mass_t: Floats  # [n, N] mass of each vehicle, t
-    front_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts in front, m/s; 0: not hit there
-    rear_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts at the rear, m/s; 0: not hit there
+    front_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts at its front, m/s; 0 without an impact
+    rear_change_mps: Floats  # [n, N] change of speed of each vehicle by impacts at its rear, m/s; 0 without an impact
     harm_weight: Floats  # [n, N] weight of each vehicle's harm in the objective ``preference``
 
 
 class Weighed(Protocol):
-    """What an objective may weigh the vehicles of n lines by; a ``Ledger`` and ``Vehicles`` have it."""
+    """Data on the vehicles of n worlds from which an objective may compute weights: a ``Ledger`` or ``Vehicles``."""
 
     @property
     def mass_t(self) -> Floats:
@@ -76,21 +81,22 @@ ObjectiveFunction = Callable[[HarmSoFar, int], Floats]
 
 
 class Kind(NamedTuple):
-    """One kind of objective, built in or registered: a line of the table at the top of this file."""
+    """A kind of objective, built in or registered. The module docstring has a table of the built-in kinds."""
 
-    form: str  # how it is written; no argument if there is no ":"
-    about: str  # what it means, in words
-    amount: Callable[[Objective, HarmSoFar, int], Floats]  # (objective, harm, vehicle) -> amount [n]: less is better
-    function: ObjectiveFunction | None = None  # the function of a registered objective
-    weights: Callable[[Objective, Weighed, int], Floats] | None = None  # (objective, line, vehicle) -> [n, N]
+    form: str  # how a scenario writes the objective, such as ``social:ANGLE``; without ":" it takes no argument
+    about: str  # meaning of the objective, in words
+    amount: Callable[[Objective, HarmSoFar, int], Floats]  # (objective, harm, vehicle) -> amount to minimise, [n]
+    function: ObjectiveFunction | None = None  # function of a registered objective; None: built in
+    # (objective, vehicles, vehicle) -> weights of the vehicles' harm, [n, N]; None: the amount is not a weighted sum
+    weights: Callable[[Objective, Weighed, int], Floats] | None = None
 
 
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
     """Parse the text of an objective: ``total``, ``own``, ``social:45``, ``weighted:1,4,1``, ``injury:lr4s``, ...
 
-    Raises ``InvalidInput`` for an unknown name, an angle outside [0, 90] degrees, a weight that is neither 0 nor
-    in [1e-6, 1e6], weights that are all 0, or an unknown curve.
+    Raises ``InvalidInput`` for an unknown name or injury curve, an angle outside [0, 90] degrees, a weight that is
+    neither 0 nor in [1e-6, 1e6], and weights that are all 0.
     """
     kind, colon, argument = text.partition(":")
     if ":" not in OBJECTIVES[kind].form:
@@ -109,54 +115,61 @@ def parse_objective(text: str) -> Objective:
         return Objective(kind, angle_deg=numbers[0])
     if not (any(numbers) and all(weight == 0.0 or 1e-6 <= weight <= 1e6 for weight in numbers)):
         raise InvalidInput(
-            f"objective {text!r}: weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6 and not 0 for all, as"
-            " in weighted:1,4,1"
+            f"objective {text!r}: weighted needs one weight per vehicle, as in weighted:1,4,1; a weight is 0 or from"
+            " 1e-6 to 1e6, and at least one weight must not be 0"
         )
     return Objective(kind, weights=numbers)
 
 
 def check_declared(declared: object) -> None:
-    """Raise ``InvalidInput`` unless ``declared`` is an objective as a scenario writes it, such as ``own``, or a list.
+    """Raise ``InvalidInput`` unless ``declared`` is the text of an objective, such as ``own``, or a list of such texts.
 
-    The number of objectives in a list is not checked here.
+    The length of the list is not checked.
     """
     each = [declared] if isinstance(declared, str) else declared
     if not isinstance(each, list | tuple) or not all(isinstance(text, str) for text in each):
-        raise InvalidInput("objective: must be a name, for instance own or social:45, or a list with one per vehicle")
+        raise InvalidInput(
+            "objective: must be the name of an objective, for instance own or social:45, or a list with one name per"
+            " vehicle"
+        )
     for text in each:
         parse_objective(text)
 
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
-    """Return the parsed objective of each of ``vehicles`` vehicles; raise ``InvalidInput`` if their number is wrong.
+    """Return the parsed objective of each vehicle, front to rear.
 
-    ``declared``: the text of one objective for all vehicles, or one text per vehicle.
+    Raises ``InvalidInput`` for an invalid objective, or a wrong number of objectives or weights. ``declared``: the text
+    of one objective for all vehicles, or one text per vehicle. ``vehicles``: number of vehicles.
     """
     check_declared(declared)
     each = (declared,) * vehicles if isinstance(declared, str) else tuple(declared)
     if len(each) != vehicles:
         raise InvalidInput(
-            f"objective: {len(each)} entries; {vehicles} vehicles need {vehicles} (one per vehicle), or one for all"
+            f"objective: has {len(each)} entries; must have {vehicles}, one per vehicle, or be a single entry for all"
         )
     parsed = tuple(parse_objective(text) for text in each)
     for text, objective in zip(each, parsed, strict=True):
         if objective.weights and len(objective.weights) != vehicles:
             names = len(objective.weights)
-            raise InvalidInput(f"objective {text!r}: {names} weights; {vehicles} vehicles need {vehicles}")
+            raise InvalidInput(f"objective {text!r}: has {names} weights; must have {vehicles}, one per vehicle")
     return parsed
 
 
 def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """Return what each vehicle should minimise, for the harm so far, [n, N] (m2/s2, or injuries in 1,000 lines).
+    """Return the amount that each vehicle should minimise, for the harm so far, [n, N].
+
+    The unit is m2/s2, or injuries in 1,000 lines for the objective ``injury``.
 
     Args:
-        ledger: harm of n worlds since the start of the episode.
-        harm_count: impacts that count: ``"first"`` of each pair, or ``"total"``.
-        objectives: objective of each vehicle, N of them.
+        ledger: harm in n worlds since the start of the episode.
+        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
+        objectives: objective of each of the N vehicles.
 
     """
     harms = ledger.vehicle_harm(harm_count), ledger.world_harm(harm_count)
-    no_sums = any(OBJECTIVES[each.kind].weights is None for each in objectives)  # only these may read changes of speed
+    # only objectives that are not weighted sums may use changes of speed
+    no_sums = any(OBJECTIVES[each.kind].weights is None for each in objectives)
     changes = ledger.speed_changes(harm_count) if no_sums else 2 * (np.full(ledger.mass_t.shape, np.nan),)
     arrays = *harms, ledger.mass_t, *changes, ledger.harm_weight
     harm = HarmSoFar(*(np.broadcast_to(each, each.shape) for each in arrays))  # read-only views
@@ -164,16 +177,16 @@ def objective_harm(ledger: Ledger, harm_count: HarmCount, objectives: Sequence[O
 
 
 def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives: Sequence[Objective]) -> Floats:
-    """Return by how much a step raised what each vehicle should minimise, [n, N].
+    """Return the change during a step of the amount that each vehicle should minimise, [n, N].
 
-    Of a weighted sum of what the vehicles bear it is the same sum of what they bear in the step; of any other
-    objective it is the difference.
+    For an objective that is a weighted sum of the vehicles' harm, the change is the weighted sum of their harm in the
+    step. For any other objective it is the amount after the step minus the amount before the step.
 
     Args:
         before: harm before the step.
-        after: harm after it.
-        harm_count: impacts that count, ``first`` of each pair or ``total``.
-        objectives: objective of each vehicle, N of them.
+        after: harm after the step.
+        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
+        objectives: objective of each of the N vehicles.
 
     """
     sums = [OBJECTIVES[each.kind].weights is not None for each in objectives]
@@ -185,14 +198,14 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
 
 
 def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, bool]:
-    """Return the weights of the vehicles' harm in an objective, [n, N], and whether the largest counts, not the sum.
+    """Return the weights of the vehicles' harm in an objective, [n, N], and whether it is a maximum instead of a sum.
 
     Args:
         objective: the objective.
-        line: ``Vehicles`` or ledger of n lines of N vehicles.
-        vehicle: index of the vehicle whose objective it is (0 = front).
+        line: ``Vehicles`` or ledger of n worlds of N vehicles.
+        vehicle: index of the vehicle that has this objective (0 = front).
 
-    Raises ``InvalidInput`` for an objective that is neither, such as ``injury``.
+    Raises ``InvalidInput`` for an objective that is neither a weighted sum nor a maximum, such as ``injury``.
 
     """
     weights = OBJECTIVES[objective.kind].weights
@@ -200,22 +213,24 @@ def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, b
         return np.ones(line.mass_t.shape), True
     if weights is None:
         known = ", ".join(kind.form for kind in _BUILT_IN.values() if kind.weights) + ", maximin"
-        raise InvalidInput(f"objective {objective.kind!r}: is no weighted sum of the vehicles' harm; known: {known}")
+        raise InvalidInput(
+            f"objective {objective.kind!r}: is not a weighted sum of the vehicles' harm; use one of {known}"
+        )
     return np.broadcast_to(weights(objective, line, vehicle), line.mass_t.shape).astype(np.float64), False
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """Return the built-in objectives that fit every scenario, then the registered ones that are loaded."""
+    """Return the names of the built-in objectives that every scenario can use, and of loaded registered objectives."""
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
 def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
-    """Return the names of objectives, with ``standard`` replaced by all of ``standard_objectives``.
+    """Return ``texts`` with each ``standard`` replaced by all names from ``standard_objectives``.
 
-    Raises ``InvalidInput`` if an objective is unknown, listed twice, or made for another number of vehicles.
+    Raises ``InvalidInput`` if an objective is unknown, listed twice, or has weights for another number of vehicles.
 
     Args:
-        texts: names of objectives, or ``standard``.
+        texts: names of objectives; ``standard`` means all standard objectives.
         vehicles: number of vehicles in the line.
 
     """
@@ -223,45 +238,52 @@ def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
     for k, name in enumerate(names):
         objectives_of(name, vehicles)
         if name in names[:k]:
-            raise InvalidInput(f"objective {name!r} is given twice")
+            raise InvalidInput(f"objective {name!r} is listed twice; list it once")
     return names
 
 
 def register_objective(name: str, function: ObjectiveFunction) -> None:
-    """Register an objective, so that scenarios, rewards and ``--objective`` can use ``name``.
+    """Register an objective, so that scenarios, rewards and ``--objective`` can use it under ``name``.
 
     An installed package registers an objective with an entry point of the group ``ethbrake_marl.objectives`` that names
     the function.
 
-    Args:
-        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        function: ``function(harm, vehicle)`` returns the amount of harm that this vehicle should minimise, [n] (m2/s2).
-            ``harm`` is a ``HarmSoFar``, vehicle 0 is in front. Its docstring describes the objective.
-
     Registering the same function again changes nothing. Raises ``AlreadyExists`` if the name belongs to another
-    objective, ``InvalidInput`` for an invalid name or a function without a docstring.
+    objective, and ``InvalidInput`` for an invalid name or a function without a docstring.
+
+    Args:
+        name: name of the objective, 1 to 64 characters ``a-z``, ``0-9``, ``-``, ``_``; the first is a letter or digit.
+        function: ``function(harm, vehicle)`` returns the amount that this vehicle should minimise, [n] m2/s2. ``harm``
+            is a ``HarmSoFar``; ``vehicle`` is an index, 0 for the front vehicle. The function's docstring describes the
+            objective.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise InvalidInput(f"objective {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+        raise InvalidInput(
+            f"objective {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a letter or"
+            " digit"
+        )
     if not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"objective {name!r}: needs a function with a docstring that says what it is")
+        raise InvalidInput(f"objective {name!r}: must be a function with a docstring that describes the objective")
 
     def amount(_: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
         try:
             harms = np.asarray(function(harm, vehicle))
         except Exception as error:
-            raise InvalidInput(f"objective {name!r}: of vehicle_{vehicle + 1}: {describe_error(error)}") from error
+            raise InvalidInput(
+                f"objective {name!r}: its function fails for vehicle_{vehicle + 1}: {describe_error(error)}"
+            ) from error
         worlds = len(harm.whole)
         if harms.shape != (worlds,) or harms.dtype.kind not in "fiub":
             raise InvalidInput(
-                f"objective {name!r}: gave {harms.dtype} of shape {harms.shape}; must be numbers of shape ({worlds},),"
-                " one per world"
+                f"objective {name!r}: its function returned {harms.dtype} of shape {harms.shape}; must return numbers"
+                f" of shape ({worlds},), one per world"
             )
         if not np.isfinite(harms).all():
             world = int(np.argmin(np.isfinite(harms)))
             raise InvalidInput(
-                f"objective {name!r}: gave {harms[world]} for vehicle_{vehicle + 1} in world {world}; must be finite"
+                f"objective {name!r}: its function returned {harms[world]} for vehicle_{vehicle + 1} in world {world};"
+                " must be finite"
             )
         return harms.astype(np.float64)
 
@@ -270,15 +292,16 @@ def register_objective(name: str, function: ObjectiveFunction) -> None:
 
 
 def scored(ledger: Ledger, harm_count: HarmCount, declared: Sequence[Declared] | None = None) -> dict[str, Floats]:
-    """Evaluate one ledger under several objectives; return the amount for each vehicle: ``{"own": [n, N], ...}``.
+    """Return the amounts of several objectives for the same harm: ``{"own": [n, N], ...}``, one per vehicle.
 
-    So a policy can be judged under objectives that it was not trained for. Amounts are in m2/s2, or injuries in 1,000
-    lines; less is better.
+    With this function a policy can be evaluated under objectives for which it was not trained. Amounts are in m2/s2, or
+    injuries in 1,000 lines for the objective ``injury``; less is better.
 
     Args:
-        ledger: harm of n worlds since the start of the episode.
-        harm_count: impacts that count: ``"first"`` of each pair, or ``"total"``.
-        declared: list of objectives, each for all vehicles or one per vehicle; None: ``standard_objectives``.
+        ledger: harm in n worlds since the start of the episode.
+        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
+        declared: list of objectives; each entry is one text for all vehicles, or a tuple with one text per vehicle.
+            None: ``standard_objectives``.
 
     Raises ``InvalidInput`` for a single name instead of a list.
 
@@ -304,9 +327,10 @@ def _social(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 @lru_cache
 def _social_weights(angle_deg: float) -> tuple[float, float]:
-    """Return the weights of own harm and others' harm: cosine and sine of the angle, exactly 0 and 1 at 90 degrees.
+    """Return the weights of own harm and of others' harm: cosine and sine of the angle, exactly 0 and 1 at 90 degrees.
 
-    Computed by their series in exact fractions and rounded once, because the C library's last bits differ by processor.
+    The power series are summed in exact fractions and rounded once. Results of the C library would differ between
+    processors in the last bits.
     """
     if angle_deg == 90.0:
         return 0.0, 1.0
@@ -318,10 +342,10 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 
 
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
-    """Return the injuries in 1,000 lines, [n], summed front to rear; the same number for all vehicles.
+    """Return the expected injuries in 1,000 lines, [n], summed over the vehicles; the same for every ``vehicle``.
 
-    If a vehicle has two impacts, the larger risk counts, not the larger change of speed, so that no further impact can
-    lower the number.
+    For a vehicle that is hit at both sides, the larger of the two risks counts. The larger change of speed may have the
+    smaller risk, so with it another impact could lower the number of injuries.
     """
     del vehicle
     front, rear = harm.front_change_mps, harm.rear_change_mps
@@ -334,9 +358,9 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 
 def weighted_harm(borne: Floats, weights: Floats) -> Floats:
-    """Return ``N sum_j w_j H_j / sum_j w_j``, [n], summed front to rear: the same bits in any batch.
+    """Return ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, summed front to rear, so it does not depend on the batch.
 
-    ``borne``: harm H_j of each vehicle, [n, N] m2/s2; ``weights``: w_j, [n, N].
+    ``borne``: harm H_j that each vehicle bears, [n, N] m2/s2. ``weights``: weight w_j of each vehicle, [n, N].
     """
     n, vehicles = borne.shape
     harm, whole = np.zeros(n), np.zeros(n)
@@ -348,7 +372,7 @@ def weighted_harm(borne: Floats, weights: Floats) -> Floats:
 
 
 def _shares(weights: Floats) -> Floats:
-    """Return weights [n, N] as multiples of their mean."""
+    """Return ``weights`` [n, N] divided by their mean over the vehicles."""
     shares: Floats = weights * (weights.shape[1] / weights.sum(axis=1, keepdims=True))
     return shares
 
@@ -356,44 +380,48 @@ def _shares(weights: Floats) -> Floats:
 _BUILT_IN: dict[str, Kind] = {
     "total": Kind(
         "total",
-        "everybody's harm alike",
+        "harm of all vehicles, with equal weights",
         lambda _, harm, vehicle: harm.whole,
         weights=lambda _, line, vehicle: np.ones(line.mass_t.shape[1]),
     ),
     "own": Kind(
         "own",
-        "what the vehicle itself bears",
+        "harm that the vehicle itself bears",
         lambda _, harm, vehicle: harm.borne[:, vehicle],
         weights=lambda _, line, vehicle: np.eye(line.mass_t.shape[1])[vehicle],
     ),
     "social": Kind(
         "social:ANGLE",
-        "social value orientation: own harm at 0, the others' at 90 degrees",
+        "social value orientation: own harm at 0 degrees, harm of the other vehicles at 90 degrees",
         _social,
         weights=lambda objective, line, vehicle: np.where(
             np.eye(line.mass_t.shape[1])[vehicle], *_social_weights(objective.angle_deg)
         ),
     ),
-    "maximin": Kind("maximin", "the harm of whoever bears most", lambda _, harm, vehicle: harm.borne.max(axis=1)),
+    "maximin": Kind("maximin", "harm of the vehicle that bears most", lambda _, harm, vehicle: harm.borne.max(axis=1)),
     "mass-weighted": Kind(
         "mass-weighted",
-        "harm in a heavy vehicle counts for more",
+        "harm of all vehicles, weighted by their masses",
         lambda _, harm, vehicle: weighted_harm(harm.borne, harm.mass_t),
         weights=lambda _, line, vehicle: _shares(line.mass_t),
     ),
     "weighted": Kind(
         "weighted:W1,W2,...",
-        "one weight for each vehicle",
+        "harm of all vehicles, with one given weight per vehicle",
         lambda objective, harm, vehicle: weighted_harm(harm.borne, np.full(harm.borne.shape, objective.weights)),
         weights=lambda objective, line, vehicle: _shares(np.array([objective.weights])),
     ),
     "preference": Kind(
         "preference",
-        "the weights harm_weight of each world",
+        "harm of all vehicles, with the weights harm_weight of the scenario",
         lambda _, harm, vehicle: weighted_harm(harm.borne, harm.harm_weight),
         weights=lambda _, line, vehicle: _shares(line.harm_weight),
     ),
-    "injury": Kind("injury:CURVE", "injuries in 1,000 lines, by the impact that injures a vehicle more", _injured),
+    "injury": Kind(
+        "injury:CURVE",
+        "expected injuries in 1,000 lines, by the impact with the largest risk for each vehicle",
+        _injured,
+    ),
 }
 
 OBJECTIVES: Registry[Kind] = Registry("objective", "objectives", register_objective, _BUILT_IN)

@@ -1,4 +1,4 @@
-"""Observations: which features a vehicle observes, and their values in a batch of worlds."""
+"""Observations: choose the features that a vehicle observes, and compute their values in a batch of worlds."""
 
 from __future__ import annotations
 
@@ -46,9 +46,10 @@ from ethbrake_marl.physics.state import Floats, Ints, Worlds
 
 @dataclass(frozen=True, slots=True)
 class ObservationSpec:
-    """What a vehicle observes: a number of neighbours on each side, and whether place, obstacle and contacts are added.
+    """The features that a vehicle observes: its own, those of neighbours, and optionally place, obstacle and contacts.
 
-    With ``chosen`` the observation has exactly these features, in this order; use ``choose_observation`` to make it.
+    If ``chosen`` is given, the observation has exactly these features in this order. Use ``choose_observation`` to make
+    such a specification.
 
     >>> import ethbrake_marl as eb
     >>> spec = eb.ObservationSpec(front=2, rear=0)
@@ -61,43 +62,48 @@ class ObservationSpec:
 
     front: int = 1  # number of observed neighbours ahead, 0 to 64
     rear: int = 1  # number of observed neighbours behind, 0 to 64
-    role: bool = False  # whether to add the vehicle's place in the line (GROUPS.role)
-    obstacle: bool = False  # whether to add the obstacle ahead (GROUPS.obstacle)
-    chosen: tuple[str, ...] = ()  # full names of all features, in order; the other fields are then what these need
-    contact: bool = False  # whether to add forecast impacts (GROUPS.contact); contact_far only through ``chosen``
+    role: bool = False  # whether the vehicle's place in the line is observed (GROUPS.role)
+    obstacle: bool = False  # whether the obstacle ahead is observed (GROUPS.obstacle)
+    chosen: tuple[str, ...] = ()  # full names of all features, in order; the fields above and ``contact`` must fit them
+    contact: bool = False  # whether forecast impacts are observed (GROUPS.contact); contact_far needs ``chosen``
     time_step_s: float | None = None  # time between two decisions (s); only contact features need it
 
     def __post_init__(self) -> None:
-        """Raise ``InvalidInput`` for an invalid number of neighbours, or fields that contradict ``chosen``."""
+        """Raise ``InvalidInput`` for a field that is invalid or contradicts ``chosen``."""
         for side, count in (("front", self.front), ("rear", self.rear)):
             whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
             if not whole or not 0 <= count <= MOST_NEIGHBOURS:
-                raise InvalidInput(f"observation: {side} = {count!r}; must be a whole number in 0..{MOST_NEIGHBOURS}")
+                raise InvalidInput(
+                    f"observation: {side} = {count!r}; must be a whole number from 0 to {MOST_NEIGHBOURS}"
+                )
         for name, shown in (("role", self.role), ("obstacle", self.obstacle), ("contact", self.contact)):
             if not isinstance(shown, bool):
                 raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
         if self.time_step_s is not None and not 0.0 < self.time_step_s < math.inf:
             raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}; must be a positive number of seconds")
         if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
-            raise InvalidInput("observation: chosen: the other fields do not fit; use eb.choose_observation([...])")
+            raise InvalidInput(
+                "observation: chosen: the other fields contradict the chosen features; use eb.choose_observation([...])"
+            )
 
     @property
     def sides(self) -> tuple[tuple[str, int], ...]:
-        """Observed neighbours as (prefix, offset), nearest first: ``("front_1", -1)`` is the next vehicle ahead.
+        """Observed neighbours as (prefix, offset): ``("front_1", -1)`` is the next vehicle ahead.
 
-        Neighbours in front come first; the offset is the difference of the places in the line.
+        Neighbours ahead come before neighbours behind, nearest first. The offset is the neighbour's index in the line
+        minus the observer's index.
         """
         fronts = tuple((f"front_{k}", -k) for k in range(1, self.front + 1))
         return fronts + tuple((f"rear_{k}", k) for k in range(1, self.rear + 1))
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """Every feature of an observation in order; names are unique (``own.speed``, ``front_1.gap``)."""
+        """All features of the observation, in order; their names are unique (``own.speed``, ``front_1.gap``)."""
         return tuple(feature_named(name) for name in self.chosen) or self.whole
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """All built-in features of every group of which the observation has at least one feature, in order."""
+        """Built-in features of every group from which the observation has at least one feature, in order."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -107,37 +113,38 @@ class ObservationSpec:
 
     @property
     def far(self) -> bool:
-        """Whether the observation has features of GROUPS.contact_far (late or hard forecast impacts)."""
+        """Whether the observation has features of GROUPS.contact_far (forecast impacts that are late or hard)."""
         return any(name.startswith("contact_far.") for name in self.chosen)
 
     @property
     def size(self) -> int:
-        """Length F of an observation."""
+        """Number of features, F."""
         return len(self.features)
 
     @property
     def plan(self) -> Plan:
         """The ``Plan`` that computes this observation from worlds.
 
-        It is cached per specification and must not be changed. Raises ``InvalidInput`` for contact features without a
-        time step.
+        The plan is cached and must not be changed. Raises ``InvalidInput`` for contact features if ``time_step_s`` is
+        None.
         """
         return _plan(self, tuple(registered_in(self.chosen).items()) if self.chosen else ())
 
     def at_steps_of(self, time_step_s: float) -> ObservationSpec:
-        """Return the specification with ``time_step_s`` (s) filled in, if it needs one and has none."""
+        """Return the specification with this ``time_step_s`` (s) if it has contact features and no time step yet."""
         return replace(self, time_step_s=time_step_s) if self.contact and self.time_step_s is None else self
 
 
-Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]  # list: groups and features; mapping: fields
+# a specification, a list of groups and features, or a mapping with the fields of a specification
+Observation = ObservationSpec | Sequence[str] | Mapping[str, Any]
 
 
 def choose_observation(listed: Observation, time_step_s: float | None = None) -> ObservationSpec:
-    """Return the observation for a list of groups and single features: ``[own, front_1, rear_1.gap, my_feature]``.
+    """Return the observation for a list of groups and features, such as ``["own", "front_1", "rear_1.gap"]``.
 
-    A mapping gives the fields of an ``ObservationSpec``, as in JSON; an ``ObservationSpec`` is returned unchanged.
-    ``time_step_s`` (s) is the time between two decisions; only contact features outside an environment need it. Raises
-    ``UnknownName`` with a suggestion, ``InvalidInput`` for an invalid list.
+    ``listed`` may also be a mapping with the fields of an ``ObservationSpec``, or an ``ObservationSpec``.
+    ``time_step_s``: time between two decisions (s), needed only for contact features outside an environment. Raises
+    ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput`` for an invalid list.
     """
     if isinstance(listed, ObservationSpec):
         spec = listed
@@ -160,10 +167,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return what features with these full names need: neighbours in front and behind, own place, obstacle, contacts.
-
-    These are the fields ``front``, ``rear``, ``role``, ``obstacle`` and ``contact`` of ``ObservationSpec``.
-    """
+    """Return the fields (front, rear, role, obstacle, contact) of the specification with the features ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -178,12 +182,12 @@ _ROLE, _OBSTACLE = len(GROUPS.role), len(GROUPS.obstacle)
 
 
 def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations:
-    """Return the observation of ``vehicle`` (0 = front) in every world, [n, F] float32 in new memory.
+    """Return the observation of ``vehicle`` (0 = front) in every world, a new array [n, F] float32.
 
-    ``spec`` says which F features are observed. Raises ``InvalidInput`` for an index without a vehicle.
+    ``spec``: the F features to observe. Raises ``InvalidInput`` if no vehicle has this index.
     """
     if not 0 <= vehicle < worlds.N:
-        raise InvalidInput(f"observe: vehicle index {vehicle}; must be in 0..{worlds.N - 1}")
+        raise InvalidInput(f"observe: vehicle index {vehicle}; must be from 0 to {worlds.N - 1}")
     packed = Packed.of(worlds)
     return spec.plan.observe(packed.state, packed.params, np.array([vehicle]))[:, 0].copy()
 
@@ -191,24 +195,24 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
 class Scaling(NamedTuple):
     """Arguments of the kernel that computes all groups of features except the contact features."""
 
-    offsets: Ints  # place of each observed neighbour relative to the observer: -1 is the next vehicle ahead
+    offsets: Ints  # index of each observed neighbour minus index of the observer; -1 is the next vehicle ahead
     role: bool  # whether the place in the line is observed
     obstacle: bool  # whether the obstacle ahead is observed
-    features: Floats  # [3, F] rows 1 / scale, low and high; a column per feature
+    features: Floats  # [3, F] scaling of the features: rows 1 / scale, low and high, one column per feature
 
 
 class Extra(NamedTuple):
     """A registered feature in an observation, computed by its own function."""
 
-    column: int  # its column in the observation
+    column: int  # column of the feature in the observation
     entry: RegisteredFeature  # the feature and its function
-    offset: int  # place of the neighbour relative to the vehicle, -1 is the next one ahead; 0: the vehicle itself
+    offset: int  # index of the neighbour minus index of the vehicle; 0: the feature is of the vehicle itself
     known: int  # column of the neighbour's feature ``known`` among the built-in features
 
     def known_in(self, worlds: Worlds, vehicle: int, neighbour: int) -> NDArray[np.bool_]:
-        """Return the worlds [n] in which ``vehicle`` knows every piece of the neighbour that the feature reads.
+        """Return whether ``vehicle`` knows all data of the neighbour that the feature reads, in each world, [n].
 
-        Raises ``InvalidInput`` for a feature that does not say what it reads, where messages do not contain everything.
+        Raises ``InvalidInput`` if messages lack some data and the feature was registered without ``reads``.
         """
         messages, reads = Messages.of(worlds), self.entry.reads
         if not messages.says_contents:
@@ -216,9 +220,9 @@ class Extra(NamedTuple):
         if reads is None:
             for piece in messages.lacks(neighbour):
                 raise InvalidInput(
-                    f"feature {self.entry.feature.name!r}: vehicle_{neighbour + 1} does not tell its {piece} (v2x:"
-                    " tells), and the feature may read it; list what it reads, as in register_feature(...,"
-                    " reads=['place'])"
+                    f"feature {self.entry.feature.name!r}: the messages of vehicle_{neighbour + 1} do not contain its"
+                    f" {piece} (v2x: tells), which the feature may read; list what the feature reads when you register"
+                    " it, as in register_feature(..., reads=['place'])"
                 )
             return np.ones(worlds.n, np.bool_)
         known = messages.known_pieces(vehicle, worlds.time_s)[:, neighbour]
@@ -226,25 +230,24 @@ class Extra(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """How to compute an observation from worlds: kernels fill whole groups, functions compute registered features."""
+    """Everything needed to compute an observation: arguments of the kernels, and the registered features."""
 
-    scaling: Scaling  # how to compute all built-in features but the contact features
-    contacts: Contacts | None  # contact features, after all other groups; None: no such features
-    picked: Ints | None  # [F] columns to take from the features of whole groups; None: all
-    extras: tuple[Extra, ...]  # registered features
+    scaling: Scaling  # arguments for the built-in features except the contact features
+    contacts: Contacts | None  # arguments for the contact features, which follow all other groups; None: none observed
+    picked: Ints | None  # [F] columns of the observation among the features of whole groups; None: all columns
+    extras: tuple[Extra, ...]  # registered features in the observation
 
     def observe(self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None = None) -> Observations:
         """Return the observations of several vehicles, [n, len(vehicles), F] float32.
 
-        With periodic messages a vehicle observes the worlds as it estimates them (``physics.estimates``). Contact
-        features of commands that are not needed are 0. Raises ``PhysicsError`` with the worlds in which a forecast of
-        contacts failed.
+        With periodic messages, a vehicle observes its own estimate of the worlds (``physics.estimates``). Raises
+        ``PhysicsError`` with the worlds in which a forecast of contacts failed.
 
         Args:
             state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-            params: their parameter rows.
+            params: parameter rows of the worlds, in the same layout.
             vehicles: indices of the observing vehicles, from 0.
-            steps: number of steps so far, [n], for messages.
+            steps: number of steps so far, [n], for error messages.
 
         """
         packed = Packed(state, params)
@@ -263,9 +266,9 @@ class Plan(NamedTuple):
     def _observe_present(
         self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None, *, says: bool = False
     ) -> Observations:
-        """Version of ``observe`` without estimation: a known vehicle is observed in its present state.
+        """Return the observations if the state of a known vehicle is its present state, [n, len(vehicles), F].
 
-        ``says``: whether the worlds say what messages contain.
+        ``says``: whether the scenario restricts what messages contain (``v2x: tells``).
         """
         shape = len(state), len(vehicles)
         whole = np.empty((*shape, self.scaling.features.shape[1]), np.float32)
@@ -277,7 +280,7 @@ class Plan(NamedTuple):
             failed = np.zeros(len(state), np.bool_)
             observe_contacts(state, params, vehicles, *self.contacts, features, failed)
             if failed.any():
-                reason = f"a forecast of contacts could not look {FORECAST_S:g} s ahead"
+                reason = f"a forecast of contacts failed before the end of its {FORECAST_S:g} s"
                 raise PhysicsError({k: reason for k in np.flatnonzero(failed).tolist()})
             whole = np.concatenate([whole, features], axis=2)
         if self.picked is None:
@@ -291,9 +294,9 @@ class Plan(NamedTuple):
             counts = np.ones(worlds.n, np.bool_) if neighbour is None else whole[:, o, extra.known] == 1.0
             if neighbour is not None and counts.any():
                 counts &= extra.known_in(worlds, vehicle, neighbour)
-            if counts.any():  # a neighbour's feature counts where the neighbour is known
+            if counts.any():  # the value of a neighbour's feature is used in worlds where the neighbour is known
                 values = extra.entry.checked(worlds, vehicle, neighbour, counts, steps)
-            else:  # no such neighbour, or no news of it
+            else:  # the neighbour does not exist or is unknown in all worlds
                 values = extra.entry.scaled(np.full(worlds.n, extra.entry.unknown))
             out[:, o, extra.column] = values
         return out
@@ -308,7 +311,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
     if spec.contact:
         if spec.time_step_s is None:
             raise InvalidInput(
-                "observation: contact features need the time between two decisions; give it as time_step_s, for"
+                "observation: contact features need the time between two decisions; give the argument time_step_s, for"
                 " instance eb.choose_observation([...], time_step_s=scenario.time_step_s)"
             )
         inside = [name.partition(".") for name in spec.chosen or (feature.name for feature in spec.whole)]
@@ -329,7 +332,7 @@ def _plan(spec: ObservationSpec, registered: tuple[tuple[str, RegisteredFeature]
 
 
 def _scales(features: Sequence[Feature]) -> Floats:
-    """Return the scaling of features, [3, F]: rows 1 / scale, low and high, a column per feature."""
+    """Return the scaling of features, [3, F]: rows 1 / scale, low and high, one column per feature."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -338,19 +341,19 @@ def _observe_rows(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, features: Floats,
     out: Observations,
 ) -> None:  # fmt: skip
-    """Fill ``out`` [n, observers, F] with the clipped features of each observer, in the order of ``GROUPS``.
+    """Write the features of each observer into ``out``, in the order of ``GROUPS``.
 
-    This is one long loop on purpose: passing these arrays to functions made it four times slower.
+    This is one long loop because smaller functions that receive these arrays made it four times slower.
 
     Args:
         state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: their parameter rows.
+        params: parameter rows of the worlds, in the same layout.
         observers: indices of the observing vehicles.
-        offsets: place of each observed neighbour relative to the observer; -1 is the next vehicle ahead.
-        role: whether the vehicle's place in the line is observed.
+        offsets: index of each observed neighbour minus index of the observer; -1 is the next vehicle ahead.
+        role: whether the observer's place in the line is observed.
         with_obstacle: whether the obstacle ahead is observed.
-        features: scaling, [3, F]: rows 1 / scale, low and high, a column per feature.
-        out: result.
+        features: scaling of the features, [3, F]: rows 1 / scale, low and high, one column per feature.
+        out: result, [n, observers, F].
 
     """
     of = columns(state)
@@ -424,9 +427,10 @@ def _observe_rows(
 def _hide_untold(
     state: Floats, params: Floats, observers: Ints, offsets: Ints, role: bool, with_obstacle: bool, out: Observations
 ) -> None:
-    """Set features in ``out`` to 0 that need a piece of a neighbour which the observer does not know.
+    """Set those features in ``out`` to 0 that need data of a neighbour which the observer does not know.
 
-    Where no piece of it is known, all of its features are 0. The obstacle is known with the place of Vehicle 1.
+    If the observer knows no data of a neighbour, all features of this neighbour become 0. An observer knows the
+    obstacle if it knows the place of Vehicle 1.
     """
     of = columns(state)
     N, knows = of.vehicles, np.zeros(len(PIECES), np.bool_)
@@ -453,15 +457,15 @@ def _hide_untold(
 
 @compiled
 def _fitting_deceleration(speed: float, latency_left: float, room: float) -> float:
-    """Return the constant deceleration (m/s2) that stops a vehicle within ``room``: ``v^2 / (2 (room - v tau))``.
+    """Return the constant deceleration (m/s2) with which a vehicle stops in a distance: ``v^2 / (2 (room - v tau))``.
 
-    Room below 1 mm counts as 1 mm. So without room the feature is at its upper bound (20 m/s2) from 0.2 m/s on, and
-    lower for a slower vehicle; at rest it is 0.
+    A braking distance ``room - v tau`` below 1 mm counts as 1 mm. The result is then at least 20 m/s2, the upper bound
+    of the feature, for speeds of 0.2 m/s and more; at rest it is 0.
 
     Args:
-        speed: present speed v, m/s.
-        latency_left: time tau until its brakes act, s.
-        room: distance in which it must stop, m.
+        speed: present speed v of the vehicle, m/s.
+        latency_left: time tau until the vehicle's brakes act, s.
+        room: distance in which the vehicle must stop, m.
 
     """
     speed = max(speed, 0.0)

@@ -1,4 +1,4 @@
-"""Observations of the vehicles of a game: which features each vehicle observes."""
+"""The features that each vehicle of a game observes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ethbrake_marl.game.observations import Observation, ObservationSpec, choose
 def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSpec:
     """Return the observation that the scenario declares for ``vehicle``, such as ``"vehicle_2"``.
 
-    None: the observation that all learners share; raises ``InvalidInput`` naming two learners whose observations
-    differ. By default a vehicle observes one neighbour on each side; with an obstacle ahead also its own place in the
-    line and the obstacle.
+    If ``vehicle`` is None, return the observation that all learners share, or raise ``InvalidInput`` naming two
+    learners whose observations differ. If the scenario declares no observation, a vehicle observes one neighbour on
+    each side, and, in a scenario with an obstacle, also its own place in the line and the obstacle.
     """
     observations = observations_of(scenario)
     if vehicle is None:
@@ -25,14 +25,14 @@ def observation_for(scenario: Game, vehicle: str | None = None) -> ObservationSp
 
 
 def observations_of(scenario: Game, given: Observation | None = None) -> tuple[ObservationSpec, ...]:
-    """Return the observation of each vehicle, front to rear, [N].
+    """Return the observation of each of the N vehicles, front to rear.
 
-    Raises ``UnknownName`` for an unknown vehicle, and what ``choose_observation`` raises.
+    Raises ``UnknownName`` for an unknown vehicle, and the same errors as ``choose_observation``.
 
     Args:
-        scenario: the game, whose own declaration applies unless ``given`` replaces it.
-        given: one observation for all vehicles, or by name for some: ``{"vehicle_2": ["own", "front_1"]}``; None: what
-            the scenario declares.
+        scenario: the game, which declares observations.
+        given: observation that replaces the scenario's: one for all vehicles, or a mapping for some vehicles, such as
+            ``{"vehicle_2": ["own", "front_1"]}``; None: use the scenario's observations.
 
     """
     names, step_s, said = scenario.vehicle_names, scenario.time_step_s, scenario.observation
@@ -53,17 +53,18 @@ def observations_of(scenario: Game, given: Observation | None = None) -> tuple[O
 
 
 def common_observation(observations: tuple[ObservationSpec, ...], scenario: Game) -> ObservationSpec:
-    """Return the observation that all learners share; without learners, the one that all vehicles share.
+    """Return the observation that all learners share, or, if there are no learners, that all vehicles share.
 
-    Raises ``InvalidInput`` naming two vehicles whose observations differ. ``observations``: one per vehicle, front to
-    rear.
+    Raises ``InvalidInput`` naming two vehicles whose observations differ. ``observations``: observation of each
+    vehicle, front to rear.
     """
     first, *others = scenario.learners or range(scenario.vehicles)
     for other in others:
         if observations[other] != observations[first]:
             one, two = (scenario.vehicle_names[i] for i in (first, other))
             raise InvalidInput(
-                f"observation: {one} and {two} of {scenario.name!r} observe different features, here learners must"
-                " observe the same: give one list for all, let one learn, or use parallel_env or scheme independent"
+                f"observation: {one} and {two} of {scenario.name!r} observe different features, but here all learners"
+                " must observe the same features; give one list for all vehicles, use a single learner, or use"
+                " parallel_env or scheme: independent"
             )
     return observations[first]

@@ -1,15 +1,17 @@
-"""Vector rewards: instead of one number, a reward has a component for each vehicle's harm, or others by name.
+"""Vector rewards: a reward has several named components, such as the harm of each vehicle, instead of one number.
 
-Components, of one step:
+These components can be chosen. Their values are for one step:
 
+==========  ========================================================================================
+component   value
 ==========  ========================================================================================
 harm_K      minus the harm that vehicle_K bears, m2/s2
 pair_J_K    minus the harm of the pair of vehicle_J and vehicle_K behind it, m2/s2
-obstacle    minus the harm of Vehicle 1 with an obstacle ahead, m2/s2
-a term      a term that the reward weighs (``game.rewards``), before its weight, for instance ``jerk``
+obstacle    minus the harm of impacts of Vehicle 1 with an obstacle ahead, m2/s2
+term name   value, before weighting, of a term with a weight in the reward, for instance ``jerk``
 ==========  ========================================================================================
 
-Harm counts as the reward's ``harm_count`` says.
+The setting ``harm_count`` of the reward selects first-impact harm or total harm.
 """
 
 from __future__ import annotations
@@ -25,18 +27,18 @@ from ethbrake_marl.physics.state import Floats
 
 RewardVector = str | Sequence[str]  # "vehicles", or names of components
 
-VEHICLES = "vehicles"  # the harm of each vehicle, front to rear
+VEHICLES = "vehicles"  # stands for the components harm_1 to harm_N
 
 
 def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> tuple[str, ...]:
     """Return the names of the components of a vector reward.
 
     Args:
-        vector: ``vehicles``, or a list of names of components, each once.
+        vector: ``vehicles``, or a list of different names of components.
         params: the reward, whose terms may be components.
         vehicles: number of vehicles in the line.
 
-    Raises ``InvalidInput`` for no name or a name given twice, ``UnknownName`` for another name.
+    Raises ``InvalidInput`` for an empty list or a repeated name, and ``UnknownName`` for an unknown name.
 
     """
     each = [f"harm_{k + 1}" for k in range(vehicles)]
@@ -45,7 +47,7 @@ def components_of(vector: RewardVector, params: RewardParams, vehicles: int) -> 
     listed = isinstance(vector, Sequence) and not isinstance(vector, str) and all(isinstance(n, str) for n in vector)
     if not listed or not vector or len(set(vector)) < len(vector):
         raise InvalidInput(
-            f"reward_vector = {vector!r}: must be {VEHICLES!r}, or a list of components, each once, for instance"
+            f"reward_vector = {vector!r}: must be {VEHICLES!r}, or a list of different components, for instance"
             " ['harm_1', 'harm_2', 'harm_3']"
         )
     known = [*each, *(f"pair_{k + 1}_{k + 2}" for k in range(vehicles - 1)), "obstacle", *params.counted]
@@ -60,9 +62,9 @@ def vector_of(names: Sequence[str], harm: Ledger, harm_count: HarmCount, terms: 
 
     Args:
         names: names of the K components.
-        harm: harm of the step, of n worlds of N vehicles.
-        harm_count: impacts that count, ``first`` of each pair or ``total``.
-        terms: terms of the reward before their weights, by name, [n] or [n, N].
+        harm: harm of the step in n worlds of N vehicles.
+        harm_count: ``"first"``: first-impact harm; ``"total"``: total harm.
+        terms: values of the reward's terms before weighting, by name, [n] or [n, N].
 
     """
     borne, pairs = harm.vehicle_harm(harm_count), harm.pair_harm(harm_count)

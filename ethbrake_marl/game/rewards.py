@@ -1,18 +1,21 @@
-"""Reward: a weighted sum of measures (``game.measures``): what is reported can be rewarded.
+"""Rewards: a reward is a weighted sum of terms, each of which is a measure (``game.measures``).
 
-Built-in terms, for vehicle i and one step (the paper's section on the reward, with its printed defects repaired):
+The built-in terms have these values for a vehicle in one step. The terms ``collision``, ``risk``, ``jerk`` and
+``terminal`` are those of the paper, with misprints corrected:
 
 =========  =======================================================================================================
-harm       minus the harm of the whole line in this step, each impact once (``harm_count``: first | total); or minus
-           the change in this step of the amount that the vehicle's ``objective`` minimises
-collision  the paper's r_collision: minus ``sum_p k_energy w_p^2`` over every impact of the step
-risk       the paper's r_risk over the vehicle's own pairs: ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))``; an
-           opening pair has TTC = infinity (first part 0) and ``d - d_safe`` is not negative
-jerk       the paper's r_jerk: minus the squared rate of change of the own command
-terminal   the paper's r_terminal: 1 when an episode ends without any collision
-shaping    for learners: ``discount Phi(after) - Phi(before)``, Phi = minus the least harm ahead (``potential``); such a
-           difference of potentials leaves the optimal policy as it is (Ng, Harada and Russell 1999) if
-           ``shaping_discount`` is the learner's own discount
+term       value
+=========  =======================================================================================================
+harm       minus the harm of the whole line in this step (``harm_count``: first-impact or total harm); with an
+           ``objective``, minus the change in this step of the amount that the vehicle should minimise
+collision  minus ``sum k_energy w^2`` over every impact of the step, where w is the closing speed
+risk       sum of ``-sigma(-TTC / tau) - sigma(k_d (d_target - d))`` over the vehicle's pairs, with gap d and time to
+           collision ``TTC = max(d - d_safe, 0) / closing speed``; the first part is 0 if a pair does not approach
+jerk       minus the squared rate of change of the vehicle's acceleration
+terminal   1 in the last step of an episode without any collision, otherwise 0
+shaping    for learners: ``discount Phi(after) - Phi(before)``, where Phi is minus the least harm that simple braking
+           can reach (``potential``). This term does not change the optimal policy if ``shaping_discount`` equals the
+           learner's own discount (Ng, Harada and Russell 1999)
 =========  =======================================================================================================
 """
 
@@ -36,11 +39,11 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class WithoutEffect(UserWarning):
-    """Warning: a setting has no effect, for example an objective in a reward that gives harm the weight 0."""
+    """Warning that a setting has no effect, for example an objective in a reward that gives harm the weight 0."""
 
 
 def own_terms() -> list[str]:
-    """Return the names of the registered measures, which are not built in; nothing is loaded."""
+    """Return the names of the registered measures, without the built-in ones and without loading any package."""
     return [name for name in MEASURES if name not in RewardParams.model_fields]
 
 
@@ -54,25 +57,24 @@ Value = TypeVar("Value", float, Floats)
 
 _BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
-_ROUNDS = 2  # of several learners
+_ROUNDS = 2  # how often each of several learners chooses its deceleration in ``potential``
 
 
 class RewardParams(FileModel):
-    """Weights of the terms and their constants; a weight of 0 switches a term off.
+    """Weights and constants of the terms of a reward. A term with weight 0 is not computed.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights, at least 0, of these terms: harm of the line, all
-            impacts, nearness of a collision, change of the command, an end without collision, and change of a
-            potential. The head of the module has the formulas. harm must be given beside any other.
-        harm_count: impacts that count, ``first`` of each pair or ``total``.
-        objective: whose harm counts, one name or one for each vehicle; None: the scenario's.
-        shaping_discount: the learner's own discount, in (0, 1].
-        k_energy: weight of an impact's squared closing speed in the collision term.
-        ttc_scale_s: time to collision at which the risk term falls, s.
-        safety_buffer_m: distance kept free in the risk term, m.
-        target_gap_m: gap below which the risk term rises, m.
-        distance_slope_per_m: how steeply the risk term rises below that gap, 1/m.
-        terms: weights of registered measures, which may be negative: a measure of harm gets a negative one.
+        harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
+            module ``game.rewards`` has their formulas. If another term has a weight, harm must be given explicitly.
+        harm_count: ``first``: the term harm counts first-impact harm; ``total``: it counts total harm.
+        objective: objective of all vehicles, or a list with one per vehicle; None: the objective of the scenario.
+        shaping_discount: discount in the shaping term, in (0, 1]; it should equal the learner's own discount.
+        k_energy: factor of the squared closing speed in the collision term.
+        ttc_scale_s: scale tau of the time to collision in the risk term, s.
+        safety_buffer_m: distance d_safe that is subtracted from the gap in the risk term, m.
+        target_gap_m: gap d_target below which the second part of the risk term exceeds 1/2, m.
+        distance_slope_per_m: steepness k_d of the second part of the risk term, 1/m.
+        terms: weights of registered measures by name; use a negative weight for a measure that should be small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
@@ -81,7 +83,7 @@ class RewardParams(FileModel):
 
     harm: NonNegative = 1.0
     harm_count: HarmCount = "first"
-    objective: str | Annotated[tuple[str, ...], Field(strict=False)] | None = None  # None: the scenario's
+    objective: str | Annotated[tuple[str, ...], Field(strict=False)] | None = None
     collision: NonNegative = 0.0
     risk: NonNegative = 0.0
     jerk: NonNegative = 0.0
@@ -93,13 +95,13 @@ class RewardParams(FileModel):
     safety_buffer_m: NonNegative = 1.0
     target_gap_m: NonNegative = 3.0
     distance_slope_per_m: Positive = 1.0
-    # weights of registered measures; in a file or a mapping they may stand beside the others
+    # weights of registered measures; a file or mapping may also write them next to the other settings
     terms: dict[str, Finite] = Field(default_factory=dict, validate_default=True, exclude_if=not_)
 
     @model_validator(mode="before")
     @classmethod
     def _own_terms(cls, value: Any) -> Any:
-        """Move the weights of registered measures that stand beside the other settings into ``terms``."""
+        """Move weights of registered measures that are written next to the other settings into ``terms``."""
         if not isinstance(value, dict):
             return value
         beside = {name: weight for name, weight in value.items() if name in own_terms()}
@@ -107,13 +109,16 @@ class RewardParams(FileModel):
             return value
         inside = value.get("terms", {})
         if not isinstance(inside, dict) or beside.keys() & inside.keys():
-            raise ValueError("each weight of a registered measure is given once, beside the others or in terms")
+            raise ValueError(
+                "terms must be a mapping, and a registered measure must have one weight: either in terms or next to the"
+                " other settings, not both"
+            )
         return {**{name: each for name, each in value.items() if name not in beside}, "terms": {**inside, **beside}}
 
     @field_validator("terms")
     @classmethod
     def _settled(cls, value: dict[str, float]) -> dict[str, float]:
-        """Load the registered measures of ``terms`` and drop those with weight 0."""
+        """Load the registered measures in ``terms``, and remove measures with weight 0."""
         for name in value:
             if name not in own_terms():
                 raise unknown_name("measure", name, own_terms(), may_be_own=True)
@@ -131,20 +136,23 @@ class RewardParams(FileModel):
 
     @model_validator(mode="after")
     def _harm_is_meant(self) -> Self:
-        """Require an explicit weight of harm beside other terms, and a weight of harm above 0 for an objective.
+        """Raise an error if other terms are given without ``harm``, or an objective although harm has weight 0.
 
-        Harm weighs 1 by default, which must not happen unnoticed.
+        The default weight 1 of harm would otherwise be added to the given terms without notice.
         """
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
-        right = f"is left out, and would weigh 1 beside {''.join(beside[:1])}; say harm: 1, or 0 for none"
+        right = (
+            f"must be given together with {''.join(beside[:1])}, because its default weight is 1; write harm: 1, or"
+            " harm: 0 for a reward without harm"
+        )
         require(not beside or "harm" in names, ("harm",), UNSHOWN, right)
-        right = "changes the term harm alone, whose weight is 0; give that a weight, or leave it out"
+        right = "has no effect, because it changes only the term harm, whose weight is 0; leave it out or give a weight"
         require(self.objective is None or self.harm > 0.0, ("objective",), UNSHOWN, right)
         return self
 
     def weight(self, term: str) -> float:
-        """Return the weight of the built-in term or registered measure ``term``; 0 if this reward does not have it."""
+        """Return the weight of the built-in term or registered measure ``term``; 0 if the reward has no such term."""
         weight: float = self.terms[term] if term in self.terms else self.__dict__.get(term, 0.0)
         return weight
 
@@ -159,13 +167,13 @@ class RewardParams(FileModel):
         return tuple(name for name, weight in self.weights.items() if weight != 0.0)
 
     def shared(self, harm: Value, safe_end: Value) -> dict[str, Value]:
-        """Return the terms ``harm`` and ``terminal`` by name, as far as they count and are equal for all vehicles.
+        """Return the terms ``harm`` and ``terminal`` by name if they have a weight and are equal for all vehicles.
 
-        With an objective the harm term differs between vehicles and is left out.
+        If an objective is given, the term harm differs between vehicles and is not included.
 
         Args:
-            harm: harm of the step, of many worlds [n] or of one, m2/s2.
-            safe_end: 1 where the episode ended without any collision, else 0.
+            harm: harm of the step in m2/s2, for many worlds [n] or as one number for a single world.
+            safe_end: 1 if the episode ended without any collision in this step, else 0; in the same shape.
 
         """
         terms = {}
@@ -176,9 +184,9 @@ class RewardParams(FileModel):
         return terms
 
     def weighted_sum(self, terms: Mapping[str, Floats], shape: tuple[int, ...]) -> Floats:
-        """Return the reward of every vehicle, [n, N]: the sum of weight times term.
+        """Return the reward of every vehicle, [n, N]: the sum of weight times value over the terms.
 
-        ``terms``: values of each term by name, [n] or [n, N]; ``shape``: (n, N).
+        ``terms``: values of the terms by name, [n] or [n, N]. ``shape``: shape (n, N) of the result.
         """
         total = np.zeros(shape)
         for name, term in terms.items():
@@ -188,9 +196,9 @@ class RewardParams(FileModel):
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
         """Return this reward with its field ``objective`` filled in, and the parsed objective of each vehicle.
 
-        The objective is the reward's own, or else the scenario's. If all vehicles minimise everybody's harm (the usual
-        case), the field is None and the tuple is empty. The same holds if harm has weight 0; then a warning
-        (``WithoutEffect``) says that the objective changes nothing.
+        The objective is that of the reward, or of the scenario if the reward has none. If all vehicles have the
+        objective ``total``, or if harm has weight 0, the field is None and the tuple is empty. In the second case a
+        warning (``WithoutEffect``) says that an objective other than ``total`` has no effect.
 
         Args:
             of_scenario: objective that the scenario declares.
@@ -202,27 +210,30 @@ class RewardParams(FileModel):
         declared = of_scenario if self.objective is None else self.objective
         try:
             objectives = objectives_of(declared, vehicles)
-        except InvalidInput as error:  # the scenario's was found to fit when it was made
+        except InvalidInput as error:  # only the reward's objective can be invalid; the scenario's was checked before
             raise InvalidInput(f"reward: {error}") from None
         usual = all(objective.kind == "total" for objective in objectives)
         if not usual and self.harm == 0.0:
             what = f"the scenario's objective, {declared if isinstance(declared, str) else ', '.join(declared)},"
-            warnings.warn(WithoutEffect(f"{what} changes nothing: this reward gives harm no weight"), stacklevel=2)
+            warnings.warn(
+                WithoutEffect(f"{what} has no effect, because the weight of harm in this reward is 0"), stacklevel=2
+            )
         if usual or self.harm == 0.0:
             return self.model_copy(update={"objective": None}), ()
         return self.model_copy(update={"objective": declared}), objectives
 
     def potential(self, worlds: Worlds, learners: Sequence[int], horizon_s: float) -> Floats:
-        """Return the potential of the shaping term, [n] m2/s2: minus the least harm ahead that simple braking achieves.
+        """Return the potential of the shaping term, [n] m2/s2: minus the least harm that simple braking can reach.
 
-        Each learner holds a constant deceleration from now on; all other vehicles brake fully. A single learner takes
-        the best of nine shares of its capacity. Several learners begin with full braking and choose one after the
-        other, front to rear, twice round; all get the same potential.
+        Each learner brakes with a constant deceleration from now on, and all other vehicles brake fully. The
+        deceleration is one of nine fractions, from 0 to 1, of the learner's braking capacity. A single learner uses the
+        fraction with the least harm. Several learners begin with full braking and choose their fractions one after the
+        other, front to rear, in two rounds; they all get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.
             learners: indices of the learners, from 0.
-            horizon_s: end of the episode, s; harm until then counts, by ``harm_count``.
+            horizon_s: end of the episode, s; harm (by ``harm_count``) up to this time is counted.
 
         """
         braking = worlds.vehicles.braking_capacity_mps2
@@ -247,9 +258,9 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Return the ``RewardParams`` for a name in ``REWARDS``, a mapping of settings, or parameters (unchanged).
+    """Return the ``RewardParams`` for a name in ``REWARDS`` or a mapping of settings; ``RewardParams`` are unchanged.
 
-    Raises ``UnknownName`` for an unknown name or setting and ``InvalidInput`` for a value out of its range.
+    Raises ``UnknownName`` for an unknown name or setting, and ``InvalidInput`` for an invalid value.
     """
     if isinstance(reward, RewardParams):
         return reward
@@ -270,7 +281,7 @@ def reward_params(reward: Reward) -> RewardParams:
         return RewardParams(**reward)
     except ValidationError as error:
         first = first_mistake(error)
-        where = "" if isinstance(first.given, dict) else f" = {first.given!r}"  # the whole of it is to be read there
+        where = "" if isinstance(first.given, dict) else f" = {first.given!r}"
         raise InvalidInput(f"reward: {first.place.removeprefix('terms.')}{where}: {first.right}") from None
 
 

@@ -1,4 +1,4 @@
-"""``StepOutcome``: the result of one step, and the paper's reward terms that are computed from it."""
+"""``StepOutcome``, the result of one step, and the paper's reward terms that are computed from a step."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """Result of one step in n worlds of N vehicles (P pairs): the input of measures by step. Do not change it.
+    """Result of one step in n worlds of N vehicles (P pairs), the input of measures by step. Do not change its arrays.
 
-    Vehicles are counted from 0, the front one.
+    Column 0 belongs to the front vehicle or front pair.
     """
 
-    first_impact_harm: Floats  # [n] harm of the line's first impacts (of each pair) in this step, m2/s2
-    total_harm: Floats  # [n] harm of all impacts of the line in this step, m2/s2
+    first_impact_harm: Floats  # [n] first-impact harm of the line in this step, m2/s2
+    total_harm: Floats  # [n] total harm of the line in this step, m2/s2
     safe_end: Bools  # [n] whether the episode ended with this step without any collision
     gaps_m: Floats  # [n, P] gaps after the step, m
     speeds_mps: Floats  # [n, N] speeds after the step, m/s
@@ -26,11 +26,11 @@ class StepOutcome:
     previous_mps2: Floats  # [n, N] acceleration in force before the step, m/s2
     time_step_s: float  # time between two decisions, s
     time_s: Floats  # [n] time since the alert, after the step, s
-    braking_capacity_mps2: Floats  # [n, N] largest deceleration, m/s2
-    driving_capacity_mps2: Floats  # [n, N] largest forward acceleration, m/s2
-    latency_s: Floats  # [n, N] time before which commands have no effect, s
-    mass_t: Floats  # [n, N] mass, t
-    learners: Ints  # [L] indices of the vehicles that learn, or that an evaluated agent controls
+    braking_capacity_mps2: Floats  # [n, N] largest deceleration of each vehicle, m/s2
+    driving_capacity_mps2: Floats  # [n, N] largest forward acceleration of each vehicle, m/s2
+    latency_s: Floats  # [n, N] time from the alert until commands take effect, s
+    mass_t: Floats  # [n, N] mass of each vehicle, t
+    learners: Ints  # [L] indices of the learners; in an evaluation, of the controlled vehicles
 
     def protect(self) -> None:
         """Make the arrays of this object read-only."""
@@ -40,12 +40,12 @@ class StepOutcome:
 
 
 def collision(step: StepOutcome, k_energy: float) -> Floats:
-    """Return the collision term of a reward, [n]: minus ``k_energy`` times the harm of every impact of the step."""
+    """Return the collision term of a reward, [n] m2/s2: minus ``k_energy`` times the total harm of the step."""
     return -k_energy * step.total_harm
 
 
 def jerk(step: StepOutcome) -> Floats:
-    """Return the jerk term of a reward, [n, N]: minus the squared rate of change of each command (m2/s6)."""
+    """Return the jerk term of a reward, [n, N] m2/s6: minus the squared rate of change of each acceleration."""
     rate = (step.command_mps2 - step.previous_mps2) / step.time_step_s
     return -rate * rate
 
@@ -53,16 +53,18 @@ def jerk(step: StepOutcome) -> Floats:
 def risk(
     step: StepOutcome, ttc_scale_s: float, safety_buffer_m: float, target_gap_m: float, distance_slope_per_m: float
 ) -> Floats:
-    """Return the risk term of a reward, [n, N]: minus how near and how soon a collision of each vehicle's pairs is.
+    """Return the risk term of a reward, [n, N]: minus the sum of the collision risks of each vehicle's pairs.
 
-    Each pair contributes 0 to 2: ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, sigma the logistic function.
+    The risk of a pair is ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, where sigma is the logistic function, d the
+    gap and TTC the time to collision. ``TTC = max(d - d_safe, 0) / closing speed``; for a pair that does not approach,
+    the first summand is 0.
 
     Args:
-        step: the step.
-        ttc_scale_s: tau, time to collision at which the first part falls, s.
-        safety_buffer_m: distance that the time to collision TTC keeps free, m.
-        target_gap_m: d_target, gap below which the second part rises, m.
-        distance_slope_per_m: k_d, steepness of the second part, 1/m.
+        step: result of the step.
+        ttc_scale_s: scale tau of the time to collision, s.
+        safety_buffer_m: distance d_safe that is subtracted from the gap, m.
+        target_gap_m: gap d_target at which the second summand is 1/2, m.
+        distance_slope_per_m: steepness k_d of the second summand, 1/m.
 
     """
     closing = step.speeds_mps[:, 1:] - step.speeds_mps[:, :-1]

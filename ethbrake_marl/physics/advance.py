@@ -22,11 +22,8 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, checked_num
 
 @compiled
 def finite_among(values: Floats) -> int:
-    """Return how many entries of ``values`` [n] are below infinity.
-
-    A counting loop over an index is compiled to vector instructions.
-    """
-    count = 0
+    """Return how many entries of ``values`` [n] are below infinity."""
+    count = 0  # this kind of loop is compiled to vector instructions
     for k in range(values.size):
         count += 1 if values[k] < math.inf else 0
     return count
@@ -41,19 +38,19 @@ def advance_worlds(
 ) -> tuple[int, bool]:  # fmt: skip
     """Advance every world to its time ``until``, in place; return the number of impacts and whether the input is valid.
 
-    A failed world keeps its state; the others go on. The second result is False if some ``until`` or command is
-    invalid. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for example
-    ``gaps`` for ``gaps_m``.
+    A world that fails keeps its state; the other worlds are advanced. The second result is False if some ``until`` or
+    command is invalid. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for
+    example ``gaps`` for ``gaps_m``.
 
     - ``in_force``: accelerations in force at the start, [n, N] m/s2. The first seven arrays, the state, are updated.
-    - ``ahead``: gap to the obstacle ahead, [n] m.
-    - ``first_harm``: harm of first impacts, [n, P] m2/s2. The six arrays from this one to ``ahead_count`` are filled.
+    - ``ahead``: gap between Vehicle 1 and the obstacle ahead, [n] m.
+    - ``first_harm``: harm of first impacts, [n, P] m2/s2. The arrays from here to ``ahead_count`` are results.
     - ``command``: commands, [n, N] m/s2.
     - ``until``: time at which each world's segment ends, [n] s.
-    - ``failed``: [n] receives the status of each world: ``FLAG.DONE``, or the code of the check that failed.
+    - ``failed``: result, the status of each world, [n]: ``FLAG.DONE``, or the code of the check that failed.
     - ``at``: 1 if some world has an obstacle, otherwise 0; vehicle i is column ``at + i`` of the table
       (``physics.rows``).
-    - ``rows``: list of impacts, [capacity, LISTED.WIDTH], filled until it is full; further impacts are only counted.
+    - ``rows``: result, one row for each impact, [capacity, LISTED.WIDTH]; impacts beyond the capacity are only counted.
     """
     n, vehicles = speeds.shape
     building = pieces.shape[2] > 0 or finite_among(brake_rate.ravel()) + finite_among(release_rate.ravel()) > 0
@@ -117,24 +114,25 @@ def advance(
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` exactly, each under constant commands, and return the new worlds and their impacts.
 
-    Raises ``InvalidInput`` for an invalid command, end time or ``threads``; ``PhysicsError`` with the failed worlds.
+    Raises ``InvalidInput`` for an invalid command, end time or ``threads``, and ``PhysicsError``, which lists the
+    failed worlds, if a check of the kernel fails.
 
     Args:
         worlds: n worlds of N vehicles; they are not changed.
-        command_mps2: commanded acceleration, [n, N] m/s2, negative brakes, within the vehicles' capacities; it has no
-            effect before a vehicle's latency has elapsed.
-        duration_s: length of the segment, one number or [n], s. Pass this or ``until_s``.
-        until_s: absolute time at which the segment ends, one number or [n], s; not before the worlds' time.
-        record: also return every single impact, in ``Impacts.rows``.
-        threads: number of threads; more than one is faster from about 10,000 worlds on. Results depend neither on the
-            number of threads nor on the batch.
+        command_mps2: commanded accelerations within the vehicles' capacities, [n, N] m/s2; negative values brake. A
+            command has no effect before the vehicle's latency has elapsed.
+        duration_s: length of the segment, one number or [n], s. Pass either ``duration_s`` or ``until_s``.
+        until_s: absolute time at which the segment ends, one number or [n], s; at least the present time of each world.
+        record: whether to return each single impact in ``Impacts.rows``.
+        threads: number of threads; more than one is faster from about 10,000 worlds on. The result of a world depends
+            neither on the number of threads nor on the other worlds of the batch.
 
     """
     command = shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
     if until_s is None and duration_s is not None:
         until_s = worlds.time_s + shaped("duration_s", duration_s, (worlds.n,))
     elif until_s is None or duration_s is not None:
-        raise InvalidInput("advance: give either duration_s or until_s")
+        raise InvalidInput("advance: pass either duration_s or until_s")
     until = shaped("until_s", until_s, (worlds.n,))
     v, shape = worlds.vehicles, worlds.gaps_m.shape
     at, capacity = int(worlds.obstacle_ahead.any()), 4 * worlds.n + 64 if record else 0
@@ -167,7 +165,7 @@ class _Part(NamedTuple):
     """Result of the kernel ``advance_worlds`` for a contiguous part of the worlds."""
 
     first: int  # row in the whole batch of the part's first world
-    rows: Floats  # [capacity, LISTED.WIDTH] impacts, until it is full; worlds are numbered within the part
+    rows: Floats  # [capacity, LISTED.WIDTH] recorded impacts; worlds are numbered within the part
     recorded: int  # number of all impacts
     good: bool  # every end time and command was valid
 
@@ -195,7 +193,7 @@ def shaped(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Floats:
     try:
         return np.array(np.broadcast_to(numbers, shape), order="C")
     except ValueError:
-        raise InvalidInput(f"{name}: shape {numbers.shape} does not fit {shape}") from None
+        raise InvalidInput(f"{name}: shape {numbers.shape}; must be {shape} or broadcast to this shape") from None
 
 
 def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -> None:
@@ -214,7 +212,10 @@ def refuse_bad(worlds: Worlds, command: Floats, until: Floats, in_time: Bools) -
         return
     k = int(np.argmin(in_time & in_range.all(axis=1)))
     if not in_time[k]:
-        raise InvalidInput(f"advance: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s")
+        raise InvalidInput(
+            f"advance: world {k} is at {worlds.time_s[k]:g} s; its end time {until[k]:g} s must be finite and not"
+            " earlier"
+        )
     i = int(np.argmin(in_range[k]))
     raise InvalidInput(f"command_mps2[{k}, {i}] = {command[k, i]:g}: must be in [{low[k, i]:g}, {high[k, i]:g}] m/s2")
 

@@ -1,16 +1,15 @@
-"""Motion with brake build-up: the force moves towards the command at a constant rate, so motion is cubic in time.
+"""Motion with brakes that build up: the force approaches the command at a constant rate, so gaps are cubic in time.
 
 The kernels advance one world in a ``table`` with the layout of ``physics.rows``: a row per quantity, a column per
 vehicle or pair.
 
-The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine call for at the moment. It falls at
-the rate BRAKE_RATE and rises at the rate RELEASE_RATE until it equals the command; before the latency has elapsed the
-command counts as 0. The force keeps moving while a vehicle stands, is held, or is struck.
+The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine alone would cause at the moment. The
+force falls at the rate BRAKE_RATE and rises at the rate RELEASE_RATE until it equals the command; before the latency
+has elapsed, the command counts as 0. The force also changes while the vehicle stands, is held, or is struck.
 
-Between events each vehicle, and each body of touching vehicles that move together, has a constant jerk. Build-up adds
-two kinds of events to those of ``physics.constant_motion``: a force reaches its command or passes 0; and touching
-vehicles separate, or a body that was held starts to move. Worlds in which all rates are infinite do not use this
-module.
+A *body* is a vehicle, or several touching vehicles that move together. Between events each body has a constant jerk.
+There are two kinds of events that ``physics.constant_motion`` does not have: a force reaches its command or passes 0,
+and touching vehicles separate or a body that was held starts to move.
 """
 
 from __future__ import annotations
@@ -32,23 +31,23 @@ _PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
-    """Return whether no force will change before the next latency elapses: each already equals its command.
+    """Return whether every force equals its command, so that no force changes before the next latency elapses.
 
-    The force of a vehicle is the acceleration by its brakes or engine. A vehicle that brakes in *pieces* (by a fixed
-    sequence of commands) must also have begun the last one. If the result is True, ``constant_motion.move`` is exact.
-    ``table``: one world in the layout of ``physics.rows``.
+    The force of a vehicle is the acceleration by its brakes or engine. If a vehicle brakes in *pieces* (by a fixed
+    sequence of commands), its last piece must also have begun. If the result is True, ``constant_motion.move`` is
+    exact. ``table``: one world in the layout of ``physics.rows``.
     """
-    there = True
+    built = True
     for i in range(table.shape[1]):
-        there = there and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
-    return there and not pieces_to_come(table)
+        built = built and table[ROW.FORCE, i] == table[ROW.COMMAND, i] * table[ROW.ACTIVE, i]
+    return built and not pieces_to_come(table)
 
 
 @compiled
 def first_return(value: float, rate: float, jerk: float) -> float:
     """Return the first time t > 0 at which ``value + rate t + jerk t^2 / 2`` is 0, in s; infinite if there is none.
 
-    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. A value that is 0 at t = 0 does not count.
+    For a speed, ``value`` is in m/s, ``rate`` in m/s2 and ``jerk`` in m/s3. A zero at t = 0 does not count.
     """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf
@@ -68,16 +67,16 @@ def first_return(value: float, rate: float, jerk: float) -> float:
 
 @compiled
 def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: float) -> float:
-    """Return the gap (m) after the time t at constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``.
+    """Return the gap (m) after the time t at a constant closing jerk: ``g - (w + (b + j t / 3) t / 2) t``.
 
-    Closing quantities are rear minus front.
+    Closing speed, acceleration and jerk are rear minus front.
 
     Args:
         gap: present gap g, m.
         closing: present closing speed w, m/s.
         pressing: present closing acceleration b, m/s2.
         jerk: rate j of the closing acceleration, m/s3.
-        time: t, s.
+        time: time t, s.
 
     """
     return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
@@ -85,11 +84,11 @@ def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: fl
 
 @compiled
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
-    """Return the time of a pair's first contact before ``end`` (s) and the closing speed there; ``(inf, 0)`` if none.
+    """Return the time (s) and closing speed (m/s) of a pair's first contact before ``end``; ``(inf, 0)`` if none.
 
-    Like ``contact``, for a closing acceleration that changes with time. The closing speed ``w + b t + j t^2 / 2`` has
-    at most two roots, and between them the gap is monotone. The contact lies in the first monotone stretch that ends
-    with a gap of at most 0. Newton's method finds it; bisection keeps the iterates inside the stretch.
+    This is ``contact`` for a closing acceleration that changes with time. The closing speed ``w + b t + j t^2 / 2`` has
+    at most two roots, and between them the gap is monotone. The contact lies in the first monotone interval that ends
+    with a gap of at most 0. Newton's method finds the contact; bisection keeps the iterates inside this interval.
 
     Args:
         gap: present gap of the pair, m.
@@ -139,11 +138,11 @@ def contact_within(gap: float, closing: float, pressing: float, jerk: float, end
 
 @compiled(bare=True)
 def plan_force(table: Floats, i: int, wanted: float) -> None:
-    """Write into the table how the force of vehicle ``i`` changes next: rate, next goal and the time until then.
+    """Write into the table how the force of vehicle ``i`` changes next: its rate, its goal and the time until the goal.
 
     The force is the acceleration by brakes or engine. The goal is the command ``wanted`` (m/s2), or 0 if the force
-    changes sign on the way to it. Writes the rows FORCE, FORCE_RATE, FORCE_TIME and FORCE_VALUE; the time is infinite
-    if the force already equals the command.
+    changes its sign on the way to this command. The function writes the rows FORCE, FORCE_RATE, FORCE_TIME and
+    FORCE_VALUE; the time is infinite if the force already equals the command.
     """
     force = table[ROW.FORCE, i]
     force = force_now(force, wanted, table[ROW.BRAKE_RATE, i], table[ROW.RELEASE_RATE, i])
@@ -161,10 +160,10 @@ def plan_force(table: Floats, i: int, wanted: float) -> None:
 
 @compiled
 def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple[float, float, float, float]:
-    """Return a vehicle's own acceleration if it is about to move forward and if backward, and how fast both change.
+    """Return a vehicle's own acceleration for motion forward and for motion backward, and the rates of both.
 
     The result is ``(forward, backward, rate of forward, rate of backward)``, in m/s2 and m/s3. The two accelerations
-    differ where the force depends on the direction, for example for brakes at standstill, see ``motion.force_range``.
+    differ if the force depends on the direction of motion, as brakes at standstill do (see ``motion.force_range``).
 
     Args:
         force: present acceleration by brakes or engine, m/s2.
@@ -189,10 +188,10 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
 
 @compiled
 def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) -> tuple[float, float]:
-    """Return acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several that move as one).
+    """Return acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several vehicles that move as one).
 
-    Its own forces allow every acceleration in the range ``[low, high]`` (m/s2), whose ends move at the rates
-    ``low_jerk`` and ``high_jerk`` (m/s3). The body takes the value nearest to 0, as in ``motion.settle``.
+    The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2). The ends of this range change at
+    the rates ``low_jerk`` and ``high_jerk`` (m/s3). The body takes the value nearest to 0, as in ``motion.settle``.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
@@ -205,10 +204,10 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
 def pool_moving(table: Floats, first: int, last: int) -> float:
     """Set accelerations and jerks of touching vehicles; return the time until two of them separate (s).
 
-    The vehicles are the columns ``first..last`` of ``table`` and have the same speed. A vehicle whose acceleration is
-    at least as large as that of the vehicle in front, up to rounding, joins it: both move as one body with a common
-    acceleration and jerk. They separate later if their jerks differ. The time is infinite if no joined vehicles
-    separate. Writes the rows ACCELERATION, JERK and JOINED.
+    The vehicles are the columns ``first..last`` of ``table`` and have the same speed. If the acceleration of a vehicle
+    is at least the acceleration of the vehicle in front, up to rounding, both move as one body with a common
+    acceleration and jerk. Different jerks may separate them later. The time is infinite if no vehicles separate.
+    Writes the rows ACCELERATION, JERK and JOINED.
     """
     count = 0
     for i in range(first, last + 1):
@@ -247,8 +246,8 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 def settle_block(table: Floats, block: int, out: int) -> None:
     """Write the common acceleration and jerk of a pooled block into column ``out`` of the table.
 
-    A block is a run of touching vehicles that move as one body; ``block`` is its column in the rows BLOCK_*, which hold
-    its mass and the sums of mass times force.
+    A block consists of touching vehicles that move as one body. ``block`` is its column in the rows BLOCK_*, which
+    contain its mass and the sums of mass times force.
     """
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
@@ -259,15 +258,15 @@ def settle_block(table: Floats, block: int, out: int) -> None:
 
 @compiled(bare=True)
 def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
-    """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s); infinite: never.
+    """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s); infinite if they never do.
 
-    A moving body splits where its front vehicles alone would be faster than the whole. A body that is held starts to
-    move where its front vehicles drive away or its rear vehicles would be pushed back.
+    A moving body splits when its front vehicles alone would accelerate more than the whole body. A body that is held
+    starts to move when its front vehicles drive away or its rear vehicles would be pushed back.
 
     Args:
         table: one world in the layout of ``physics.rows``.
         head: column of the body's front vehicle.
-        tail: column of its rear vehicle.
+        tail: column of the body's rear vehicle.
         value: acceleration of the body, m/s2.
         jerk: jerk of the body, m/s3.
 
@@ -298,10 +297,10 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
 
 @compiled
 def crossing_s(below: float, rate: float) -> float:
-    """Return the time after which a difference of two accelerations is surely positive (s); infinite: never.
+    """Return the time after which a difference of two accelerations is surely positive (s); infinite if never.
 
-    The difference is now ``below`` <= 0 (m/s2) and grows at ``rate`` (m/s3). A small delay is added, so that rounding
-    cannot leave the difference at 0.
+    The present difference is ``below`` <= 0 (m/s2), and it grows at ``rate`` (m/s3). The time includes a small delay,
+    so that rounding cannot leave the difference at 0.
     """
     if rate <= 0.0:
         return math.inf
@@ -312,9 +311,9 @@ def crossing_s(below: float, rate: float) -> float:
 def accelerate_moving(table: Floats) -> float:
     """Set the acceleration and jerk of every vehicle; return the time until touching vehicles separate (s).
 
-    Version of ``constant_motion.accelerate`` for brake build-up; ``table`` is one world in the layout of
-    ``physics.rows``. Also sets how each vehicle's force changes next and marks the pairs that move as one body (row
-    JOINED). The time is infinite if no touching vehicles separate.
+    This is ``constant_motion.accelerate`` for brakes that build up; ``table`` is one world in the layout of
+    ``physics.rows``. The function also sets how each vehicle's force changes next and marks the pairs that move as one
+    body (row JOINED). The time is infinite if no touching vehicles separate.
     """
     vehicles = table.shape[1]
     for i in range(vehicles):
@@ -348,15 +347,15 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
     An event is a contact, a separation, a vehicle that comes to rest or reaches its speed limit, a command that takes
-    effect, or a force that reaches its command. Also writes into the table when each vehicle next comes to rest or
-    reaches its speed limit, and when each pair comes into contact. Version of ``constant_motion.next_event`` for brake
-    build-up.
+    effect, or a force that reaches its command. The function also writes into the table when each vehicle next comes to
+    rest or reaches its speed limit, and when each pair comes into contact. This is ``constant_motion.next_event`` for
+    brakes that build up.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.
         now: present time, counted from the start of the segment, s.
         end: end of the segment, s.
-        parting: time until touching vehicles separate, s: the result of ``accelerate_moving``.
+        parting: time until touching vehicles separate (the result of ``accelerate_moving``), s.
 
     """
     vehicles = table.shape[1]
@@ -404,7 +403,7 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 def move_on_cubics(table: Floats, duration: float) -> bool:
     """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
 
-    Version of ``constant_motion.move`` for brake build-up; ``table`` is one world in the layout of ``physics.rows``.
+    This is ``constant_motion.move`` for brakes that build up; ``table`` is one world in the layout of ``physics.rows``.
     """
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
@@ -447,11 +446,11 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """Move every vehicle alone by ``duration`` (s) and return True if no two can meet; otherwise return False.
+    """Move every vehicle alone for ``duration`` (s) and return True, or return False if two vehicles may meet.
 
-    In the second case speeds and gaps do not change. Version of ``segment.move_apart`` for brake build-up; ``table`` is
-    one world in the layout of ``physics.rows``. A bound decides whether two vehicles can meet: their gap must exceed
-    ``duration`` times the largest possible closing speed.
+    If the result is False, speeds and gaps are unchanged. Two neighbours cannot meet if their gap exceeds ``duration``
+    times their largest possible closing speed. This is ``segment.move_apart`` for brakes that build up; ``table`` is
+    one world in the layout of ``physics.rows``.
     """
     vehicles = table.shape[1]
     slowest_in_front = math.inf
@@ -494,7 +493,8 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
 def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
     """Move vehicle ``i`` alone under a constant command; return its lowest and its highest speed on the way (m/s).
 
-    The motion starts at the speed in row SPEED_VALUE, which is updated, as is FORCE; the distance is added to row WAY.
+    The motion starts at the speed in row SPEED_VALUE. The rows SPEED_VALUE and FORCE are updated, and the distance is
+    added to row WAY.
 
     Args:
         table: one world in the layout of ``physics.rows``.
@@ -527,7 +527,7 @@ def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[f
 
 @compiled(apart=True, bare=True)
 def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Version of ``move_alone`` for a vehicle that may come to rest or reach its speed limit: it moves event by event.
+    """Do the work of ``move_alone`` event by event, for a vehicle that may come to rest or reach its speed limit.
 
     Arguments, result and updated rows are the same as in ``move_alone``.
     """
@@ -544,8 +544,8 @@ def move_alone_by_events(table: Floats, i: int, wanted: float, duration: float) 
         passed = min(passed, reach)
         table[ROW.WAY, i] += (speed + 0.5 * (acceleration + jerk * passed / 3.0) * passed) * passed
         speed = value if reach <= passed else speed + (acceleration + 0.5 * jerk * passed) * passed
-        there = table[ROW.FORCE_TIME, i] <= passed
-        table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i] if there else force + rate * passed
+        built = table[ROW.FORCE_TIME, i] <= passed
+        table[ROW.FORCE, i] = table[ROW.FORCE_VALUE, i] if built else force + rate * passed
         slowest, fastest = min(slowest, speed), max(fastest, speed)
         now = duration if passed >= duration - now else now + passed
     table[ROW.SPEED_VALUE, i] = speed

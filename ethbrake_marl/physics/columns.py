@@ -19,15 +19,15 @@ from ethbrake_marl.physics.state import Floats, Ints, Vehicles, Worlds
 class Columns(NamedTuple):
     """First column of each group of quantities in the rows of ``Packed``, for N vehicles and P = N - 1 pairs.
 
-    A group ends where the next one begins. *News by link* is the time from which each vehicle may act on information
-    about each other one. Its columns exist only if some world needs them; without them a vehicle knows everything from
-    the end of its own latency on. The columns of periodic messages (``physics.messages``) follow; they change as
-    messages arrive.
+    A group ends where the next group begins. *News by link* is the time from which each vehicle may act on information
+    about each other vehicle. Its columns exist only if some world needs them; without them every vehicle knows
+    everything from the end of its own latency on. The last columns are those of periodic messages
+    (``physics.messages``); their values change as messages arrive.
     """
 
     vehicles: int  # the number N itself, not a column
-    # of the state
-    time: int  # 1 column: since Vehicle 1 began to brake (s)
+    # columns of the state
+    time: int  # 1 column: time since Vehicle 1 began to brake (s)
     speed: int  # N columns (m/s)
     command: int  # N columns, acceleration in force (m/s2)
     previous: int  # N columns, acceleration in force before the last segment (m/s2)
@@ -35,7 +35,7 @@ class Columns(NamedTuple):
     hit: int  # P columns, 1 once the pair has had an impact
     harm: int  # 3 P columns since the start of the episode: first-impact harm, total harm, number of impacts
     obstacle: int  # 5 columns: gap (m; infinite: none), hit flag, both harms, impacts; if absent, the row's width
-    # of the parameters
+    # columns of the parameters
     restitution: int  # 1 column, coefficient of restitution
     braking: int  # N columns, braking capacity (m/s2)
     driving: int  # N columns, driving capacity (m/s2)
@@ -43,7 +43,7 @@ class Columns(NamedTuple):
     mass: int  # N columns (t)
     limit: int  # N columns, speed up to which a vehicle drives (m/s)
     brake_rate: int  # N columns, rate at which the acceleration in force falls (m/s3)
-    release_rate: int  # N columns, rate at which it rises (m/s3)
+    release_rate: int  # N columns, rate at which the acceleration in force rises (m/s3)
     harm_weight: int  # N columns, weight of the vehicle's harm in the objective ``preference``
     own_latency: int  # N columns, part of the latency without the channel (s); if absent, the row's width
     news: int  # N * N columns, time from which vehicle i acts on news of vehicle j (s)
@@ -86,8 +86,8 @@ class Packed(NamedTuple):
     def of(cls, worlds: Worlds) -> Packed:
         """Pack ``worlds`` at the start of their episode, with harm 0.
 
-        Columns of the obstacle, and of news by link (the time from which each vehicle may act on information about each
-        other one), exist only if some world needs them.
+        Columns of the obstacle exist only if some world needs them, and so do columns of news by link (the time from
+        which each vehicle may act on information about each other vehicle).
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
@@ -127,18 +127,18 @@ class Packed(NamedTuple):
 
     @property
     def builds_up(self) -> bool:
-        """Whether the brakes of some vehicle build up, that is, at a finite rate."""
+        """Whether the brakes of some vehicle build up at a finite rate."""
         column = self.column
         return bool(np.isfinite(self.params[:, column.brake_rate : column.harm_weight]).any())
 
     def widened(self, obstacle: bool, news: bool) -> Packed:
-        """Return the rows with columns for an obstacle, and for news by link, if requested and not there yet.
+        """Return these worlds, with the requested columns added if they are missing.
 
         The new columns say that there is no obstacle, and that each vehicle knows everything from its own latency on.
 
         Args:
-            obstacle: add the columns of an obstacle.
-            news: add the columns of news by link.
+            obstacle: whether to add the columns of an obstacle.
+            news: whether to add the columns of news by link.
 
         """
         (state, params), column = self, self.column
@@ -153,7 +153,7 @@ class Packed(NamedTuple):
     def worlds(self, vehicles: Vehicles | None = None) -> Worlds:
         """Unpack the worlds into new arrays.
 
-        ``vehicles``: parameters to use in the result; None: unpack them too.
+        ``vehicles``: parameters to use in the result; None: unpack the parameters from the rows.
         """
         (state, params), column, far = self, self.column, not self.has_obstacle
         return Worlds(
@@ -194,8 +194,8 @@ class Packed(NamedTuple):
     def ledger(self) -> tuple[Floats, Floats, Ints, Floats, Floats, Ints]:
         """Return six arrays: harm and impacts since the start of the episode, for the pairs and for the obstacle.
 
-        First-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each pair, [n, P] each; then the same
-        three for the obstacle, [n] each.
+        The first three arrays are first-impact harm (m2/s2), total harm (m2/s2) and number of impacts of each pair,
+        [n, P]. The other three arrays are the same quantities for the obstacle, [n].
         """
         state, column, pairs = self.state, self.column, self.column.vehicles - 1
         first, total, count = (state[:, at : at + pairs].copy() for at in range(column.harm, column.obstacle, pairs))

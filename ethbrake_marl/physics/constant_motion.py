@@ -1,4 +1,4 @@
-"""Motion of one world under constant accelerations: set the accelerations, find the next event, move to it. Compiled.
+"""Compiled motion of one world from event to event, with constant accelerations between two events.
 
 The kernels work on a ``table`` in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair.
 """
@@ -16,7 +16,7 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def accelerate(table: Floats) -> None:
-    """Set the acceleration of every vehicle, coupling touching ones, and mark the pairs that move as one body.
+    """Set the acceleration of every vehicle and mark the pairs that move as one body; touching vehicles are coupled.
 
     Reads speeds, commands and gaps of ``table``; writes the rows ACCELERATION and JOINED.
     """
@@ -47,9 +47,9 @@ def accelerate(table: Floats) -> None:
 def next_event(table: Floats, now: float, end: float) -> float:
     """Return the time from ``now`` to the next event, at most ``end - now`` (s).
 
-    An event is a contact, a vehicle that comes to rest or reaches its speed limit, or a command that takes effect. Also
-    writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each pair comes into
-    contact.
+    An event is a contact, a vehicle that comes to rest or reaches its speed limit, or a command that takes effect. The
+    function also writes into the table when each vehicle next comes to rest or reaches its speed limit, and when each
+    pair comes into contact.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate``.
@@ -104,10 +104,10 @@ def move(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_speeds(table: Floats, duration: float) -> None:
-    """Set the speeds of ``table`` to those after ``duration`` (s), before or at the next event.
+    """Advance the speeds of ``table`` by ``duration`` (s), at most to the next event.
 
-    Vehicles that move as one body get one common speed; the speeds of a pair that comes into contact differ exactly by
-    its closing speed.
+    Vehicles that move as one body get one common speed. If a pair comes into contact, the speeds of its vehicles differ
+    exactly by its closing speed.
     """
     vehicles = table.shape[1]
     first = 0

@@ -1,6 +1,6 @@
-"""Forecast of contacts: when each pair of a line next has an impact under constant commands, and its closing speed.
+"""Forecast of contacts: time and closing speed of the next impact of each pair under constant commands.
 
-Uses the physics of ``advance`` on a table that the caller has filled. The resulting motion is not kept.
+The forecast uses the physics of ``advance`` on a table that the caller has filled, and does not return the motion.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ CONTACT = _Contact()
 def forecast_contacts(table: Floats, restitution: float, duration: float, contacts: Floats) -> int:
     """Simulate one world for ``duration`` (s) and write each pair's next impact into ``contacts``; return a status.
 
-    The status is ``FLAG.DONE``, or the check that failed. A pair that had an impact before the forecast can have
-    another one here, but that one adds no first-impact harm.
+    The status is ``FLAG.DONE``, or the code of the check that failed. If a pair had an impact before the forecast, its
+    next impact is still reported, although it adds no first-impact harm.
 
     Args:
-        table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. Its motion
-            and harm rows are overwritten.
+        table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. The rows
+            of motion and harm are overwritten.
         restitution: coefficient of restitution of every impact, in [0, 1].
         duration: length of the forecast, s.
-        contacts: result, [CONTACT.WIDTH, N]; column p is pair p, the last column is not used. Row ``CONTACT.TIME`` is
-            the time to the impact (s; infinite: none), row ``CONTACT.CLOSING`` its closing speed (m/s).
+        contacts: result, [CONTACT.WIDTH, N]; column p is pair p, and the last column is not used. Row ``CONTACT.TIME``
+            is the time to the impact (s; infinite: none), and row ``CONTACT.CLOSING`` is its closing speed (m/s).
 
     """
     for p in range(table.shape[1] - 1):

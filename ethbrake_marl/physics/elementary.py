@@ -1,9 +1,9 @@
-"""Exponential, logarithm and normal quantile, computed only with + - * / and sqrt, to equal bits on every machine.
+"""Exponential, logarithm and normal quantile from + - * / and sqrt alone, so that every machine gets the same bits.
 
-The C library and numpy choose implementations of exp, log and pow by processor, which differ in the last bits. The
-functions here do the same IEEE operations in the same order everywhere, so a list of worlds has the same bits on any
-machine. Each error bound is the largest error in a comparison with 40 digits, rounded up
-(tests/physics/test_compiling.py).
+The C library and numpy choose implementations of exp, log and pow by processor, and these differ in the last bits. The
+functions of this module do the same IEEE operations in the same order on every machine, so worlds drawn from a seed
+have the same bits everywhere. Each error bound is the largest error in a comparison with values of 40 digits, rounded
+up (tests/physics/test_compiling.py).
 """
 
 from __future__ import annotations
@@ -98,9 +98,10 @@ def power_of_two(k: int) -> float:
 
 @compiled
 def exp_rest(x: float, k: int) -> float:
-    """Return ``e^x / 2^k``; pass the whole number k nearest to ``x / ln 2``.
+    """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
-    Taylor's series to the 13th power of ``x - k ln 2``, which lies within ``ln(2) / 2`` of 0; relative error 5e-18.
+    The result is Taylor's series to the 13th power of ``x - k ln 2``, which lies within ``ln(2) / 2`` of 0. The
+    relative error is 5e-18.
     """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
@@ -109,7 +110,7 @@ def exp_rest(x: float, k: int) -> float:
 def exp(x: float) -> float:
     """Return ``e^x`` within 1.5 ulp; infinite above 709.78, 0 below -708.
 
-    ``e^x = 2^k e^(x - k ln 2)`` with k whole.
+    The function computes ``2^k e^(x - k ln 2)`` for the whole number k nearest to ``x / ln 2``.
     """
     if not x < _LARGEST_EXPONENT:
         return np.inf if x >= _LARGEST_EXPONENT else np.nan
@@ -121,11 +122,11 @@ def exp(x: float) -> float:
 
 @compiled
 def _log_parts(x: float) -> tuple[float, float]:
-    """Return two numbers whose sum is ``ln x``, for a finite x > 0, more accurate than one number could be.
+    """Return two numbers whose sum is ``ln x``, for a finite x > 0; the sum is more accurate than a single number.
 
     With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
-    ``ln 2``, without rounding. The second is the rest of ``k ln 2``, plus ``ln m = 2 artanh((m - 1) / (m + 1))`` by its
-    series.
+    ``ln 2``, without rounding. The second number is the rest of ``k ln 2``, plus the series of
+    ``ln m = 2 artanh((m - 1) / (m + 1))``.
     """
     k, m = 0, x
     while m >= _SQRT2:
@@ -143,17 +144,17 @@ def _log_parts(x: float) -> tuple[float, float]:
 
 @compiled
 def log(x: float) -> float:
-    """Return ``ln x`` of a finite x > 0 within 1 ulp."""
+    """Return ``ln x`` within 1 ulp, for a finite x > 0."""
     whole, rest = _log_parts(x)
     return whole + rest
 
 
 @compiled
 def normal_quantile(p: float) -> float:
-    """Return the quantile x of a standard normal: its probability of being below x is p. Within 1.5 ulp.
+    """Return the number x below which a standard normal variable lies with probability p, within 1.5 ulp.
 
-    p is clipped to [1e-22, 1 - 1e-22]. In the tails ``r = sqrt(-2 ln p)`` is the sum of two numbers. The first has 24
-    bits, so its square is exact.
+    p is clipped to [1e-22, 1 - 1e-22]. In the tails, ``r = sqrt(-2 ln p)`` is represented as the sum of two numbers.
+    The first number has 24 bits, so its square is exact.
     """
     q = p - 0.5
     if abs(q) <= 0.25:
@@ -176,9 +177,10 @@ def normal_quantile(p: float) -> float:
 
 @compiled
 def normal_probability(x: float) -> float:
-    """Return the probability that a standard normal number is below x; relative error 1e-13 for x > -30.
+    """Return the probability that a standard normal variable is below x; the relative error is 1e-13 for x > -30.
 
-    For ``|x| <= 2`` by the series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``, beyond by the continued fraction
+    With the density phi, the upper tail for ``0 <= x <= 2`` is the series
+    ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``, and for larger x the continued fraction
     ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``.
     """
     a = abs(x)

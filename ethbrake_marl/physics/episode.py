@@ -1,12 +1,12 @@
-"""One step of an episode, compiled: onset of commands, motion, harm, rest, and the times of the decisions.
+"""Compiled rules of one step of an episode: onset of commands, motion, harm, rest, and times of decisions.
 
-Search and shield advance an episode with ``step_episode``. The engine keeps its worlds in rows and has its own loop,
-made of the same rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) around the same ``advance_table``. So all
-three agree to the bit (decision 0025). Search and shield copy one world at a time into the table of ``physics.rows``,
-with its rows of an episode.
+Search and shield advance an episode with ``step_episode``. They copy one world at a time into a table in the layout of
+``physics.rows``. The engine stores its worlds in rows and has its own loop, which uses the same rules (``step_end_s``,
+``onset_s``, ``force_at``, ``stands``) and the same ``advance_table``. Engine, search and shield therefore agree to the
+last bit (decision 0025).
 
-A *profile* holds the commands of the controlled vehicles in each of its *phases*. Phases begin and end at decisions,
-so an agent can drive the profile. Letters used in addition to those of ``physics.state``:
+A *profile* contains the commands of the controlled vehicles in each of its *phases*. Phases begin and end at decisions,
+so an agent can follow the profile. The following letters are used in addition to those of ``physics.state``:
 
 ===  ===========================================================
 C    controlled vehicles
@@ -27,7 +27,7 @@ from ethbrake_marl.physics.rows import FLAG, ROW, builds_up
 from ethbrake_marl.physics.segment import advance_table
 from ethbrake_marl.physics.state import Floats, Ints
 
-# state of an episode after a step; a value below 0 is a failure: minus the status of the kernel
+# state of an episode after a step; a value below 0 is minus the status of a kernel that failed
 GOES_ON, AT_REST, AT_HORIZON = 0, 1, 2
 
 
@@ -80,7 +80,7 @@ class Episode(NamedTuple):
 
 
 class Decisions(NamedTuple):
-    """Decision times of one or many worlds: ``first_s``, and every ``time_step_s`` after it."""
+    """Decision times of one or many worlds: the first decision at ``first_s``, then one every ``time_step_s``."""
 
     first_s: Floats  # time of the first decision in each world, [n] or one number (s)
     time_step_s: Floats | float  # time between two decisions (s)
@@ -90,7 +90,7 @@ class Decisions(NamedTuple):
         return np.ceil((time_s - self.first_s) / self.time_step_s - _ROUNDING)
 
     def latest(self, time_s: Floats) -> Ints:
-        """Return the number of the latest decision at each time (s), counted from 0; negative before the first."""
+        """Return the number of the latest decision at each time (s), from 0; negative before the first decision."""
         number: Floats = np.floor((time_s - self.first_s) / self.time_step_s + _ON_GRID)
         return number.astype(np.int64)
 
@@ -107,7 +107,7 @@ def grid_of(clock: Floats) -> Grid:
 
 @compiled
 def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float, horizon_s: float) -> float:
-    """Return the time at which step number ``step`` ends (s), counted from 1; the last step ends at the horizon.
+    """Return the time at which step number ``step`` (from 1) ends (s); the last step ends at the horizon.
 
     Args:
         step: number of the step; a step is the time between two decisions.
@@ -122,22 +122,23 @@ def step_end_s(step: float, last_step: float, first_s: float, time_step_s: float
 
 @compiled
 def time_of(grid: Grid, step: int) -> float:
-    """Return the time of decision number ``step`` (s), counted from 0; ``grid`` holds the decision times."""
+    """Return the time of decision number ``step`` (from 0) on the grid (s)."""
     return step_end_s(step, grid.last_step, grid.first_s, grid.time_step_s, grid.horizon_s)
 
 
 @compiled
 def onset_s(latency_s: float, time_s: float) -> float:
-    """Return the time from ``time_s`` until a command takes effect (s); 0 or less: it takes effect at once.
+    """Return the time from ``time_s`` until a command takes effect (s); 0 or less if it takes effect at once.
 
-    ``latency_s`` is the time at which commands begin to have effect, on the same clock as ``time_s``.
+    ``latency_s`` is the time from the alert at which commands begin to have effect; ``time_s`` also counts from the
+    alert.
     """
     return latency_s - time_s
 
 
 @compiled
 def stands(speed_mps: float, command_mps2: float) -> bool:
-    """Return whether a vehicle stands still and its command (negative brakes) does not start it moving."""
+    """Return whether a vehicle stands still and its command does not drive (negative commands brake)."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
 
 
@@ -145,7 +146,7 @@ def stands(speed_mps: float, command_mps2: float) -> bool:
 def at_rest(table: Floats) -> bool:
     """Return whether all vehicles of ``table`` stand still and no command or force would start one moving.
 
-    Then the episode has ended. ``table``: one world in the layout of ``physics.rows``.
+    If the result is True, the episode has ended. ``table``: one world in the layout of ``physics.rows``.
     """
     for i in range(table.shape[1]):  # numba does not compile all()
         command = table[ROW.COMMAND, i]
@@ -158,11 +159,11 @@ def at_rest(table: Floats) -> bool:
 def step_episode(
     table: Floats, restitution: float, time: float, until: float, horizon_s: float, no_rows: Floats
 ) -> int:
-    """Advance one world from ``time`` to ``until`` under its commands, and add the harm: the one step of an episode.
+    """Advance one world from ``time`` to ``until`` under its commands, and add the harm of this step.
 
     Returns GOES_ON, AT_REST, AT_HORIZON (not at rest at the horizon), or minus the status of a failed kernel; after a
-    failure the table is invalid. The bits of the result depend on where steps end; the engine's steps go from each
-    decision to the next.
+    failure the table is invalid. The last bits of the result depend on where steps end. In the engine a step goes from
+    one decision to the next.
 
     Args:
         table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
@@ -170,7 +171,7 @@ def step_episode(
         time: present time, s.
         until: end of the step, s.
         horizon_s: end of the episode, s.
-        no_rows: an empty list of impacts, such as ``table[:0]``.
+        no_rows: an empty array of impacts, such as ``table[:0]``.
 
     """
     status = advance_table(table, restitution, until - time, time, 0, no_rows, 0)[1]
@@ -186,10 +187,10 @@ def step_episode(
 
 @compiled(within=True)
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
-    """Advance a world from decision number ``step`` to decision number ``end``; the result is as in ``step_episode``.
+    """Advance a world from decision number ``step`` to decision number ``end``; return the result of ``step_episode``.
 
-    The table must still hold the world as the previous step left it; only the times at which commands take effect are
-    computed anew.
+    The table must be as the previous step left it. This function computes the times at which commands take effect
+    again.
 
     Args:
         table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
@@ -197,7 +198,7 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
         grid: decision times.
         step: number of the decision to start at, from 0.
         end: number of the decision to stop at.
-        no_rows: an empty list of impacts, such as ``table[:0]``.
+        no_rows: an empty array of impacts, such as ``table[:0]``.
 
     """
     time = time_of(grid, step)
@@ -208,11 +209,11 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
 
 @compiled
 def harm_so_far(table: Floats, total: float) -> float:
-    """Return the harm of the line since the episode began, summed front to rear (m2/s2).
+    """Return the harm of the line since the episode began, summed from front to rear (m2/s2).
 
     Args:
         table: one world in the layout of ``physics.rows``, with its rows of an episode.
-        total: 1 for the harm of all impacts, 0 for that of each pair's first impact.
+        total: 1 for total harm, 0 for first-impact harm.
 
     """
     value, row = 0.0, ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM
@@ -223,14 +224,14 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 @compiled
 def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -> float:
-    """Return the number that a search minimises (m2/s2), which never falls while an episode goes on.
+    """Return the number that a search minimises (m2/s2), which never decreases during an episode.
 
-    It is the harm of the line, the weighted sum of what its vehicles bear, or the largest weighted share, plus
-    ``other_weight`` times the line's harm in the other count, which only decides between equals.
+    The number is the harm of the line, the weighted sum of its vehicles' harms, or the largest weighted harm of a
+    vehicle. To break ties, ``other_weight`` times the line's harm in the other count (first-impact or total) is added.
 
     Args:
         table: one world in the layout of ``physics.rows``, with its rows of an episode.
-        clock: [CLOCK.WIDTH] settings: ``HARM_IS_TOTAL`` chooses the count, ``AIM`` whose harm.
+        clock: settings, [CLOCK.WIDTH]: ``HARM_IS_TOTAL`` chooses the count, and ``AIM`` chooses whose harm counts.
         other_weight: weight of the line's harm in the other count.
 
     """
@@ -253,7 +254,7 @@ def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -
 def save(table: Floats, state: Floats) -> None:
     """Save the state of a world, and its harm so far, from its ``table`` into the row ``state`` [S].
 
-    The columns are listed at S at the top of this file.
+    The columns of ``state`` are listed in the docstring of this module, under the letter S.
     """
     vehicles = table.shape[1]
     pairs = vehicles - 1
@@ -288,7 +289,7 @@ def restore(table: Floats, state: Floats) -> None:
 def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, bound: float) -> tuple[float, int]:
     """Simulate a whole profile: a sequence of constant commands, one per phase.
 
-    Arguments and result are those of ``follow``, with ``phase`` 0.
+    The arguments and the result are the same as in ``follow`` with ``phase`` 0.
     """
     phase = min(0, ends.shape[0])  # 0, but not as a literal: numba would compile everything again for it
     return follow(world, ends, commands, states, phase, bound)
@@ -298,18 +299,18 @@ def follow_whole(world: Episode, ends: Ints, commands: Floats, states: Floats, b
 def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: int, bound: float) -> tuple[float, int]:
     """Simulate a profile from ``phase`` on; return its value (m2/s2) and the number of phases until the episode ends.
 
-    A profile is a sequence of constant commands; a phase is the time interval of one of them. The value is the harm
-    that a search minimises (``value_of``). The number is -1 if the kernel failed. If ``world.clock[CLOCK.STEPWISE]`` is
-    1, it advances decision by decision, to the same bits as the engine. Otherwise it advances phase by phase, which is
-    several times faster and differs by rounding.
+    A profile is a sequence of constant commands; a phase is the time interval of one command. The value is the harm
+    that a search minimises (``value_of``). The number of phases is -1 if the kernel failed. If
+    ``world.clock[CLOCK.STEPWISE]`` is 1, the simulation goes from decision to decision and has the same bits as the
+    engine. Otherwise it goes from phase to phase, which is several times faster and differs by rounding.
 
     Args:
-        world: the world and its decision times; its table is a workspace.
+        world: the world and its decision times; its table is overwritten.
         ends: number of the decision at which each phase ends, [K].
         commands: commands of the C controlled vehicles in each phase, [K, C] m/s2.
         states: state at the start of each phase, [K + 1, S]: entry ``phase`` is read, later entries are written.
         phase: number of the first phase to simulate, from 0.
-        bound: stop as soon as the value reaches this (m2/s2), because harm never decreases.
+        bound: value at which the simulation stops early, m2/s2.
 
     """
     table, clock, controlled = world.table, world.clock, world.controlled

@@ -11,11 +11,11 @@ from ethbrake_marl.physics.messages import (
     CHANNEL,
     LINK,
     PLACE,
+    PLACES_AT,
     SPEED,
     has_contents,
     knows_piece,
     link_at,
-    place_at,
 )
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
@@ -25,15 +25,16 @@ from ethbrake_marl.physics.state import Floats
 def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> None:
     """Fill ``out`` with the worlds as vehicle ``observer`` estimates them from the messages it has received.
 
-    For a vehicle that the observer knows: the newest received place and speed, extrapolated alone under the command
-    received with them. A pair in which the observer sees both vehicles at present has its true gap. Hit flags are known
-    for the observer's own pairs only. A vehicle that the observer does not know is put at rest, at the place of the
-    next vehicle towards the observer, so that it gives no information. A piece that messages do not tell is replaced
-    likewise: a place by that of the next vehicle, a speed or a command by 0.
+    If the observer knows a vehicle, the newest place and speed that it has received are extrapolated to the present,
+    under the command received with them and without contact. A pair has its true gap if the information about both of
+    its vehicles is current. Hit flags are known only for the observer's own pairs. A vehicle that the observer does not
+    know is placed at rest at the position of the next vehicle towards the observer, so that it gives no information.
+    A quantity that messages do not contain is replaced in the same way: a place by the place of the next vehicle
+    towards the observer, a speed or a command by 0.
 
     Args:
         state: true state rows of the worlds, [n, S], in the layout of ``physics.columns``.
-        params: their parameter rows, with the columns of messages.
+        params: parameter rows of the worlds, with the columns of messages.
         observer: index of the observing vehicle, from 0.
         out: result, [n, S], in the layout of ``state``. Worlds without periodic messages get their true state.
 
@@ -48,7 +49,7 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
             continue
         messages, time = params[k, head:], state[k, column.time]
         says = has_contents(messages, N)
-        place[observer], fresh[observer] = messages[place_at(N) + observer], True
+        place[observer], fresh[observer] = messages[PLACES_AT + observer], True
         for way in (-1, 1):
             last = place[observer]
             j = observer + way
@@ -85,7 +86,7 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
 
 @compiled
 def moved_on(speed: float, command: float, limit: float, duration: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) of a vehicle alone after ``duration`` (s) under a command in force.
+    """Return the speed (m/s) and the distance (m) of a vehicle without contact after ``duration`` (s).
 
     A vehicle that moves backward brakes, whatever the sign of its command.
 
@@ -106,7 +107,7 @@ def moved_on(speed: float, command: float, limit: float, duration: float) -> tup
 
 @compiled
 def move_on(speed: Floats, command: Floats, onset: Floats, limit: Floats, duration: Floats) -> tuple[Floats, Floats]:
-    """Return speeds (m/s) and distances (m) of vehicles alone after ``duration`` (s), [n, N] each.
+    """Return the speeds (m/s) and the distances (m) of vehicles without contact after ``duration`` (s), [n, N] each.
 
     Args:
         speed: present speeds, [n, N] m/s, at least 0.

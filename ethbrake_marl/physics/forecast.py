@@ -1,6 +1,6 @@
 """Forecast of harm under constant commands, for many candidate commands of one vehicle.
 
-Uses the physics of ``advance``. Only harm is kept, not the motion, so a candidate costs little more than its events.
+The forecast uses the physics of ``advance``. It returns the harm but not the motion, so it is fast.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 def forecast(
     worlds: Worlds, command_mps2: Floats, vehicle: int, candidates_mps2: Floats, until_s: float
 ) -> tuple[Floats, Floats]:
-    """Return first-impact and total harm until ``until_s`` if ``vehicle`` held each candidate command.
+    """Return the first-impact harm and the total harm up to ``until_s`` for each candidate command of ``vehicle``.
 
-    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. A world at
-    or after ``until_s`` has harm 0. A pair that was hit before adds no first-impact harm.
+    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. It is 0 in
+    a world whose time is ``until_s`` or later. A pair that had an impact before adds no first-impact harm.
 
     Args:
         worlds: n worlds of N vehicles.
         command_mps2: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
         vehicle: index of the vehicle, from 0.
-        candidates_mps2: K candidate commands for it in each world, [n, K] m/s2.
+        candidates_mps2: K candidate commands for the vehicle in each world, [n, K] m/s2.
         until_s: absolute end of the forecast, s.
 
     Raises ``InvalidInput`` for arrays of wrong shape or a candidate beyond capacity; ``PhysicsError`` with the worlds
@@ -38,17 +38,18 @@ def forecast(
     n, N = worlds.speeds_mps.shape
     if command_mps2.shape != (n, N) or candidates_mps2.ndim != 2 or candidates_mps2.shape[0] != n:
         raise InvalidInput(
-            f"forecast: commands {command_mps2.shape} and candidates {candidates_mps2.shape}; ({n}, {N}) and ({n}, K)"
-            " are needed"
+            f"forecast: command_mps2 has the shape {command_mps2.shape} and candidates_mps2 {candidates_mps2.shape};"
+            f" the shapes must be ({n}, {N}) and ({n}, K)"
         )
     if not 0 <= vehicle < N:
-        raise InvalidInput(f"forecast: vehicle index {vehicle}; must be in 0..{N - 1}")
+        raise InvalidInput(f"forecast: vehicle = {vehicle}: must be an index in 0..{N - 1}")
     v = worlds.vehicles
     low, high = -v.braking_capacity_mps2[:, [vehicle]], v.driving_capacity_mps2[:, [vehicle]]
     good = (candidates_mps2 >= low) & (candidates_mps2 <= high)
     if not good.all():
         raise InvalidInput(
-            f"forecast: candidate {candidates_mps2[~good][0]:g} m/s2 is beyond vehicle_{vehicle + 1}'s capacity"
+            f"forecast: the candidate command {candidates_mps2[~good][0]:g} m/s2 is beyond the capacity of"
+            f" vehicle_{vehicle + 1}"
         )
     first, total = np.zeros(candidates_mps2.shape), np.zeros(candidates_mps2.shape)
     ahead = np.minimum(worlds.obstacle_gap_m, BOUND.FAR_AWAY_M) if worlds.obstacle_ahead.any() else np.empty(0)
@@ -60,7 +61,7 @@ def forecast(
         v.pieces, first, total, failed,
     )  # fmt: skip
     if failed.any():
-        raise PhysicsError({k: f"a forecast could not reach {until_s:g} s" for k in np.flatnonzero(failed).tolist()})
+        raise PhysicsError({k: f"the forecast to {until_s:g} s failed" for k in np.flatnonzero(failed).tolist()})
     return first, total
 
 
@@ -79,7 +80,7 @@ def forecast_worlds(
     - ``ahead``: gap to an obstacle, [n] m, ``FAR_AWAY_M`` in a world without one; empty if no world has one.
     - ``command``: commands of all vehicles, [n, N] m/s2; the column of ``vehicle`` is ignored.
     - ``vehicle``: index of the vehicle that tries the candidates, from 0.
-    - ``candidates``: K candidate commands for it in each world, [n, K] m/s2.
+    - ``candidates``: K candidate commands for this vehicle in each world, [n, K] m/s2.
     - ``until_s``: absolute end of the forecast, s.
     - ``in_force``: accelerations in force at the start, [n, N] m/s2.
     - ``failed``: set to True where a check of the kernel failed, [n].

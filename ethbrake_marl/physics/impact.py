@@ -1,17 +1,17 @@
-"""Impacts and resting contact of touching vehicles, resolved together by one law that does not depend on an order.
+"""Impacts and resting contact of touching vehicles, by one law that does not depend on the order of the pairs.
 
-Resolving pairs one after another gives results that depend on the order. Here a *cluster*, a run of touching vehicles,
-is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
+If pairs were resolved one after another, the result would depend on their order. Here a *cluster*, a run of touching
+vehicles, is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
 
 * impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
 * resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block accelerates with
-  ``sum(m u) / sum(m)``. Forces that hold (brakes at rest) enter as a range, so a block at rest moves only if the push
-  exceeds what its braked members can hold.
+  ``sum(m u) / sum(m)``. The brakes of a vehicle at rest enter as a range of forces, so a block at rest moves only if
+  the push exceeds the braking force of its braked vehicles.
 
-Vehicles are ordered front to rear; a result is feasible if no vehicle is faster than the one in front of it.
+In the result no vehicle is faster than the vehicle in front of it.
 
 The kernels work on one table of floats per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``.
-One array is cheap to pass from function to function; passing twenty small ones costs more than the physics.
+One array is cheap to pass from function to function; passing twenty small arrays costs more than the physics.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) -> int:
-    """Give touching vehicles values with which none is faster than the vehicle in front; return the number of blocks.
+    """Set values so that no touching vehicle is faster than the vehicle in front of it; return the number of blocks.
 
-    A vehicle that would be faster than the one in front is pooled with it into a *block*, whose vehicles all get the
-    same value: the mean weighted by mass (isotonic regression). The values are written to row ``out``, and rows BLOCK_*
-    describe the blocks. A vehicle of infinite mass (the obstacle) stands still, and so does its block.
+    A vehicle that would be faster than the vehicle in front is pooled with it into a *block*. All vehicles of a block
+    get the same value: the mean weighted by mass (isotonic regression). The values are written to row ``out``, and rows
+    BLOCK_* describe the blocks. A vehicle of infinite mass (the obstacle) and its block stand still.
 
     Args:
         table: one world in the layout of ``physics.rows``.
         low: row with the lower bound of each vehicle's value (a speed or an acceleration).
         high: row with the upper bound; the same row as ``low`` for an exactly known value.
-        first: column of the front vehicle of the touching run.
-        last: column of its rear vehicle.
-        out: row that receives the results.
+        first: column of the front vehicle of the touching vehicles.
+        last: column of the rear vehicle of the touching vehicles.
+        out: row into which the results are written.
 
     """
     count = 0
@@ -72,13 +72,13 @@ def pool(table: Floats, low: int, high: int, first: int, last: int, out: int) ->
 def resolve_cluster(table: Floats, restitution: float, first: int, last: int) -> None:
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
-    Nothing bounces (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. The vehicles fall into
-    blocks with one common speed before the bounce (``pool``). This speed is corrected by the mean of the remaining
-    error, so the momentum error stays within 4 eps of ``sum(m |v|)`` for any masses. A vehicle that is not struck keeps
-    its bits.
+    The impact is plastic (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. ``pool`` groups
+    the vehicles into blocks with one common speed before the bounce. This speed is corrected by the mean of the
+    remaining rounding error, so the momentum error is at most 4 eps times ``sum(m |v|)`` for any masses. The speed of a
+    vehicle that is not struck stays the same to the last bit.
 
-    Corrected speeds are ordered only up to rounding. So if nothing bounces, each speed is finally limited to that of
-    the vehicle in front. Without this step two blocks could exchange a rounding error forever.
+    The corrected speeds are ordered only up to rounding. In a plastic impact each speed is therefore limited to the
+    speed of the vehicle in front. Without this limit, two blocks could exchange a rounding error forever.
 
     Args:
         table: one world in the layout of ``physics.rows``.
@@ -110,7 +110,7 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 
 @compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
-    """Resolve, once, every run of touching vehicles in which some pair approaches; return False if no pair approaches.
+    """Resolve every run of touching vehicles in which some pair approaches, once; return False if no pair approaches.
 
     ``table``: one world in the layout of ``physics.rows``; ``restitution``: coefficient of restitution in [0, 1].
     Updates SPEED, writes the rows CLOSING, BEFORE and STRUCK of this round of impacts, and clears CONTACT_SPEED.
@@ -147,14 +147,14 @@ def resolve_impacts(table: Floats, restitution: float) -> bool:
 
 @compiled(bare=True)
 def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recorded: int) -> int:
-    """Add the last round of impacts to the harm rows and to the list ``rows``; return the new number of impacts.
+    """Add the impacts of the last round to the rows of harm and to the array ``rows``; return the number of impacts.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``resolve_impacts``.
         time_s: time of the impacts, s.
-        world: number to write into the list for this world.
-        rows: list of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
-        recorded: number of impacts counted so far.
+        world: number of this world, written into ``rows``.
+        rows: array of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
+        recorded: number of impacts before this round.
 
     """
     for p in range(table.shape[1] - 1):

@@ -1,13 +1,14 @@
 """``compiled``, the decorator of all compiled kernels: strict floating point, and a cache that is safe to share.
 
-Numba's own cache has two problems. Its key is the function's own file, so an edit to a *callee* in another file would
-keep the old machine code in use. And its index file is read, changed and written back, which is not safe if processes
-share a folder.
+Numba's own cache has two problems. It looks only at the file of the function itself, so after an edit to a *callee* in
+another file it would still use the old machine code. And its index file is read, changed and written back, which is not
+safe if several processes share a folder.
 
-Here each kernel and signature has one file. Its name is a hash of everything that determines the code: sources,
-versions, signature and processor, but not the location of the package. An edit recompiles exactly the kernels that can
-reach it, and a second environment or a moved checkout reuses the kernels of the first. There is no index. A file is
-written under a temporary name and renamed when complete, so any number of processes may share a folder.
+The cache of this module has one file for each kernel and signature. The name of the file is a hash of everything that
+determines the code: sources, versions, signature and processor, but not the location of the package. After an edit,
+only the kernels that may use the edited code are compiled again. A second environment or a moved checkout reuses the
+existing files. A file is written under a temporary name and renamed when it is complete, so any number of processes may
+share a folder.
 """
 
 from __future__ import annotations
@@ -65,7 +66,6 @@ _DIGEST_BYTES = 32
 
 _LONGEST_WAIT_S = 600.0  # for another process that compiles the same kernel
 
-_UNKEPT = "each process compiles for itself; set the clock, or their dates (find FOLDER -exec touch {} +)"
 
 _IMPORTED_S = time.time()
 
@@ -73,7 +73,7 @@ _loaded: list[str] = []
 
 
 class _Linkable(JITCodeLibrary):  # type: ignore[misc]
-    """Code of a kernel that is only inlined into its callers: no machine code is generated for it."""
+    """Code of a kernel that is only inlined into its callers; no machine code is generated for this kernel."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -83,9 +83,9 @@ class _Linkable(JITCodeLibrary):  # type: ignore[misc]
 class Kernel(CPUDispatcher):  # type: ignore[misc]
     """A compiled function like the result of numba's ``njit``, with its own cache and less to compile.
 
-    Numba generates machine code and two wrappers for each compiled function that another one calls, although the caller
-    already contains its code. And it compiles once per integer literal that is passed as an argument. This class does
-    neither.
+    If one compiled function calls another, numba generates machine code and two wrappers for the called function,
+    although the caller already contains its code. Numba also compiles a function again for each integer literal that is
+    passed as an argument. This class avoids both.
     """
 
     def __init__(self, *given: Any, **options: Any) -> None:
@@ -122,7 +122,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self.add_overload(compiled)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Return what numba needs to type a call of this kernel from another kernel (numba's own protocol).
+        """Return the template with which numba types a call of this kernel from another kernel (numba's own protocol).
 
         ``args`` and ``kws`` are the numba types of the call's arguments.
         """
@@ -166,20 +166,21 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         self._linked[signature.args] = signature, library, environments
 
     def _obtain(self, way: str, kinds: tuple[Any, ...], make: Callable[[], Any], load: Callable[..., None]) -> None:
-        """Load a kernel from the cache, or make and cache it while no other process makes the same one.
+        """Load a kernel from the cache, or compile and cache it while other processes wait for the same kernel.
 
         Args:
-            way: ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
-            kinds: numba types of the arguments, and for an entry also of the result.
-            make: compiles the kernel; returns whether it must not be cached, and its parts, which can be pickled.
-            load: takes these parts and makes the kernel usable in this process.
+            way: ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
+            kinds: numba types of the arguments, and for an entry also the type of the result.
+            make: function that compiles the kernel. It returns whether the kernel must not be cached, and the parts of
+                the kernel, which can be pickled.
+            load: function that makes the kernel usable in this process from these parts.
 
         """
         name = self._name(way, kinds)
         stored = load_kernel(name)
         if stored is None:
             with _alone(name):
-                stored = load_kernel(name)  # another process may have made it meanwhile
+                stored = load_kernel(name)  # another process may have compiled it meanwhile
                 if stored is None:
                     unkept, compiled = make()
                     if name and not unkept:
@@ -190,7 +191,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
     def _name(self, way: str, kinds: tuple[Any, ...]) -> str:
         """Return the cache file name for argument types ``kinds``; empty if the code's sources are not fully known.
 
-        ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for one called from other kernels.
+        ``way`` is ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
         """
         code, source = self.py_func.__code__, Path(self.py_func.__code__.co_filename)
         digest, own = digest_of_sources(source), digest_of_sources(Path(__file__))
@@ -209,7 +210,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
 
 def _without_c_wrapper(flags: Any) -> Any:
-    """Set numba's compiler ``flags`` to make no C wrapper: kernels are called from Python and other kernels only."""
+    """Set numba's compiler ``flags`` to omit the C wrapper, because only Python and other kernels call a kernel."""
     flags.no_cfunc_wrapper = _KNOWN
     return flags
 
@@ -220,7 +221,7 @@ def _symbols(library: Any) -> list[str]:
 
 
 def _described(kind: Any) -> str:
-    """Return a text for a numba type ``kind``, with the field names of named tuples, which its own name omits."""
+    """Return a text for the numba type ``kind``, with the field names of named tuples, which numba's own text omits."""
     parts = [_described(part) for part in getattr(kind, "types", ())]
     return f"{kind} {getattr(kind, 'fields', '')} {parts}"
 
@@ -228,8 +229,8 @@ def _described(kind: Any) -> str:
 def load_kernel(name: str) -> bytes | None:
     """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if it cannot be used.
 
-    It cannot be used if it is missing or damaged, or if its owner is not this user or root: the owner matters because a
-    cached kernel is executed.
+    A file cannot be used if it is missing or damaged, or if its owner is neither this user nor root. The owner matters
+    because a cached kernel is executed.
     """
     try:
         with (cache_folder() / name).open("rb") as file:
@@ -245,7 +246,7 @@ def load_kernel(name: str) -> bytes | None:
 
 
 def keep_kernel(name: str, content: bytes) -> None:
-    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if that fails (for example, full disk)."""
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails, as on a full disk."""
     folder = cache_folder()
     try:
         handle, part = tempfile.mkstemp(dir=folder, prefix=".")
@@ -257,7 +258,7 @@ def keep_kernel(name: str, content: bytes) -> None:
             Path(part).unlink(missing_ok=True)
             raise
     except OSError as error:
-        warnings.warn(f"{folder}: a compiled kernel could not be kept: {error}", stacklevel=2)
+        warnings.warn(f"{folder}: a compiled kernel could not be written to this folder: {error}", stacklevel=2)
 
 
 def _digest_of(name: str, content: bytes) -> bytes:
@@ -287,15 +288,19 @@ def _alone(name: str) -> Iterator[None]:
 def digest_of_sources(source: Path) -> str:
     """Return a hash of all files that the kernels in the file ``source`` may be compiled from; empty if not known.
 
-    It is not known for code outside a file (a shell), and for a file that was edited after this process started,
-    because the process may have imported the older version. A file dated in the future counts as edited, with a
-    warning.
+    The hash is not known for code outside a file (in an interactive shell), and for a file that was edited after this
+    process started, because the process may have imported the older version. A file with a date in the
+    future counts as edited, and a warning is given.
     """
     digest = hashlib.sha256()
     for file in kernel_sources(source) if source.is_file() else ():
         written_s = file.stat().st_mtime
         if written_s > time.time():
-            warnings.warn(f"{_PACKAGE}: dates of files lie in the future: {_UNKEPT}", stacklevel=2)
+            warnings.warn(
+                f"{_PACKAGE}: dates of files lie in the future, so each process compiles the kernels again; correct the"
+                " clock of this machine, or the dates (find FOLDER -exec touch {} +)",
+                stacklevel=2,
+            )
         if written_s > _IMPORTED_S:
             return ""
         digest.update(f"{_place_of(file)} {file.stat().st_size} ".encode() + file.read_bytes())
@@ -310,8 +315,8 @@ def _place_of(file: Path) -> str:
 def kernel_sources(source: Path) -> list[Path]:
     """Return the file ``source`` and all files of this package that its kernels may be compiled from, sorted by name.
 
-    These are the files with kernels that it imports, directly or through other such files, and the files from which any
-    of them imports a constant (a name in capitals).
+    The result contains the files with kernels that ``source`` imports, directly or through other files with kernels.
+    It also contains the files from which one of these files imports a constant (a name in capitals).
     """
     sources, follow = {source}, [source]
     while follow:
@@ -324,7 +329,7 @@ def kernel_sources(source: Path) -> list[Path]:
 
 @cache
 def _imports(source: Path) -> list[tuple[Path, bool]]:
-    """Return (file, whether it has kernels) for the files with kernels or constants that ``source`` imports."""
+    """Return the files with kernels or constants that ``source`` imports, as (file, whether it has kernels)."""
     modules = []
     for module, names in _IMPORT.findall(source.read_bytes()):
         for imported, taken in _homes(module.decode(), set(re.findall(r"\w+", names.decode()))):
@@ -335,10 +340,10 @@ def _imports(source: Path) -> list[tuple[Path, bool]]:
 
 
 def _homes(module: str, names: set[str]) -> list[tuple[Path, set[str]]]:
-    """Return (file, names defined there) for each file that the imported ``names`` come from.
+    """Return the files from which the imported ``names`` come, as (file, names that this file defines).
 
-    ``module`` is the dotted name in the import: a module, or a folder whose ``__init__`` imports the names from
-    elsewhere.
+    ``module`` is the dotted name in the import: a module, or a folder whose ``__init__`` imports the names from other
+    modules.
     """
     place = _PACKAGE.joinpath(*module.split(".")[1:])
     if place.with_suffix(".py").is_file():
@@ -361,17 +366,17 @@ def compiled(*, apart: bool = False, within: bool = False, bare: bool = False) -
 def compiled(function: Any = None, *, apart: bool = False, within: bool = False, bare: bool = False) -> Any:
     """Compile a function with numba: no fast-math, no bounds checks, no GIL, cached on disk.
 
-    By default a kernel is inlined into its callers (``forceinline``). A real call would count references to its arrays,
-    atomically, which costs more than half of the physics.
+    By default a kernel is inlined into its callers (``forceinline``). A real call would count the references to its
+    arrays with atomic operations, which takes more than half as long as the physics itself.
 
     Args:
         function: the function, if the decorator is used without arguments.
-        apart: keep calls of this kernel as calls. For large, shared, rarely called kernels: inlined, they would be
-            compiled once per caller, which takes minutes instead of seconds.
-        within: inline this kernel into its callers before they are compiled. ``forceinline`` still counts references at
-            each level that passes an array on; ``within`` does not.
-        bare: compile without any reference counting. For kernels that neither create nor return arrays; the caller
-            holds them. A callee with ``forceinline`` still counts references unless it is bare too.
+        apart: do not inline this kernel. Use this for a large kernel that many kernels call, but rarely. If such a
+            kernel were inlined, it would be compiled once per caller, which takes minutes instead of seconds.
+        within: inline this kernel into its callers before they are compiled. In contrast to ``forceinline``, this
+            avoids the counting of references in each function that passes an array on.
+        bare: compile without any reference counting. Use this for kernels that neither create nor return arrays. A
+            callee with ``forceinline`` still counts references unless it is also ``bare``.
 
     """
     if function is None:
@@ -391,12 +396,12 @@ Result = TypeVar("Result")
 def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Result]:
     """Return the results of ``work`` on contiguous slices that divide the rows 0 to n - 1, in the order of the rows.
 
-    There is one slice per thread, so up to ``threads`` results. The calling thread does the first slice, so
-    ``threads=1`` starts no thread. If slices fail, all others still end, and then the error of the first failed slice
-    is raised. Raises ``InvalidInput`` unless ``threads`` is a whole number >= 1.
+    There is one slice per thread. The calling thread works on the first slice, so ``threads=1`` starts no thread. If
+    ``work`` fails on a slice, the other slices are still finished before the error is raised. If several slices fail,
+    the error of the first one is raised. Raises ``InvalidInput`` unless ``threads`` is a whole number of at least 1.
 
     Args:
-        work: function of a slice of the rows, called once per slice.
+        work: function that is called with each slice of the rows.
         n: number of rows.
         threads: largest number of threads.
 

@@ -1,4 +1,4 @@
-"""Worlds that cannot be advanced are left out and reported; the results of the others do not change."""
+"""Leave out and report worlds that cannot be advanced; the results of the other worlds do not change."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out
 
 
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
-    """Measure n worlds without those that fail; return the result, the rows that were measured, and the failed rows.
+    """Measure n worlds without failed worlds; return the result, the rows that were measured, and the failed rows.
 
-    Like ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails. The failed rows come as (row,
-    reason), in ascending order.
+    The failed rows are returned as pairs (row, reason), in ascending order. Raises ``PhysicsError`` if every world
+    fails; otherwise the function works like ``leaving_out_failed``.
 
     Args:
-        measure: function of rows (indices of worlds, from 0 to n - 1); raises ``PhysicsError`` naming the worlds that
-            fail, numbered within these rows.
+        measure: function of rows (indices of worlds, from 0 to n - 1). It raises a ``PhysicsError`` that lists the
+            failed worlds by their position in these rows.
         n: number of worlds.
 
     """
@@ -35,15 +35,15 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
-    """Run ``work`` without the rows that fail; return its result, the rows it used, and the failures as row -> reason.
+    """Run ``work`` without the rows that fail; return its result, the rows it used, and a dictionary row -> reason.
 
-    A world's result does not depend on its batch, so ``work`` is simply repeated without the failed rows until none
-    fails. The result is None if no row is left.
+    The dictionary lists the failed rows. A world's result does not depend on its batch, so ``work`` is repeated without
+    the failed rows until no row fails. The result is None if no row is left.
 
     Args:
-        work: function of rows of a batch; raises ``PhysicsError`` naming the worlds that fail, numbered within these
-            rows.
-        rows: indices of the worlds to begin with, [k].
+        work: function of rows of a batch. It raises a ``PhysicsError`` that lists the failed worlds by their position
+            in these rows.
+        rows: indices of the worlds for the first call of ``work``, [k].
 
     """
     failed: dict[int, str] = {}

@@ -1,14 +1,15 @@
-"""Periodic messages: what each vehicle has received from each other one, and how old it is.
+"""Periodic messages: the information that each vehicle has received about each other vehicle, and its age.
 
-A vehicle samples its state at every decision, starting at the alert. A message carries the sender's newest sample. On
-each link a message is sent every period. The link's channel is good or bad (Gilbert-Elliott): after the first message
-that arrives it turns bad with probability p per message, and good again with probability r. A message sent while the
-channel is bad is lost. The random numbers are a pure function of the world's key, the link and the message's number, so
-they do not depend on the batch or the step. A neighbour in sight is measured, so its present state is known.
+A vehicle samples its state at every decision, starting at the alert. A message contains the sender's newest sample. On
+each link a message is sent every period. The link's channel is good or bad (Gilbert-Elliott model): after the first
+message that arrives, it turns bad with probability p per message, and good again with probability r. A message sent
+while the channel is bad is lost. The random numbers are a pure function of the world's key, the link and the message's
+number, so they do not depend on the batch or the step. A vehicle measures a neighbour in sight, so it knows the
+neighbour's present state.
 
-For N vehicles the messages use these columns of the parameters, after the news (``physics.columns.Columns``). They are
-the memory of the channel and change while it is in use. A world without periodic messages has period 0: there the
-present state is known.
+For N vehicles the messages use the following columns of the parameters, after the news (``physics.columns.Columns``).
+These columns are the memory of the channel and change during an episode. If the period is 0, the world has no periodic
+messages, and vehicles know the present state.
 
 head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), number of samples taken, place
         of the obstacle ahead (m; infinite: none)
@@ -17,11 +18,11 @@ links   N * N times the columns of ``_Link``, ordered by receiver, then sender
 ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
         and places, speeds and commands in force of all vehicles
 
-Where the scenario says what a message contains (``v2x: tells``), the link of Vehicle 1 to itself is marked, a block of
-contents stands between links and ring, and each sample also has the commands chosen at the last decision (*intents*,
-N columns). Such columns exist without periodic messages too.
+If the scenario says what a message contains (``v2x: tells``), the link of Vehicle 1 to itself is marked, and each
+sample also contains the commands chosen at the last decision (*intents*, N columns). Then three more groups of columns
+exist between links and ring, even in a world without periodic messages:
 
-contents    N * CONTENTS: 1 if messages of this vehicle contain the piece
+contents    N * CONTENTS: 1 if messages of this vehicle contain this piece of information
 intents     N, present intent of each vehicle (m/s2)
 told        N * N, by receiver, then sender: intent in the newest message received (m/s2)
 """
@@ -73,12 +74,14 @@ class _Channel(NamedTuple):
 
 CHANNEL = _Channel()
 
+PLACES_AT = CHANNEL.WIDTH  # first column of the places of the vehicles (m along the road)
+
 
 class _Link(NamedTuple):
-    """Column numbers of a link, which is one direction between two vehicles, from a sender to a receiver."""
+    """Column numbers of a link, which is the connection from one sending vehicle to one receiving vehicle."""
 
     NEXT_SENT: int = 0  # when the next unprocessed message is sent (s); infinite: no messages on this link
-    NUMBER: int = 1  # number of that message; 0 is the first message that arrives
+    NUMBER: int = 1  # number of the next unprocessed message; 0 is the first message that arrives
     BAD: int = 2  # 1 while the channel is bad
     SEEN_FROM: int = 3  # time from which the receiver measures the sender (s); infinite: never
     TOLD_S: int = 4  # when the newest received state was sampled (s); below 0: nothing received
@@ -99,15 +102,6 @@ _ON_GRID = 1e-9
 
 
 @compiled
-def place_at(vehicles: int) -> int:
-    """Return the column at which the places of the vehicles begin, counted from the first column of the messages.
-
-    A place is a position along the road (m). ``vehicles``: number N of vehicles.
-    """
-    return CHANNEL.WIDTH
-
-
-@compiled
 def link_at(receiver: int, sender: int, vehicles: int) -> int:
     """Return the first column of the link from ``sender`` to ``receiver`` (vehicle numbers from 0).
 
@@ -118,13 +112,19 @@ def link_at(receiver: int, sender: int, vehicles: int) -> int:
 
 @compiled
 def contents_at(vehicles: int) -> int:
-    """Return the first column of the contents, relative to the head; without contents the ring begins here."""
+    """Return the first column of the contents, counted from the first column of the messages.
+
+    Without contents, the ring buffer begins at this column.
+    """
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
 
 @compiled
 def intent_at(vehicles: int) -> int:
-    """Return the first column of the intents, relative to the head; those that were told follow after N columns."""
+    """Return the first column of the present intents, counted from the first column of the messages.
+
+    The intents in the newest messages received begin N columns later.
+    """
     return contents_at(vehicles) + CONTENTS * vehicles
 
 
@@ -152,11 +152,11 @@ def sample_width(messages: Floats, vehicles: int) -> int:
 
 @compiled
 def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
-    """Return whether ``receiver`` knows a piece of ``sender``, whose message or sight has arrived by ``time`` (s).
+    """Return whether ``receiver`` knows one of ``PIECES`` (such as the mass) of ``sender`` at ``time`` (s).
 
-    ``messages`` is a row of message columns, or empty. Place, speed and acceleration are measured once the sender is in
-    sight. The intent comes by message alone. A piece that messages contain but sensors do not measure is known from the
-    first message or sight on.
+    By this time the first message must have arrived, or the sender must be in sight. ``messages`` is a row of message
+    columns, or empty. Place, speed and acceleration are measured once the sender is in sight. The intent becomes known
+    only by a message. Every other piece that messages contain is known from the first message or sight on.
     """
     if not has_contents(messages, vehicles):
         return piece != INTENT
@@ -170,7 +170,7 @@ def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, pie
 
 @compiled
 def knows_line(messages: Floats, vehicles: int, receiver: int, sender: int, time: float) -> bool:
-    """Return whether ``receiver`` knows every piece of ``sender`` that is needed to foretell its motion."""
+    """Return whether ``receiver`` knows everything about ``sender`` that a prediction of its motion needs."""
     known = True
     for piece in range(INTENT):
         known = known and knows_piece(messages, vehicles, receiver, sender, piece, time)
@@ -186,9 +186,9 @@ def _known_pieces(messages: Floats, time: Floats, vehicles: int, receiver: int, 
 
 
 class Told(NamedTuple):
-    """Newest state of each vehicle that one receiving vehicle has received, by message or by sight.
+    """Newest states of all vehicles that one receiving vehicle has received, by message or by sight.
 
-    Arrays are [n, N] unless stated otherwise, with column j for sender j; they are views of the columns.
+    Arrays are [n, N] unless stated otherwise, with column j for sender j. They are views of the message columns.
     """
 
     at_s: Floats  # time at which the state was sampled (s); below 0: nothing received
@@ -203,7 +203,7 @@ class Told(NamedTuple):
 class Messages(NamedTuple):
     """Periodic messages of n worlds: what each vehicle has received from the others, and the channel's settings."""
 
-    columns: Floats  # [n, M] the columns that the module describes; M is 0 without periodic messages
+    columns: Floats  # [n, M] the columns that the module's docstring describes; M may be 0
     vehicles: int  # number N of vehicles in a line
 
     @classmethod
@@ -213,7 +213,7 @@ class Messages(NamedTuple):
 
     @staticmethod
     def ring_length(delay_s: float, time_step_s: float) -> int:
-        """Return the number of samples to store: those taken during a message's delay, and one at each end.
+        """Return the number of samples to store: the samples taken during a message's delay, and spare ones.
 
         ``delay_s``: time from sending a message to its use (s); ``time_step_s``: time between two samples (s).
         """
@@ -233,9 +233,9 @@ class Messages(NamedTuple):
             samples: length of the ring buffer, see ``ring_length``.
             period_s: time between two messages of a link, s.
             delay_s: time from sending a message to its use, s.
-            loss_begins: probability that a good channel turns bad, per message.
-            loss_ends: probability that a bad channel turns good again, per message.
-            contents: whether messages of vehicle j contain each of ``PIECES``, [N, CONTENTS]; None: all but intent.
+            loss_begins: probability per message that a good channel turns bad.
+            loss_ends: probability per message that a bad channel turns good again.
+            contents: whether messages of vehicle j contain each of ``PIECES``, [N, CONTENTS]; None: all except intent.
 
         """
         n, N = heard_s.shape[:2]
@@ -261,7 +261,7 @@ class Messages(NamedTuple):
 
     @property
     def periodic(self) -> Bools:
-        """Whether a world sends messages periodically, so that knowledge of others ages between them, [n]."""
+        """Whether vehicles of each world send messages periodically, so that information ages between them, [n]."""
         return np.asarray((self.columns[:, CHANNEL.PERIOD : CHANNEL.PERIOD + 1] > 0.0).any(axis=1))
 
     @property
@@ -276,36 +276,36 @@ class Messages(NamedTuple):
 
     @property
     def says_contents(self) -> bool:
-        """Whether the columns say what messages contain; in one batch all worlds do, or none."""
+        """Whether the columns say what messages contain, which is the same for all worlds of a batch."""
         marked: bool = self.columns.shape[1] > 0 and bool((self.links[:, 0, 0, LINK.NUMBER] == 1.0).any())
         return marked
 
     def lacks(self, sender: int, pieces: Sequence[Piece] = USUAL_PIECES) -> tuple[Piece, ...]:
-        """Return those of ``pieces`` that the messages of ``sender`` do not contain in every world."""
+        """Return the ``pieces`` that the messages of ``sender`` lack in at least one world."""
         always: Bools = np.logical_and.reduce(self.contents[:, sender])
         return tuple(piece for piece in pieces if not always[PIECES.index(piece)])
 
     def withhold_from(self, vehicle: int) -> Bools:
-        """Return the worlds [n] in which messages of another vehicle than ``vehicle`` lack a usual piece."""
+        """Return whether messages of some vehicle other than ``vehicle`` lack a usual piece, [n]."""
         others = np.delete(self.contents, vehicle, axis=1)[:, :, : len(USUAL_PIECES)]
         return np.asarray(~others.all(axis=(1, 2)))
 
     def seen_from_s(self, vehicle: int, other: int) -> Floats:
-        """Return when ``vehicle`` begins to measure ``other``, [n] s; infinite: never, or there are no columns."""
+        """Return the time from which ``vehicle`` measures ``other``, [n] s; infinite: never or without columns."""
         seen = self.links[:, vehicle, other, LINK.SEEN_FROM] if self.columns.shape[1] else None
         return np.full(len(self.columns), np.inf) if seen is None else seen
 
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
-        """Return which of ``PIECES`` of each other vehicle ``vehicle`` knows, [n, N, CONTENTS].
+        """Return which of ``PIECES`` ``vehicle`` knows of each other vehicle at ``time_s`` [n], [n, N, CONTENTS].
 
-        It applies to the vehicles whose message or sight has arrived by ``time_s`` [n].
+        The result is valid for vehicles whose first message has arrived by this time or that are in sight.
         """
         known = np.empty((len(time_s), self.vehicles, CONTENTS), np.bool_)
         _known_pieces(np.ascontiguousarray(self.columns), time_s, self.vehicles, vehicle, known)
         return known
 
     def intents(self, vehicle: int) -> Floats:
-        """Return the newest intent of each other vehicle that ``vehicle`` received, [n, N] m/s2; 0 without contents."""
+        """Return the newest intent of each vehicle that ``vehicle`` has received, [n, N] m/s2; 0 without contents."""
         n, N = len(self.columns), self.vehicles
         if not self.says_contents:
             return np.zeros((n, N))
@@ -314,7 +314,7 @@ class Messages(NamedTuple):
         return np.where(periodic, self.columns[:, messages : messages + N], self.columns[:, at : at + N])
 
     def with_intents(self, intents_mps2: Floats) -> Floats:
-        """Return the columns with these present intents [n, N] of the vehicles; the same without contents."""
+        """Return the columns with the present intents set to ``intents_mps2`` [n, N]; unchanged without contents."""
         if not self.says_contents:
             return self.columns
         columns, at = self.columns.copy(), intent_at(self.vehicles)
@@ -322,11 +322,11 @@ class Messages(NamedTuple):
         return columns
 
     def newest_told(self, vehicle: int) -> Told:
-        """Return the newest state of every vehicle that ``vehicle`` (index from 0) has received.
+        """Return the newest states of all vehicles that ``vehicle`` (index from 0) has received.
 
         All worlds must have columns of messages.
         """
-        own, obstacle = self.columns[:, place_at(self.vehicles) + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
+        own, obstacle = self.columns[:, PLACES_AT + vehicle], self.columns[:, CHANNEL.OBSTACLE_PLACE]
         newest = self.links[:, vehicle]
         at_s, place, speed, command, hit = (newest[..., entry] for entry in range(LINK.TOLD_S, LINK.WIDTH))
         return Told(at_s, place, speed, command, hit, own, obstacle)
@@ -334,9 +334,9 @@ class Messages(NamedTuple):
     def age_s(self, time_s: Floats) -> Floats:
         """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
-        Age is counted from when the state was sampled. It is 0 in worlds without periodic messages, where the present
-        state is known, and infinite if nothing was received yet. ``Vehicles.known_from_s`` says from when on vehicle i
-        may act on it.
+        The age is the time since the state was sampled. The age is 0 in worlds without periodic messages, where the
+        present state is known, and infinite if nothing has been received yet. Vehicle i may use the state from the time
+        ``Vehicles.known_from_s`` on.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():
@@ -356,26 +356,26 @@ def refuse_untold(
     needs: Sequence[Piece] = LOOK_AHEAD,
     senders: Sequence[int] | None = None,
 ) -> None:
-    """Raise ``InvalidInput`` if a message lacks a piece that ``who``, in control of ``vehicles``, needs of another one.
+    """Raise ``InvalidInput`` if messages lack a piece that ``who``, which controls ``vehicles``, needs to know.
 
-    Several vehicles that are controlled together need the messages of each other, too. ``senders`` are the vehicles
-    whose messages are needed; None: all.
+    Vehicles that are controlled together also need each other's messages. ``needs``: the pieces that must be known.
+    ``senders``: the vehicles whose messages are needed; None: all vehicles.
     """
     messages = Messages.of(worlds)
     for sender in (range(worlds.N) if senders is None else senders) if messages.says_contents else ():
         if tuple(vehicles) != (sender,) and (missing := messages.lacks(sender, needs)):
             raise InvalidInput(
-                f"{who}: vehicle_{sender + 1} does not tell its {missing[0]} (v2x: tells), and"
-                f" {', '.join(needs)} of others are needed; let messages contain them, or take a policy alone, which"
-                " decides on what it observes"
+                f"{who}: messages of vehicle_{sender + 1} do not contain its {missing[0]} (v2x: tells), but"
+                f" {', '.join(needs)} of the other vehicles are needed; let messages contain them, or use a policy"
+                " alone, which decides on its observation"
             )
 
 
 @compiled
 def chance(key: float, link: int, number: float) -> float:
-    """Return a random number in [0, 1) that decides whether a message is lost; a pure function of its arguments.
+    """Return a random number in [0, 1) that decides whether a message is lost.
 
-    The number has 53 bits of a SplitMix64 hash.
+    The number is a pure function of the arguments: 53 bits of a SplitMix64 hash.
 
     Args:
         key: seed of the message losses in this world, a whole number below 2^53.
@@ -397,21 +397,21 @@ def hear_rows(
     moving: Floats, params: Floats, wanted: Floats, until_s: Floats, decision_s: Floats, time_step_s: float,
     pieces: Floats,
 ) -> None:  # fmt: skip
-    """Advance the messages, and with them the state, of every world from its present time to ``until_s``, in place.
+    """Advance the messages and the state of every world from its present time to ``until_s``, in place.
 
-    A sample of all vehicles is taken at every multiple of ``time_step_s`` before the next decision. A world that ends
-    between two samples measures the present at its end; that sample is not stored. If the kernel cannot advance a
-    world, the world receives nothing more.
+    All vehicles are sampled every ``time_step_s``, counted back from the next decision. If ``until_s`` lies between two
+    samples, vehicles in sight are measured at ``until_s`` too, and this last sample is not stored. If the kernel cannot
+    advance a world, the vehicles of this world receive nothing more.
 
     Args:
-        moving: state rows of the worlds at the start, [n, S], in the layout of ``physics.columns``; advanced too.
-        params: their parameter rows, whose columns of messages are updated.
-        wanted: commands of the vehicles in the meantime, [n, N] m/s2.
+        moving: state rows of the worlds, [n, S], in the layout of ``physics.columns``; they are advanced.
+        params: parameter rows of the worlds; their columns of messages are updated.
+        wanted: commands of the vehicles until then, [n, N] m/s2.
         until_s: end times, [n] s.
         decision_s: time of the next decision, [n] s.
-        time_step_s: time between decisions, s.
-        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K], equal in all
-            worlds; see ``Vehicles.pieces``.
+        time_step_s: time between two decisions, s.
+        pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K], the same for
+            all worlds; see ``Vehicles.pieces``.
 
     """
     column = columns(moving)
@@ -444,18 +444,18 @@ def hear_rows(
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
     """Begin the messages of one world at the alert. Updates the rows ``state`` and ``params``.
 
-    Sets the place of each vehicle along the road, stores the first sample of all states, and lets each vehicle measure
-    the vehicles in sight.
+    The function sets the place of each vehicle along the road, stores the first sample of all states, and lets each
+    vehicle measure the vehicles in sight.
 
     Args:
         state: state row of one world, [S].
-        params: its parameter row.
+        params: parameter row of the world.
         column: first column of each group of quantities in the two rows.
         wanted: commands of the vehicles, [N] m/s2.
 
     """
     N, obstacle, gap, force = column.vehicles, column.obstacle, column.gap, column.command
-    messages, place = params[column.messages :], place_at(N)
+    messages, place = params[column.messages :], PLACES_AT
     messages[place] = 0.0
     messages[CHANNEL.OBSTACLE_PLACE] = state[obstacle] if state.shape[0] > obstacle else math.inf
     for p in range(N - 1):
@@ -474,7 +474,8 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
 def _choose(params: Floats, column: Columns, wanted: Floats, time: float) -> None:
     """Write the present intents at ``time`` (s): the commands ``wanted`` that were chosen at the last decision.
 
-    A vehicle whose latency the channel extends does not know of the emergency before that, and has chosen nothing.
+    If the channel extends a vehicle's latency, the vehicle does not know of the emergency before the latency has
+    elapsed. Until then its intent is 0.
     """
     messages, N = params[column.messages :], column.vehicles
     if not has_contents(messages, N):
@@ -492,18 +493,18 @@ def _move(
 ) -> bool:  # fmt: skip
     """Advance one world, and the places of its vehicles, to the time ``end``; return whether the kernel succeeded.
 
-    After a failure nothing has changed.
+    After a failure, state and places are unchanged.
 
     Args:
         state: state row of the world, [S]; updated.
-        params: its parameter row; its places are updated.
+        params: parameter row of the world; the places of its vehicles are updated.
         column: first column of each group of quantities in the two rows.
         wanted: commands of the vehicles, [N] m/s2.
         end: time to advance to, s.
         pieces: start (s) and command (m/s2) of the K intervals of a fixed sequence of commands, [N, 2 K]; see
             ``Vehicles.pieces``.
         table: workspace in the layout of ``physics.rows``, N + 1 columns; overwritten.
-        no_rows: empty list of impacts, [0, LISTED.WIDTH].
+        no_rows: empty array of impacts, [0, LISTED.WIDTH].
 
     """
     N, time = column.vehicles, state[column.time]
@@ -527,7 +528,7 @@ def _move(
         table[ROW.HIT, p + 1] = state[gap + N - 1 + p]
     if advance_table(table, params[column.restitution], end - time, time, 0, no_rows, 0)[1] != FLAG.DONE:
         return False
-    place = column.messages + place_at(N)
+    place = column.messages + PLACES_AT
     params[place] += ahead - table[ROW.GAP, 0]
     state[column.time] = end
     for i in range(N):
@@ -545,7 +546,7 @@ def _move(
 
 @compiled
 def _sample(state: Floats, messages: Floats, column: Columns) -> None:
-    """Store a sample of every vehicle's state, over the oldest sample of the ring buffer.
+    """Store a sample of every vehicle's state, in place of the oldest sample of the ring buffer.
 
     ``state``: state row of one world, [S]; ``messages``: its message columns, updated; ``column``: layout of the state.
     """
@@ -555,7 +556,7 @@ def _sample(state: Floats, messages: Floats, column: Columns) -> None:
     messages[at] = state[column.time]
     messages[at + 1] = state[obstacle + 1] if state.shape[0] > obstacle else 0.0
     for i in range(N):
-        messages[at + RING_HEAD + i] = messages[place_at(N) + i]
+        messages[at + RING_HEAD + i] = messages[PLACES_AT + i]
         messages[at + RING_HEAD + N + i] = state[column.speed + i]
         messages[at + RING_HEAD + 2 * N + i] = state[column.command + i]
         if width > RING_HEAD + 3 * N:
@@ -592,8 +593,8 @@ def _receive(time: float, messages: Floats, N: int) -> None:
 def _take(messages: Floats, link: int, sender: int, sent_s: float, N: int) -> int:
     """Receive one message: copy the sender's newest sample from the ring buffer to the link.
 
-    It is the newest sample taken at ``sent_s`` or earlier. Nothing changes if the receiver already has a newer one.
-    Return the first column of that sample; 0: none is left.
+    The message contains the newest sample taken at ``sent_s`` or earlier. Nothing is copied if the receiver already has
+    a newer sample. Returns the first column of the message's sample; 0 if the ring buffer does not contain it any more.
 
     Args:
         messages: columns of messages of one world; updated.

@@ -1,7 +1,7 @@
-"""Closed-form times of the events that bound motion under constant acceleration, and distances to stop.
+"""Closed formulas for motion under constant acceleration: times of the next events, gaps, and stopping distances.
 
-Between events every quantity is a quadratic in time, so the first event is found exactly and none is missed. Only
-+ - * / and sqrt are used, so a world gives the same bits in any batch.
+Between events every gap is quadratic in time, so the next event is found exactly and no event is missed. Only + - * /
+and sqrt are used, so the results have the same bits in any batch.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ ONSET_ROUNDING_S = 1e-9  # a latency that elapses this shortly before the end of
 def has_acted(latency_s: Any, time_s: Any) -> Any:
     """Return whether a command has taken effect before the end of a time interval, for numbers (in kernels) or arrays.
 
-    A latency that elapses at the start of the interval counts. A latency that elapses at its end does not: the next
-    decision replaces the command before it acts.
+    A command that takes effect at the start of the interval counts. A command that would take effect at its end does
+    not count, because the next decision replaces it before it acts.
 
     Args:
         latency_s: time from the start of the interval until the command takes effect, s; may be negative.
@@ -49,11 +49,11 @@ command_acts = compiled(has_acted)
 
 @compiled
 def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
-    """Return the time to a pair's first contact (s) and the closing speed there (m/s); ``(inf, 0)`` if there is none.
+    """Return the time (s) and the closing speed (m/s) of a pair's first contact; ``(inf, 0)`` if there is no contact.
 
     With ``D = w^2 + 2 b g``: for ``w > 0`` there is no contact if ``D < 0``, otherwise ``t = 2 g / (w + sqrt(D))``. For
-    ``w <= 0`` there is one only if ``b > 0``: ``t = (sqrt(D) - w) / b``. The closing speed at contact is computed as
-    ``sqrt(D)``; the equal ``w + b t`` would suffer cancellation.
+    ``w <= 0`` there is a contact only if ``b > 0``, at ``t = (sqrt(D) - w) / b``. The closing speed at the contact is
+    computed as ``sqrt(D)``, because the equal expression ``w + b t`` loses digits by cancellation.
 
     Args:
         gap: present gap g >= 0, m.
@@ -75,13 +75,13 @@ def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
 
 @compiled
 def drift(gap: float, closing: float, pressing: float, duration: float) -> float:
-    """Return the gap (m) after the time t at constant closing acceleration: ``g - (w + b t / 2) t``.
+    """Return the gap (m) after the time t at a constant closing acceleration: ``g - (w + b t / 2) t``.
 
     Args:
         gap: present gap g, m.
         closing: present closing speed w (rear minus front), m/s.
         pressing: closing acceleration b (rear minus front), m/s2.
-        duration: t, s.
+        duration: time t, s.
 
     """
     return gap - (closing + 0.5 * pressing * duration) * duration
@@ -89,9 +89,10 @@ def drift(gap: float, closing: float, pressing: float, duration: float) -> float
 
 @compiled
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
-    """Return the time (s) until the speed next reaches a value where forces change, and that value (m/s).
+    """Return the time (s) until the speed next reaches a value at which forces change, and this value (m/s).
 
-    These values are standstill, where brakes hold, and the speed limit of a vehicle that drives. ``(inf, 0)``: never.
+    Forces change at standstill, where brakes hold, and at the speed limit of a vehicle that drives. The result is
+    ``(inf, 0)`` if the speed reaches neither.
 
     Args:
         speed: present speed, m/s.
@@ -116,10 +117,10 @@ def speed_event(speed: float, acceleration: float, command: float, limit: float)
 
 @compiled
 def force_range(speed: float, command: float, limit: float) -> tuple[float, float]:
-    """Return a vehicle's own acceleration (m/s2) if it is about to move forward, and if it is about to move backward.
+    """Return a vehicle's own acceleration for motion forward, and its own acceleration for motion backward (m/s2).
 
-    The two differ where the force is set-valued: brakes at standstill hold against a push from either side, and a
-    driving vehicle at its speed limit drives only as much as keeps it there.
+    The two values differ if the force can take a range of values: brakes at standstill hold against a push from either
+    side, and a driving vehicle at its speed limit uses only the force that keeps it at this speed.
 
     Args:
         speed: present speed, m/s.
@@ -143,9 +144,9 @@ def force_range(speed: float, command: float, limit: float) -> tuple[float, floa
 
 @compiled
 def settle(low: float, high: float) -> float:
-    """Return the acceleration of a body whose own forces allow ``[low, high]`` (m/s2): the value nearest to 0.
+    """Return the value nearest to 0 in the range ``[low, high]`` of accelerations that a body's own forces allow, m/s2.
 
-    The body is a vehicle, or several that move as one.
+    The body is a vehicle, or several vehicles that move as one.
     """
     if low > 0.0:
         return low
@@ -160,13 +161,13 @@ def solo_motion(
 ) -> tuple[float, float, float]:
     """Move a vehicle alone; return its final speed (m/s), its distance (m) and its acceleration (m/s2).
 
-    It coasts until ``onset``, then brakes to standstill or drives up to the limit. The acceleration is NaN unless it
-    was constant throughout.
+    The vehicle coasts until ``onset``, and then brakes to standstill or drives up to the limit. The acceleration is NaN
+    if it was not constant.
 
     Args:
         speed: present speed, m/s, at least 0.
         command: command, m/s2; negative brakes.
-        onset: time from now until the command takes effect, s; 0 or less: at once.
+        onset: time from now until the command takes effect, s; 0 or less if it acts at once.
         limit: speed up to which the vehicle drives, m/s.
         duration: length of the motion, s.
 
@@ -212,14 +213,14 @@ def stopping_distance(speed: float, latency_left: float, capacity: float) -> flo
 def ramped_stopping_distance(speed: float, latency_left: float, capacity: float, rate: float) -> float:
     """Return the distance (m) to rest under full braking with brakes that build up from 0 at a constant rate.
 
-    It is ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If the vehicle stops before its brakes reach full
-    force, ``v < a^2 / (2 r)``, it is ``v tau + (2 / 3) v sqrt(2 v / r)``.
+    The distance is ``v tau + v a / (2 r) - a^3 / (24 r^2) + v^2 / (2 a)``. If the vehicle stops before its brakes reach
+    full force, ``v < a^2 / (2 r)``, the distance is ``v tau + (2 / 3) v sqrt(2 v / r)``.
 
     Args:
         speed: present speed v, m/s.
         latency_left: time tau until the brakes act, s.
         capacity: largest deceleration a, m/s2.
-        rate: r, m/s3; infinite: the brakes act at once.
+        rate: rate r at which the brakes build up, m/s3; infinite if they act at once.
 
     """
     speed = max(speed, 0.0)
@@ -239,7 +240,7 @@ def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, ra
         speed: present speeds, [n] m/s.
         latency_left: time until the brakes act, [n] s.
         capacity: largest decelerations, [n] m/s2.
-        rate: rates at which brakes build up, [n] m/s3; infinite: at once.
+        rate: rates at which brakes build up, [n] m/s3; infinite for brakes that act at once.
 
     """
     distance = np.empty(len(speed))

@@ -5,28 +5,28 @@ With the sampling period h, one step of a vehicle with command u, from sample n 
     x(n + 1) = x(n) + h f(n) + h^2 / 2 u(n)
     v(n + 1) = f(n) + h u(n)
 
-where f(n) is the vehicle's speed after the impacts of sample n. A pair with a gap <= 0 at a sample that is closing
-exchanges velocity by the paper's eq. (13). For Vehicle 2 that is f = f1 after f3: first the rear impact, then the front
-impact with the changed speed. The other vehicle of the pair is updated with it.
+where f(n) is the vehicle's speed after the impacts of sample n. A closing pair with a gap <= 0 at a sample exchanges
+velocity by the paper's eq. (13). For Vehicle 2 this means f = f1 after f3: the rear impact comes first, then the front
+impact with the changed speed. The speed of the other vehicle of each pair changes at the same time.
 
-The paper leaves these points open; here they are read as follows:
+The paper leaves some points open. This map resolves them as follows:
 
-* f1 gets the state that f3 has changed, so the closing speed of the front impact is the changed one. Its harm is the
-  square of that same speed. The printed J_harm uses the speeds before both impacts, which differs only if both pairs
-  meet at one sample.
-* The printed f1 and f3 also act on overlapping vehicles that separate, which would pull them together again. The text
-  below eq. (13) asks for a positive relative velocity. This map requires it too, for the exchange and for its harm.
+* f1 uses the state that f3 has changed, so the front impact has the changed closing speed. Its harm is the square of
+  this speed. The printed J_harm uses the speeds before both impacts, which makes a difference only if both pairs meet
+  at one sample.
+* The printed f1 and f3 also act on overlapping vehicles that separate, and would pull them together again. The text
+  below eq. (13) asks for a positive relative velocity. This map therefore requires it for the exchange and for harm.
 * Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves exactly
-  and no impact is detected: the paper assumes that there is none.
-* The command of a step is the one in force at the sample at its start (zero-order hold). A latency that ends between
-  two samples takes effect at the later one.
-* In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. Here each command of every vehicle is
-  limited to the largest one that satisfies the constraint at the next sample. An impact can leave a negative speed.
-  Clamping it would violate conservation of momentum, so it stays, and brakes bring it to rest from below.
+  and no impact is detected, because the paper assumes that there is no impact.
+* The command of a step is the command in force at its first sample (zero-order hold). If a latency ends between two
+  samples, the command takes effect at the later sample.
+* In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. Here the command of every vehicle is
+  limited so that its speed satisfies the constraint at the next sample. An impact can leave a negative speed. Clamping
+  this speed would violate conservation of momentum, so the map keeps it, and the brakes bring it back to 0.
 
-The paper defines only N = 3. For any N, the pairs are treated once per sample, from the rear pair to the front pair.
-Gaps become negative between a contact and its sample and while vehicles overlap; nothing pushes the vehicles apart.
-Source: the paper, section "Optimization Problem".
+The paper defines the map for N = 3. For any N, the pairs are treated once per sample, from the rear pair to the front
+pair. A gap is negative between a contact and the next sample, and as long as the vehicles overlap; nothing pushes the
+vehicles apart. Source: the paper, section "Optimization Problem".
 """
 
 from __future__ import annotations
@@ -83,9 +83,9 @@ def exchange_at_sample(
 
     Args:
         k: row of the world in all arrays.
-        gaps: [n, P] m.
-        speeds: [n, N] m/s; updated.
-        mass: [n, N] t.
+        gaps: gaps of all pairs, [n, P] m.
+        speeds: speeds of all vehicles, [n, N] m/s; updated.
+        mass: masses of all vehicles, [n, N] t.
         restitution: coefficient of restitution of this world.
         hit: whether a pair has had an impact, [n, P]; updated.
         first_harm: first-impact harm, [n, P] m2/s2; updated.
@@ -114,8 +114,8 @@ def exchange_at_sample(
 def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
     """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
-    u is the command, limited so that the speed ends at standstill or at its limit instead of beyond it. The distance is
-    computed as h times the mean of both speeds, which is the same for constant u. Brakes act against the motion.
+    The command u is limited so that the speed passes neither standstill nor the speed limit. The distance is computed
+    as h times the mean of the speeds at both ends, which is equal for constant u. Brakes act against the motion.
 
     Args:
         speed: speed v at the start, m/s; may be negative after an impact.
@@ -155,9 +155,9 @@ def move_to_grid(
         k: row of the world in all arrays.
         duration: length of the motion, s.
         time: present time, s.
-        gaps: [n, P] m; updated.
-        speeds: [n, N] m/s; updated.
-        command: [n, N] m/s2.
+        gaps: gaps of all pairs, [n, P] m; updated.
+        speeds: speeds of all vehicles, [n, N] m/s; updated.
+        command: commands of all vehicles, [n, N] m/s2.
         latency: time before which commands have no effect, [n, N] s.
         limit: speed up to which each vehicle drives, [n, N] m/s.
 
@@ -177,7 +177,7 @@ def sample_worlds(
     last: Ints, latency: Floats, mass: Floats, limit: Floats, restitution: Floats, first_harm: Floats,
     total_harm: Floats, count: Ints,
 ) -> None:  # fmt: skip
-    """Advance every world by the paper's fixed-step map, from one sample to another, in place.
+    """Advance every world in place by the paper's fixed-step map, from sample ``first`` to sample ``last``.
 
     Sample 0 is at the latency of Vehicle 2. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles``
     under short names; ``gaps``, ``speeds``, ``time`` and ``hit`` are updated.
@@ -185,8 +185,8 @@ def sample_worlds(
     - ``command``: commands, [n, N] m/s2.
     - ``until``: end times, [n] s; used only in a world that ends before sample 0.
     - ``step``: sampling period, s.
-    - ``first``: number of the sample at which each world starts, [n]; -1: before sample 0.
-    - ``last``: number of the sample at which it ends, [n]; -1: before sample 0.
+    - ``first``: number of the sample at which each world starts, [n]; -1 if it starts before sample 0.
+    - ``last``: number of the sample at which each world ends, [n]; -1 if it ends before sample 0.
     - ``first_harm``: first-impact harm, [n, P] m2/s2; updated.
     - ``total_harm``: harm of all impacts, [n, P] m2/s2; updated.
     - ``count``: number of impacts, [n, P]; updated.
@@ -218,29 +218,29 @@ def advance_sampled(
 ) -> tuple[Worlds, Impacts]:
     """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
-    Samples are ``step_s`` apart, the first one at the latency of Vehicle 2. A world ends at its first sample at or
-    after ``until_s``, or at ``until_s`` itself if that is before its first sample. Impacts of the last sample belong to
-    the next call, so calls can be chained; the returned state is the paper's s(n), before these impacts.
-    ``Impacts.rows`` is None. The result of a world does not depend on its batch. Inputs are not changed.
+    The first sample is at the latency of Vehicle 2; samples are ``step_s`` apart. A world ends at its first sample at
+    or after ``until_s``, or at ``until_s`` itself if this is before its first sample. Impacts of the last sample belong
+    to the next call, so calls can be chained. The returned state is the paper's s(n), before the impacts of the last
+    sample. ``Impacts.rows`` is None. The result of a world does not depend on its batch. Inputs are not changed.
 
-    Gaps of the result may be negative: it can be continued here, but not by ``advance``.
+    Gaps of the result may be negative. Continue such worlds with this function and not with ``advance``.
 
     Args:
         worlds: n worlds of N vehicles.
-        command_mps2: commanded acceleration, [n, N] m/s2, ignored before a vehicle's latency.
+        command_mps2: commanded accelerations, [n, N] m/s2; a command has no effect before the vehicle's latency.
         until_s: absolute end time, one number or [n], s.
         step_s: sampling period h, s.
 
     Raises ``InvalidInput`` for a command beyond a vehicle's capacity, an end before a world's time, a step below 1e-6
-    s, a world whose time is between two samples, negative speeds before the first sample, brakes that build up or come
-    in pieces, or an obstacle ahead.
+    s, a world whose time is between two samples, negative speeds before the first sample, brakes that build up, a
+    vehicle that follows a fixed sequence of commands, or an obstacle ahead.
 
     """
     if worlds.obstacle_ahead.any():
         k = int(np.argmax(worlds.obstacle_ahead))
         raise InvalidInput(
             f"advance_sampled: world {k} has an obstacle ahead (obstacle_gap_m = {worlds.obstacle_gap_m[k]:g}); the"
-            " paper's fixed-step map knows none, use advance"
+            " paper's fixed-step map has no obstacle; use advance"
         )
     worlds.refuse_build_up("advance_sampled")
     command = shaped("command_mps2", command_mps2, worlds.speeds_mps.shape)
@@ -256,7 +256,7 @@ def advance_sampled(
 def sample_on(worlds: Worlds, command: Floats, until: Floats, step_s: float) -> Impacts:
     """Advance ``worlds`` in place by the paper's fixed-step map, without checks, and return the impacts.
 
-    Like ``advance_sampled``; ``command_mps2`` of the worlds is not updated.
+    The function works like ``advance_sampled`` but does not update ``command_mps2`` of the worlds.
 
     Args:
         worlds: n worlds of N vehicles; updated.
@@ -290,8 +290,8 @@ def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
     if not good.all():
         k = int(np.argmin(good))
         raise InvalidInput(
-            f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s and cannot be advanced to {until[k]:g} s in 0 to"
-            f" {MOST_STEPS:,} steps of {step_s:g} s"
+            f"advance_sampled: world {k} cannot be advanced from {worlds.time_s[k]:g} s to {until[k]:g} s; this must"
+            f" take 0 to {MOST_STEPS:,} steps of {step_s:g} s"
         )
     start = worlds.vehicles.latency_s[:, 1]
     position = (worlds.time_s - start) / step_s
@@ -301,12 +301,12 @@ def _refuse_unsampled(worlds: Worlds, until: Floats, step_s: float) -> None:
         k = int(np.argmin(good))
         raise InvalidInput(
             f"advance_sampled: world {k} is at {worlds.time_s[k]:g} s, between two of its samples"
-            f" {start[k]:g} s + n * {step_s:g} s; begin at a sample or before the first"
+            f" {start[k]:g} s + n * {step_s:g} s; start at a sample or before the first sample"
         )
     good = ~before[:, np.newaxis] | (worlds.speeds_mps >= 0.0)
     if not good.all():
         k = int(np.argmin(good.all(axis=1)))
         raise InvalidInput(
             f"advance_sampled: world {k} has a negative speed at {worlds.time_s[k]:g} s, before its first sample at"
-            f" {start[k]:g} s; the map knows no impacts before that"
+            f" {start[k]:g} s; the map allows no impacts before the first sample"
         )

@@ -1,7 +1,7 @@
-"""Braking in pieces: from its onset on, a vehicle follows a fixed sequence of commands instead of the given command.
+"""Braking in pieces: after its latency, a vehicle follows a fixed sequence of commands that nothing else can change.
 
-A *piece* is a time interval of constant command. The world is advanced like one with brake build-up, whose rates may be
-infinite.
+A *piece* is a time interval of constant command. A world with pieces is advanced like a world whose brakes build up,
+with rates that may be infinite.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def begin_piece(table: Floats, i: int, now: float) -> None:
-    """Set the command of vehicle ``i`` to that of its piece (interval of constant command) at the time ``now``.
+    """Set the command of vehicle ``i`` to the command of its piece (interval of constant command) at the time ``now``.
 
-    Also writes down when its next piece begins (row NEXT_PIECE). Times are in seconds from the start of the segment.
-    ``table``: one world in the layout of ``physics.rows``.
+    The function also writes the time at which the vehicle's next piece begins (row NEXT_PIECE). Times are in seconds
+    from the start of the segment. ``table``: one world in the layout of ``physics.rows``.
     """
     count = (table.shape[0] - ROW.PIECES) // 2
     table[ROW.NEXT_PIECE, i] = math.inf
@@ -53,9 +53,9 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
     Args:
         table: the world at the end of the segment, in the layout of ``physics.rows``.
         i: column of the vehicle.
-        command: its command in the segment, m/s2.
-        latency_s: time before which its commands have no effect, s.
-        time_s: end of the segment, s, counted like ``latency_s``.
+        command: command of the vehicle in the segment, m/s2.
+        latency_s: time before which the vehicle's commands have no effect, s.
+        time_s: end of the segment, s, on the same clock as ``latency_s``.
 
     """
     acts = command_acts(latency_s, time_s)
@@ -67,10 +67,12 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
 
 @compiled
 def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
-    """Return the force (m/s2) just after a command takes effect: it jumps to the command only if its rate is infinite.
+    """Return the force (m/s2) just after a command takes effect; it equals the command if its rate is infinite.
+
+    The force is the acceleration by brakes or engine. At a finite rate it does not jump.
 
     Args:
-        force: acceleration by brakes or engine just before, m/s2.
+        force: force just before the command takes effect, m/s2.
         wanted: the command, m/s2.
         brake_rate: rate at which the force falls, m/s3.
         release_rate: rate at which the force rises, m/s3.

@@ -1,7 +1,7 @@
-"""The table on which the compiled kernels work, one per world: a row per quantity, a column per vehicle or pair.
+"""The table of one world on which the compiled kernels work: a row per quantity, a column per vehicle or pair.
 
-Rows are named by the constants of ``ROW``: ``table[ROW.SPEED, i]`` is the speed of vehicle i. Column p of a pair's
-quantity is the pair (vehicle p, vehicle p + 1). An obstacle ahead is the vehicle in column 0.
+The constants of ``ROW`` name the rows: ``table[ROW.SPEED, i]`` is the speed of vehicle i. In a row for pairs, column p
+is the pair (vehicle p, vehicle p + 1). If there is an obstacle ahead, it takes column 0 as if it were a vehicle.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from ethbrake_marl.physics.state import Floats, Ints
 class _Rows(NamedTuple):
     """Row numbers of the table of one world: quantities of its vehicles, its pairs and its pooled blocks.
 
-    A *block* is a run of touching vehicles that get one common speed or acceleration. The *force* of a vehicle is the
-    acceleration that its brakes or engine call for.
+    A *block* consists of touching vehicles that get one common speed or acceleration. The *force* of a vehicle is the
+    acceleration that its brakes or engine alone would cause.
     """
 
     # per vehicle
@@ -100,7 +100,7 @@ class _Flags(NamedTuple):
     STUCK: int = 3  # failure: more than BOUND.MOST_EVENTS events
 
     def failure(self, status: Ints, from_s: Floats, until_s: Floats) -> PhysicsError:
-        """Return the error that names every world whose status is not DONE.
+        """Return the error that lists every world whose status is not DONE.
 
         Args:
             status: status of each world, [n].
@@ -108,7 +108,10 @@ class _Flags(NamedTuple):
             until_s: end of each world's segment, [n] s, for the message.
 
         """
-        reasons = {self.PENETRATED: "a contact was missed", self.STUCK: f"more than {BOUND.MOST_EVENTS} events"}
+        reasons = {
+            self.PENETRATED: "a contact was missed",
+            self.STUCK: f"there were more than {BOUND.MOST_EVENTS:,} events",
+        }
         return PhysicsError(
             {
                 k: f"{reasons[int(status[k])]} between {from_s[k]:g} s and {until_s[k]:g} s"
@@ -121,7 +124,7 @@ FLAG = _Flags()
 
 
 class _Listed(NamedTuple):
-    """Column numbers of the list of impacts, an array with one row per impact."""
+    """Column numbers of the array of impacts, which has one row per impact."""
 
     WORLD: int = 0  # number of the world
     PAIR: int = 1  # column of the pair in the table
@@ -147,9 +150,9 @@ def builds_up(table: Floats) -> bool:
 
 @compiled
 def rows_for(pieces: int) -> int:
-    """Return the number of rows of a table for braking in K pieces per vehicle; pass ``pieces`` = 2 K.
+    """Return the number of rows of a table for vehicles that follow K pieces each; ``pieces`` is 2 K.
 
-    A piece is a time interval of constant command. With ``pieces`` = 0 the result is ROW.OF_BUILD_UP.
+    A piece is a time interval of constant command. For ``pieces`` = 0 the result is ROW.OF_BUILD_UP.
     """
     return ROW.PIECES + pieces if pieces > 0 else ROW.OF_BUILD_UP
 
@@ -163,8 +166,8 @@ def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces:
 
     Args:
         table: table to fill, [rows_for(2 K), N or N + 1]; with N + 1 columns, column 0 is an obstacle.
-        brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite: at once.
-        release_rate: rate at which it rises, [N] m/s3; infinite: at once.
+        brake_rate: rate at which each vehicle's force falls, [N] m/s3; infinite if it changes at once.
+        release_rate: rate at which each vehicle's force rises, [N] m/s3; infinite if it changes at once.
         pieces: start (s) and command (m/s2) of each piece, [N, 2 K], as in ``Vehicles.pieces``.
 
     """
@@ -188,8 +191,8 @@ def place_forces(
 ) -> None:  # fmt: skip
     """Write brake and release rates, sequences of commands and present forces of one world's vehicles into its table.
 
-    ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are those of ``place_rates``.
-    Forces are written only if BUILDS_UP is 1.
+    ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are the same as in
+    ``place_rates``. Forces are written only if BUILDS_UP is 1.
     """
     place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:

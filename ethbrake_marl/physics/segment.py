@@ -1,4 +1,4 @@
-"""Advance one world through a segment (an interval of constant commands), from event to event. Compiled."""
+"""Compiled kernels that advance one world through a segment (an interval of constant commands), from event to event."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def advance_table(
 ) -> tuple[int, int]:
     """Advance one world through a segment; return the number of recorded impacts and a status (DONE if successful).
 
-    Writes the harm of the segment to the rows FIRST_HARM, TOTAL_HARM and COUNT.
+    The harm of the segment is written to the rows FIRST_HARM, TOTAL_HARM and COUNT.
 
     Args:
         table: the world in the layout of ``physics.rows``; it is advanced.
         restitution: coefficient of restitution of every impact.
         duration: length of the segment, s.
-        start_s: absolute time at its start, s, for the list of impacts.
-        world: number of the world, for the list of impacts.
-        rows: list of impacts, [capacity, LISTED.WIDTH], filled until it is full; further impacts are only counted.
-        recorded: number of impacts counted so far.
+        start_s: absolute time at the start of the segment, s, for ``rows``.
+        world: number of the world, for ``rows``.
+        rows: array of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
+        recorded: number of impacts before this segment.
 
     """
     if builds_up(table):
@@ -47,9 +47,9 @@ def advance_table(
 def advance_on_cubics(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int
 ) -> tuple[int, int]:
-    """Version of ``advance_table`` for brakes that build up or follow a fixed sequence of commands.
+    """Do the work of ``advance_table`` for brakes that build up or follow a fixed sequence of commands.
 
-    Same arguments and result.
+    The arguments and the result are the same as in ``advance_table``.
     """
     for i in range(table.shape[1]):
         if not command_acts(table[ROW.ONSET, i], duration):
@@ -62,9 +62,9 @@ def _advance(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int,
     building: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Advance one world through a segment, for both kinds of motion; arguments and result of ``advance_table``.
+    """Do the work of ``advance_table`` for both kinds of motion; the arguments and the result are the same.
 
-    Callers pass ``building`` (whether brakes build up) as a constant, so that only one kind is compiled.
+    Callers pass ``building`` (whether brakes build up) as a constant, so only one kind of motion is compiled.
     """
     for p in range(table.shape[1] - 1):
         table[ROW.FIRST_HARM, p] = 0.0
@@ -84,16 +84,16 @@ def _advance(
 
 @compiled(bare=True)
 def move_apart(table: Floats, duration: float, building: bool) -> bool:
-    """Move a world to the end of the segment and return True if no two vehicles can touch; otherwise return False.
+    """Move a world to the end of the segment and return True, or return False if two vehicles may touch.
 
-    In the second case the world does not move. If both vehicles of a pair have constant accelerations, the time of
-    contact decides exactly. Otherwise a bound decides: speeds are monotone within a segment, so a pair closes by at
-    most ``(max rear speed - min front speed) T``.
+    If the result is False, the world has not moved. If both vehicles of a pair have constant accelerations, the time of
+    their contact is computed exactly. Otherwise a bound is used: speeds are monotone within a segment, so a gap shrinks
+    by at most ``(max rear speed - min front speed) T``.
 
     Args:
         table: the world in the layout of ``physics.rows``.
         duration: length T of the segment, s.
-        building: whether its brakes build up, see ``builds_up``.
+        building: whether brakes build up, see ``builds_up``.
 
     """
     if building:
@@ -131,7 +131,7 @@ def start_events(table: Floats, building: bool) -> None:
 
     Args:
         table: the world in the layout of ``physics.rows``.
-        building: whether its brakes build up, see ``builds_up``.
+        building: whether brakes build up, see ``builds_up``.
 
     """
     for i in range(table.shape[1]):
@@ -145,14 +145,15 @@ def start_events(table: Floats, building: bool) -> None:
 def to_next_impact(table: Floats, restitution: float, now: float, duration: float, building: bool) -> tuple[int, float]:
     """Move a world up to and including its next round of impacts, or to the end of the segment.
 
-    Returns a status and the time reached (s): IMPACT (call again), DONE, or the check that failed.
+    Returns a status and the time reached (s). The status is IMPACT (call the function again), DONE, or the code of the
+    check that failed.
 
     Args:
         table: the world in the layout of ``physics.rows``; it is advanced.
         restitution: coefficient of restitution of every impact.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: whether its brakes build up, see ``builds_up``.
+        building: whether brakes build up, see ``builds_up``.
 
     """
     for _ in range(BOUND.MOST_EVENTS):
@@ -168,7 +169,7 @@ def to_next_impact(table: Floats, restitution: float, now: float, duration: floa
 
 @compiled(bare=True)
 def to_next_event(table: Floats, now: float, duration: float, building: bool) -> tuple[bool, float]:
-    """Move a world to its next event or the end of the segment; return whether all is sound, and the time reached (s).
+    """Move a world to its next event or the end of the segment; return whether it succeeded, and the time reached (s).
 
     The first result is False if a gap became negative, which means that a contact was missed.
 
@@ -176,7 +177,7 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
         table: the world in the layout of ``physics.rows``; it is advanced.
         now: present time, counted from the start of the segment, s.
         duration: length of the segment, s.
-        building: whether its brakes build up, see ``builds_up``.
+        building: whether brakes build up, see ``builds_up``.
 
     """
     if building and not built_up(table):
@@ -196,13 +197,13 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
     """Put into effect the commands that begin between ``now`` and ``now + passed``.
 
-    They include the next commands of vehicles that brake by a fixed sequence of commands.
+    This includes the next command of each vehicle that follows a fixed sequence of commands.
 
     Args:
         table: the world in the layout of ``physics.rows``.
         now: time counted from the start of the segment, s.
         passed: length of the interval, s.
-        building: whether its brakes build up, see ``builds_up``.
+        building: whether brakes build up, see ``builds_up``.
 
     """
     for i in range(table.shape[1]):

@@ -10,7 +10,7 @@ L    learners
 F    features of an observation
 ===  =========================================================
 
-Only gaps and speeds are stored: absolute positions would lose precision as the line moves on.
+Worlds store gaps and speeds. Absolute positions would lose precision as the line moves on.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[s
     """Return ``quantities`` with the braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
 
     ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
-    Other fields stay as they are.
+    Other fields are returned unchanged.
     """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
@@ -78,7 +78,7 @@ class Vehicles:
         return f"Vehicles({count_of(n, 'world')} of {N}, masses {_span(self.mass_t)} t)"
 
     def take(self, rows: ArrayLike) -> Vehicles:
-        """Return the vehicles of the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
+        """Return a copy of the vehicles in the worlds selected by ``rows`` (indices or a mask [n])."""
         index = np.asarray(rows)
         return _combined(lambda column: np.ascontiguousarray(column[index]), self)
 
@@ -96,11 +96,11 @@ class Vehicles:
         pieces: Floats | None = None,
         harm_weight: Floats | None = None,
     ) -> Vehicles:
-        """Return vehicles without a channel: each has only its own latency and knows everything from then on.
+        """Return vehicles without a channel: each vehicle knows everything from its own latency on.
 
         Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
-        ``restitution`` is [n], rates are [n, N]. Rates None: a command takes full effect at once. ``pieces`` None: no
-        vehicle follows a fixed sequence of commands. ``harm_weight`` None: everybody's harm weighs 1.
+        ``restitution`` is [n], rates are [n, N]. If a rate is None, commands take full effect at once. If ``pieces`` is
+        None, no vehicle follows a fixed sequence of commands. If ``harm_weight`` is None, every weight of harm is 1.
         """
         known = cls.known_at_once(latency_s)
         at_once = np.full(mass_t.shape, np.inf)
@@ -127,22 +127,22 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """Whether some vehicle of a world has a finite brake or release rate, or a fixed sequence of commands, [n]."""
+        """Whether some vehicle of each world has a finite brake or release rate, or brakes in pieces, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
     @property
     def in_pieces(self) -> Bools:
-        """Whether some vehicle of a world brakes in pieces, that is, by a fixed sequence of commands, [n]."""
+        """Whether some vehicle of each world brakes in pieces, that is, by a fixed sequence of commands, [n]."""
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
-        """Return the commands in which vehicles that brake in pieces follow their current piece, [n, N] m/s2.
+        """Return the commands of all vehicles, [n, N] m/s2; vehicles that brake in pieces follow their current piece.
 
         A piece is a time interval of constant command.
 
         Args:
-            command_mps2: commands of all vehicles, [n, N] m/s2; kept for vehicles without pieces.
+            command_mps2: commands of all vehicles, [n, N] m/s2; returned unchanged for vehicles without pieces.
             time_s: absolute time in each world, [n] s.
 
         """
@@ -156,8 +156,9 @@ class Vehicles:
     def hide_from(self, vehicle: int) -> Bools:
         """Return whether a channel hides part of the line from ``vehicle`` (index from 0) at its first decision, [n].
 
-        Either news of another vehicle has not arrived yet, or another vehicle reacts later than its own latency, which
-        is all that a message reports. Without a channel nothing is hidden.
+        The channel hides something if news of another vehicle has not arrived yet. It also hides something if another
+        vehicle reacts later than its own latency, because messages report only this latency. Without a channel nothing
+        is hidden.
         """
         late = self.latency_s > self.own_latency_s
         hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
@@ -166,7 +167,7 @@ class Vehicles:
 
     @property
     def is_known_at_once(self) -> bool:
-        """Whether every vehicle knows everything from its own latency on: there is no channel, or it has no effect."""
+        """Whether every vehicle knows everything from its own latency on, so that no channel has an effect."""
         if self._is_view:
             return True
         own, latency = self.own_latency_s, self.latency_s
@@ -174,7 +175,7 @@ class Vehicles:
 
     @property
     def _is_view(self) -> bool:
-        """Whether own latency and news share the memory of the latency, as ``at_once`` makes them."""
+        """Whether ``own_latency_s`` and ``known_from_s`` share the memory of ``latency_s``, as after ``at_once``."""
         latency, news = self.latency_s, self.known_from_s
         return self.own_latency_s is latency and news.base is latency and news.strides[1:] == (latency.itemsize, 0)
 
@@ -186,7 +187,7 @@ _WITHOUT_NEWS = _OF_VEHICLES[:-2]
 
 @dataclass(frozen=True, slots=True)
 class Worlds:
-    """State of ``n`` worlds at their times ``time_s``.
+    """State of ``n`` worlds, each at its own time ``time_s``.
 
     >>> import ethbrake_marl as eb
     >>> worlds = eb.make_worlds(
@@ -226,7 +227,7 @@ class Worlds:
         return int(self.speeds_mps.shape[1])
 
     def _each(self, change: Callable[..., NDArray[Any]], *others: Worlds) -> Worlds:
-        """Return new worlds, each field of which is ``change(own field, field of the first of others, ...)``.
+        """Return new worlds whose fields are ``change(field of self, field of others[0], ...)``.
 
         ``change`` takes one array per batch and returns one array: it selects or joins rows.
         """
@@ -239,7 +240,7 @@ class Worlds:
         return Worlds(self.vehicles, *(getattr(self, name).copy() for name in _OF_WORLDS))
 
     def take(self, rows: ArrayLike) -> Worlds:
-        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy."""
+        """Return a copy of the worlds selected by ``rows`` (indices or a mask [n])."""
         index = np.asarray(rows)
         return self._each(lambda column: np.ascontiguousarray(column[index]))
 
@@ -278,12 +279,12 @@ class Worlds:
 
         Args:
             time_s: time since Vehicle 1 began to brake, broadcast to [n], s.
-            gaps_m: bumper to bumper, broadcast to [n, P], m.
-            speeds_mps: broadcast to [n, N], m/s.
+            gaps_m: gaps, bumper to bumper, broadcast to [n, P], m.
+            speeds_mps: speeds, broadcast to [n, N], m/s.
             command_mps2: acceleration in force of each vehicle, broadcast to [n, N], m/s2.
             pair_hit: whether each pair has had an impact, broadcast to [n, P].
 
-        Raises ``InvalidInput`` naming the field and its first bad entry.
+        Raises ``InvalidInput``, with the field and its first invalid entry, for a value out of range.
 
         """
         (n, N), inf = self.speeds_mps.shape, math.inf
@@ -303,8 +304,8 @@ class Worlds:
     def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
         """Return these worlds on a road with this ``friction`` [n]; capacities are at most ``friction * GRAVITY_MPS2``.
 
-        ``dry`` gives new capacities on a dry road, [n, N] by field name, for example ``{"braking_capacity_mps2":
-        array}``; fields that it does not name keep theirs.
+        ``dry``: new capacities on a dry road, a dictionary from field name to [n, N] m/s2, for example
+        ``{"braking_capacity_mps2": array}``. The other capacities on a dry road do not change.
         """
         on_dry = {name: self.dry(name) for name in _ON_ROADS} | dict(dry or {})
         vehicles = replace(self.vehicles, **as_road_allows(on_dry, friction[:, np.newaxis]))
@@ -318,7 +319,7 @@ class Worlds:
         return self.road[:, 0] if self.road.shape[1] else np.full(self.n, np.inf)
 
     def dry(self, name: str) -> Floats:
-        """Return the field ``name`` of ``vehicles``, [n, N]; a braking or driving capacity as it is on a dry road."""
+        """Return the field ``name`` of ``vehicles``, [n, N]; for a capacity, return its value on a dry road."""
         value: Floats = getattr(self.vehicles, name)
         if self.road.shape[1] and name in _ON_ROADS:
             begin = 1 + self.N * _ON_ROADS.index(name)
@@ -328,9 +329,9 @@ class Worlds:
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
         """Return these worlds with some vehicles braking in pieces, that is, by a fixed sequence of commands.
 
-        ``pieces`` maps a vehicle (index from 0) to its sequence of (start, braking): seconds after its latency, 0 for
-        the first piece; and deceleration in m/s2. Vehicles that it does not name do not brake in pieces, nor does a
-        vehicle with a single piece.
+        ``pieces`` maps a vehicle (index from 0) to its sequence of (start, deceleration). The start is in s after the
+        vehicle's latency, 0 for the first piece; the deceleration is in m/s2. All other vehicles, and vehicles with a
+        single piece, do not brake in pieces.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -342,26 +343,26 @@ class Worlds:
         return replace(self, vehicles=replace(self.vehicles, pieces=commands.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a sequence of commands.
+        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or brakes in pieces.
 
-        For callers that have no exact answer in these worlds. ``who`` names the caller in the message.
+        Callers whose results are not exact in such worlds use this check. ``who``: name of the caller in the message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
             raise InvalidInput(
                 f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} brakes in pieces (profile), and"
-                " nothing exact is known for these; give a constant command"
+                " the result would not be exact; use a constant command"
             )
         if slow.any():
             raise InvalidInput(
                 f"{who}: brakes of world {int(np.argmax(slow))} build up (brake_rate_mps3, release_rate_mps3), and"
-                " nothing exact is known for these; leave the rates out"
+                " the result would not be exact; leave these rates out"
             )
 
     def first_decision_s(self, deciders: Sequence[int]) -> Floats:
         """Return the time of the first decision, [n] s: the least latency of the ``deciders``, at least ``time_s``.
 
-        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without deciders it is
+        ``deciders`` are the indices (from 0) of the vehicles that choose their commands. Without deciders the result is
         ``time_s``.
         """
         if len(deciders) == 0:
@@ -369,12 +370,12 @@ class Worlds:
         first: Floats = np.maximum(self.vehicles.latency_s[:, list(deciders)].min(axis=1), self.time_s)
         return first
 
-    # The kernels treat the obstacle ahead of Vehicle 1 as one more vehicle in front, which nothing moves. Everywhere
-    # else the obstacle has columns of its own, so the vehicles keep their indices.
+    # The kernels treat the obstacle ahead of Vehicle 1 as one more vehicle in front, which nothing moves. In the other
+    # modules the obstacle has columns of its own, so the vehicles keep their indices.
 
     @property
     def obstacle_ahead(self) -> Bools:
-        """Whether a world has an obstacle ahead of Vehicle 1, [n]."""
+        """Whether each world has an obstacle ahead of Vehicle 1, [n]."""
         return np.isfinite(self.obstacle_gap_m)
 
     def with_obstacle(self) -> Worlds:
@@ -412,12 +413,12 @@ class Worlds:
         )
 
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
-        """Return these worlds with an obstacle each: their own, or one out of Vehicle 1's reach for ``duration_s`` [n].
+        """Return these worlds with an obstacle in each: its own, or one that is out of reach for ``duration_s`` [n].
 
-        Worlds store gaps and speeds, not places. With the obstacle, the change of its gap is the distance that Vehicle
-        1 travels. An added obstacle changes no motion: it is farther away than ``T sqrt(2 E / m_1)``, the distance that
-        Vehicle 1 would travel in the duration T if it had all the energy E that the line can ever have. Impacts and
-        brakes only remove energy; driving adds at most ``m a v`` per second, and never above the speed limit.
+        The change of the gap to the obstacle is the distance that Vehicle 1 travels, which worlds do not store. An
+        added obstacle changes no motion: it is farther away than ``T sqrt(2 E / m_1)``, the distance that Vehicle 1
+        would travel in the duration T if it had all the energy E that the line can ever have. Impacts and brakes only
+        remove energy. Driving adds at most ``m a v`` per second, and only up to the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -427,9 +428,10 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the batches ``parts``, made alike so that their columns can be joined.
+    """Return the batches ``parts`` with equal columns, so that they can be joined.
 
-    All get columns for equally many pieces of braking; if some have a road, the others get one with infinite friction.
+    All batches get columns for the same number of pieces of braking. If some batches have a road, the other batches get
+    a road with infinite friction.
     """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
@@ -463,7 +465,7 @@ def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _span(values: Floats) -> str:
-    """Format the smallest and largest value; one value if they are equal, ``none`` if there are no values."""
+    """Format the smallest and the largest value; only one value if they are equal, ``none`` without values."""
     if not values.size:
         return "none"
     low, high = float(values.min()), float(values.max())
@@ -471,7 +473,7 @@ def _span(values: Floats) -> str:
 
 
 def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles:
-    """Return new vehicles, each field of which is ``change(field of the first part, field of the second, ...)``.
+    """Return new vehicles whose fields are ``change(field of the first part, field of the second part, ...)``.
 
     ``change`` takes one array per part and returns one array: it selects or joins rows. If no part has a channel,
     ``latency_s``, ``own_latency_s`` and ``known_from_s`` share one memory in the result, as in ``at_once``.
@@ -484,7 +486,7 @@ def _combined(change: Callable[..., NDArray[Any]], *parts: Vehicles) -> Vehicles
 
 
 def sum_rows(values: Floats) -> Floats:
-    """Return ``values.sum(axis=1)`` to the same bits; faster for short rows, which NumPy adds entry by entry."""
+    """Return ``values.sum(axis=1)`` with the same bits, but faster for rows of fewer than 8 entries."""
     if not 0 < values.shape[1] < 8:
         total: Floats = values.sum(axis=1)
         return total
@@ -495,10 +497,10 @@ def sum_rows(values: Floats) -> Floats:
 
 
 def real_numbers(value: ArrayLike) -> Floats:
-    """Return ``value`` as float64, without a copy if it already is.
+    """Return ``value`` as float64, without a copy if it is a float64 array already.
 
-    Raises ``ValueError``, with the reason as its text, for anything that is not a number, even if numpy would convert
-    it: booleans, masked entries, texts, tensors that need gradients or are on another device.
+    Raises ``ValueError``, with the reason as its text, for a value that is not numeric. This includes values that numpy
+    would convert: booleans, masked entries, texts, and tensors that need gradients or are on another device.
     """
     if type(value) is np.ndarray and value.dtype.kind in "fiu":
         return np.asarray(value, np.float64)
@@ -530,7 +532,7 @@ def checked_numbers(name: str, value: ArrayLike) -> Floats:
     try:
         return real_numbers(value)
     except ValueError as error:
-        raise InvalidInput(f"{name} = {value!r}: {error}; must be a number or an array of numbers") from None
+        raise InvalidInput(f"{name}: {value!r} {error}; a number or an array of numbers is needed") from None
 
 
 def make_worlds(
@@ -549,11 +551,11 @@ def make_worlds(
     friction: ArrayLike | None = None,
     harm_weight: ArrayLike = 1.0,
 ) -> Worlds:
-    """Build and check worlds at ``t = 0``; every parameter broadcasts to its full shape.
+    """Build and check worlds at ``t = 0``; every parameter is broadcast to its full shape.
 
     Args:
-        gaps_m: bumper to bumper, [n, P], [P] or one number, m.
-        speeds_mps: [n, N] or [N], m/s.
+        gaps_m: gaps, bumper to bumper, [n, P], [P] or one number, m.
+        speeds_mps: speeds, [n, N] or [N], m/s.
         braking_capacity_mps2: largest deceleration, m/s2, broadcast to [n, N].
         driving_capacity_mps2: largest forward acceleration, m/s2, broadcast to [n, N].
         latency_s: time before which commands have no effect, s, broadcast to [n, N].
@@ -561,20 +563,21 @@ def make_worlds(
         restitution: coefficient of restitution of every impact, in [0, 1], broadcast to [n].
         speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
         brake_rate_mps3: rate at which the acceleration in force falls to a lower command, m/s3, broadcast to [n, N];
-            inf: at once.
-        release_rate_mps3: rate at which it rises to a higher command, m/s3, broadcast to [n, N]; inf: at once.
+            inf: it falls at once.
+        release_rate_mps3: rate at which the acceleration in force rises to a higher command, m/s3, broadcast to [n, N];
+            inf: it rises at once.
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
-        friction: friction of the road, broadcast to [n]; it limits capacities to ``friction * GRAVITY_MPS2``. None: no
-            limit.
+        friction: friction coefficient of the road, broadcast to [n]; it limits capacities to
+            ``friction * GRAVITY_MPS2``. None: no limit.
         harm_weight: weight of each vehicle's harm in the objective ``preference``, at least 0, and at least
             ``LEAST_WEIGHT`` for one vehicle, broadcast to [n, N].
 
-    Raises ``InvalidInput`` with the field, the first invalid entry and the valid range.
+    Raises ``InvalidInput``, with the field, its first invalid entry and the valid range, for an invalid value.
 
     """
     speeds = np.atleast_2d(checked_numbers("speeds_mps", speeds_mps))
     if speeds.ndim != 2 or speeds.shape[1] < 2:
-        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; a line needs at least 2 vehicles, as [n, N]")
+        raise InvalidInput(f"speeds_mps: shape {speeds.shape}; must be [n, N] with at least 2 vehicles")
     gaps = checked_numbers("gaps_m", gaps_m)
     n = speeds.shape[0] if gaps.ndim < 2 else max(speeds.shape[0], gaps.shape[0])
     N = speeds.shape[1]
@@ -593,13 +596,14 @@ def make_worlds(
     nobody = ~(vehicles.harm_weight >= LEAST_WEIGHT).any(axis=1)
     if nobody.any():
         raise InvalidInput(
-            f"harm_weight of world {int(np.argmax(nobody))}: must be at least {LEAST_WEIGHT:g} for one vehicle"
+            f"harm_weight of world {int(np.argmax(nobody))}: the weight of at least one vehicle must be"
+            f" {LEAST_WEIGHT:g} or more"
         )
     speeds = _full("speeds_mps", speeds, (n, N), 0.0, np.inf)
     if not np.all(speeds <= vehicles.speed_limit_mps):
         world, vehicle = np.argwhere(~(speeds <= vehicles.speed_limit_mps))[0]
         raise InvalidInput(
-            f"speeds_mps[{world}, {vehicle}] = {speeds[world, vehicle]:g}: above this vehicle's"
+            f"speeds_mps[{world}, {vehicle}] = {speeds[world, vehicle]:g}: must be at most this vehicle's"
             f" speed_limit_mps {vehicles.speed_limit_mps[world, vehicle]:g}"
         )
     worlds = Worlds(
@@ -633,17 +637,17 @@ def _full(
         name: name of the field, for the message.
         value: number or array.
         shape: shape of the result.
-        low: least valid entry.
+        low: smallest valid entry.
         high: largest valid entry.
-        open_low: ``low`` itself is invalid.
-        finite: infinite entries are invalid.
+        open_low: whether ``low`` itself is invalid.
+        finite: whether infinite entries are invalid.
 
     """
     numbers = checked_numbers(name, value)
     try:
         full = np.array(np.broadcast_to(numbers, shape), dtype=np.float64, order="C")
     except ValueError:
-        raise InvalidInput(f"{name}: shape {numbers.shape} does not fit {shape}") from None
+        raise InvalidInput(f"{name}: shape {numbers.shape}; must be {shape} or broadcast to this shape") from None
     good = (
         (np.isfinite(full) if finite else ~np.isnan(full))
         & (full <= high)

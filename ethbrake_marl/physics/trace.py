@@ -1,4 +1,4 @@
-"""The motion within a segment (an interval of constant commands) as pieces of constant jerk, to draw it exactly."""
+"""The exact motion within a segment (an interval of constant commands) for drawings, as pieces of constant jerk."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _CAPACITY = 64
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
     """Write the state at the start of each piece of constant jerk into ``rows``; return the number of pieces.
 
-    The state is time, gaps, speeds, accelerations and jerks. Pieces that do not fit into ``rows`` are only counted. The
-    number is negative if a contact was missed.
+    The state consists of time, gaps, speeds, accelerations and jerks. Pieces that do not fit into ``rows`` are only
+    counted. The number is negative if a contact was missed.
 
     Args:
         table: one world in the layout of ``physics.rows``; it is advanced.
@@ -62,16 +62,16 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
 
 
 def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
-    """Return the motion of each world until a time, under constant commands: a row per time interval of constant jerk.
+    """Return the motion of each world up to ``until_s`` under constant commands, by intervals of constant jerk.
 
     Args:
         worlds: n worlds of N vehicles; they are not changed.
         command_mps2: commanded accelerations, [n, N] m/s2.
         until_s: end of each segment, [n] s.
 
-    Returns one array [k, 1 + N + 3 N] per world, with a row per interval. Its columns: absolute time at which the
-    interval begins (s), distance that Vehicle 1 has travelled since the segment began (m), then N - 1 gaps (m), N
-    speeds (m/s), N accelerations (m/s2) and N jerks (m/s3).
+    Returns one array [k, 1 + N + 3 N] per world, with a row per interval. The columns are: absolute time at which the
+    interval begins (s), distance that Vehicle 1 has travelled since the segment began (m), N - 1 gaps (m), N speeds
+    (m/s), N accelerations (m/s2) and N jerks (m/s3).
 
     """
     v, N, durations = worlds.vehicles, worlds.N, until_s - worlds.time_s

@@ -1,1 +1,1 @@
-"""Policies as plain files (JSON and safetensors, never a pickle), run without torch."""
+"""Policies, stored as JSON and safetensors files (never a pickle) and run without torch."""

@@ -1,4 +1,4 @@
-"""Run a policy's networks without torch: observations in, actions out."""
+"""Compute a policy's actions from observations, without torch."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.layers import Layers, dense, layers_of, squash
 from ethbrake_marl.policies.network_spec import Float32s, NetworkSpec
 
-BLOCK_ROWS = 256  # worlds computed together, so that activations stay in the cache; does not change results
+BLOCK_ROWS = 256  # number of worlds computed together, so that activations fit the cache; does not change results
 
 
 class Actor:
-    """The deterministic policy: observation [n, F] float32 -> action [n, A] float32 in [-1, 1].
+    """The deterministic policy: observations [n, F] float32 -> actions [n, A] float32 in [-1, 1].
 
-    In a mixture of experts only the selected expert is computed in a row. Inside, arrays are transposed: ``x`` [F,
-    rows] holds one observation per column.
+    In a mixture of experts, only the selected expert is computed for each observation. All methods except ``__call__``
+    take transposed arrays, with one observation per column, [F, rows].
     """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:
         """Take the layers from ``tensors``, which must fit ``spec`` (see ``NetworkSpec.tensors``).
 
-        ``prefix`` stands before the tensors' names if this policy is part of a larger one, for example ``among_1.``.
+        ``prefix`` is the beginning of the tensors' names, for example ``among_1.``, if this policy is part of another
+        policy.
         """
         self.spec = spec
         self._networks = [layers_of(prefix + name, len(spec.policy_hidden), tensors) for name in spec.actors]
@@ -33,9 +34,9 @@ class Actor:
         self._among = [type(self)(each, tensors, f"among_{m}.") for m, each in enumerate(spec.among, 1)]
 
     def __call__(self, observation: Float32s) -> Float32s:
-        """Return the action of each row, [n, A].
+        """Return the action for each observation, [n, A].
 
-        Raises ``InvalidInput`` for a wrong shape, dtype or non-finite entry.
+        Raises ``InvalidInput`` for observations with a wrong shape or dtype, or with an entry that is not finite.
         """
         seen = self._check(observation)
         action = np.empty((seen.shape[0], self.spec.action_size), dtype=np.float32)
@@ -47,17 +48,17 @@ class Actor:
     def choose(self, x: Float32s) -> NDArray[np.int64]:
         """Return the index (from 0) of the expert that the gating network selects for each observation, [rows].
 
-        ``x``: observations, [F, rows].
+        ``x`` are observations, [F, rows].
         """
         chosen: NDArray[np.int64] = self._forward(self._gate, x).argmax(axis=0)
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the action that each row's choice leads to, [1, rows].
+        """Return the action for each observation after output ``choice`` has chosen a policy or an action, [1, rows].
 
         Args:
-            number: index of the choice in each row, [rows]. The first indices are the policies in
-                ``NetworkSpec.among``, whose action is computed; the others are fixed actions.
+            number: index of the choice for each observation, [rows]. The first indices stand for the policies in
+                ``NetworkSpec.among``, the later indices for fixed actions.
             x: observations, [F, rows].
 
         """
@@ -69,7 +70,7 @@ class Actor:
         return actions
 
     def _block(self, x: Float32s) -> Float32s:
-        """Return the actions [A, rows] for observations x [F, rows]."""
+        """Return the actions [A, rows] for the observations ``x`` [F, rows]."""
         if len(self._networks) == 1:
             y = self._forward(self._networks[0], x)
             if self.spec.choices is not None:
@@ -86,7 +87,7 @@ class Actor:
         return y
 
     def _forward(self, layers: Layers, x: Float32s) -> Float32s:
-        """Return the outputs [outputs, rows] of the network with these ``layers``, for inputs x [F, rows]."""
+        """Return the outputs [outputs, rows] of the network with these ``layers`` for the inputs ``x`` [F, rows]."""
         for number, (weight, bias) in enumerate(layers, start=1):
             y = np.empty((weight.shape[0], x.shape[1]), dtype=np.float32)
             dense(weight, bias, x, y)
@@ -103,8 +104,8 @@ class Actor:
         wanted = (observation.shape[0] if observation.ndim else 0, self.spec.observation_size)
         if observation.shape != wanted or observation.dtype != np.float32:
             raise InvalidInput(
-                f"observation: {observation.dtype} of shape {observation.shape};"
-                f" this policy takes float32 [n, {self.spec.observation_size}]"
+                f"observation: is {observation.dtype} of shape {observation.shape}; must be float32 of shape"
+                f" (n, {self.spec.observation_size}) for this policy"
             )
         if not np.isfinite(observation).all():
             row, column = np.argwhere(~np.isfinite(observation))[0]

@@ -1,4 +1,4 @@
-"""Read a policy bundle (a folder with manifest and weights); refuse a damaged one, and one with unknown features."""
+"""Read a policy bundle (a folder with manifest and weights); refuse damaged bundles and unknown features."""
 
 from __future__ import annotations
 
@@ -20,18 +20,20 @@ _LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Load the policy bundle at ``path``: the folder of a bundle, or of a training run (then its ``policy/``).
+    """Load a policy bundle. ``path`` is the folder of the bundle, or of a training run with a folder ``policy/``.
 
-    Raises ``InvalidInput`` if there is none; ``CorruptBundle`` with file and reason if it is damaged.
+    Raises ``InvalidInput`` if there is no bundle, and ``CorruptBundle`` with file and reason if it is damaged.
     """
     if not isinstance(path, str | os.PathLike):
-        raise InvalidInput(f"policy {path!r:.60}: must be the path of a run or of a policy bundle")
+        raise InvalidInput(f"policy = {path!r:.60}: must be the path of a run or of a policy bundle")
     folder = _bundle_folder(Path(path))
     entries = {entry.name for entry in os.scandir(folder)}
     for name in sorted({MANIFEST, WEIGHTS} - entries):
         raise CorruptBundle(f"{folder / name}: is missing")
     for name in sorted(entries - {MANIFEST, WEIGHTS}):
-        raise CorruptBundle(f"{folder / name}: does not belong into a bundle, which is {MANIFEST} and {WEIGHTS} only")
+        raise CorruptBundle(
+            f"{folder / name}: does not belong in a bundle, which has only the files {MANIFEST} and {WEIGHTS}"
+        )
     place = folder / MANIFEST
     data = _read(place)
     try:
@@ -41,15 +43,18 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     own = content_sha256(content)
     if own != manifest.manifest_sha256:
         raise CorruptBundle(
-            f"{place}: its content has SHA-256 {own}, but it says {manifest.manifest_sha256}; it was changed after it"
-            " was saved"
+            f"{place}: the content has SHA-256 {own}, but manifest_sha256 is {manifest.manifest_sha256}; the file was"
+            " changed after it was saved"
         )
     manifest = manifest.model_copy(update={"algorithm": RENAMED.get(manifest.algorithm, manifest.algorithm)})
     _check_observed(place, manifest)
     data = _read(folder / WEIGHTS)
     sha256 = hashlib.sha256(data).hexdigest()
     if sha256 != manifest.weights_sha256:
-        raise CorruptBundle(f"{folder / WEIGHTS}: SHA-256 is {sha256}, the manifest says {manifest.weights_sha256}")
+        raise CorruptBundle(
+            f"{folder / WEIGHTS}: the file has SHA-256 {sha256}, but weights_sha256 in the manifest is"
+            f" {manifest.weights_sha256}"
+        )
     try:
         return Policy(manifest, checked_tensors(data, manifest))
     except ValueError as error:
@@ -64,13 +69,15 @@ def _bundle_folder(path: Path) -> Path:
             raise InvalidInput(f"{str(path)!r:.120}: cannot be read ({error.strerror})") from None
         if exists:
             if folder.is_symlink():
-                raise CorruptBundle(f"{folder}: is a symbolic link; give the folder it points to")
+                raise CorruptBundle(f"{folder}: is a symbolic link; give the folder to which the link points")
             return folder
     members = sorted((path / "policy").glob("vehicle_*"))
     if members:
-        raise InvalidInput(f"{path}: each of its learners has a policy of its own; name one, for instance {members[0]}")
-    reason = "holds no policy" if path.is_dir() else "is not a folder"
-    raise InvalidInput(f"{path}: {reason}; give a policy bundle ({MANIFEST}, {WEIGHTS}) or a run that finished")
+        raise InvalidInput(f"{path}: has one policy for each learner; give the path of one, for instance {members[0]}")
+    reason = "contains no policy" if path.is_dir() else "is not a folder"
+    raise InvalidInput(
+        f"{path}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
+    )
 
 
 def _read(path: Path) -> bytes:
@@ -78,31 +85,31 @@ def _read(path: Path) -> bytes:
 
 
 def _check_observed(path: Path, manifest: Manifest) -> None:
-    """Check that the features that a policy observes are the same today as when it was trained.
+    """Check that the features that a policy observes are the same as at its training.
 
-    ``path``: its manifest file, for messages. Raises ``InvalidInput`` for a registered feature that is missing or was
-    changed; ``CorruptBundle`` for features that this version does not have, or scales differently.
+    ``path`` is the manifest file, for messages. Raises ``InvalidInput`` for a registered feature that is missing or has
+    changed, and ``CorruptBundle`` for features of this package that are missing or have another scaling.
     """
     seen = manifest.observation
     for was in seen.registered:
         of = f"{path}: the policy observes {was.name!r:.80}"
         if was.name not in FEATURES:
             raise InvalidInput(
-                f"{of}, which is not registered; install the package that gives it, or register it first"
-                " (eb.register_feature)"
+                f"{of}, which is not registered; install the package that registers this feature, or register it first"
+                " with eb.register_feature"
             )
         entry = FEATURES[was.name]
         now = {name: getattr(entry.feature, name) for name in ("unit", "scale", "low", "high")}
         for key, value in (now | {"of": entry.of, "unknown": entry.unknown}).items():
             if getattr(was, key) != value:
                 raise InvalidInput(
-                    f"{of}, whose {key} was {getattr(was, key)!r:.60} when it was trained and is {value!r:.60} now;"
-                    " register it as it was, or train again"
+                    f"{of}, whose {key} was {getattr(was, key)!r:.60} in training and is {value!r:.60} now; register"
+                    " the feature as in training, or train again"
                 )
         if len(was.tried) != len(entry.tried) or not np.allclose(was.tried, entry.tried, rtol=1e-6, atol=1e-6):
             raise InvalidInput(
-                f"{of}, whose function gives other numbers than when it was trained; register it as it was, or train"
-                " again"
+                f"{of}, whose function returns other numbers than in training; register the feature as in training, or"
+                " train again"
             )
     with suppress(InvalidInput):  # a feature that no longer exists
         today = ObservationSchema.of(seen.spec)
@@ -110,6 +117,6 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
         if known == today and [each.name for each in seen.registered] == [each.name for each in today.registered]:
             return
     raise CorruptBundle(
-        f"{path}: observation: features or their scaling are not those of this version of the package;"
-        f" use the one it was made with ({manifest.versions.get('ethbrake-marl', 'unknown')}), or train again"
+        f"{path}: observation: features or their scaling differ from this version of the package; use version"
+        f" {manifest.versions.get('ethbrake-marl', 'unknown')}, in which the policy was trained, or train again"
     )

@@ -1,7 +1,7 @@
 """Layers of a network: matrix product and hyperbolic tangent with the same bits in any batch, on any machine.
 
-Vector units and mathematics libraries round ``tanh`` and sums differently, by machine and even by the position of a
-number in an array. Here both are fixed sequences of IEEE operations.
+Mathematics libraries round ``tanh`` and sums differently on different machines, and even at different positions in an
+array. In this module both are fixed sequences of IEEE operations.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from ethbrake_marl.physics.elementary import PER_LN2, exp_rest
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.policies.network_spec import Float32s
 
-_SATURATED = 10.0  # the single-precision result is 1 from 9.02 on
+_SATURATED = 10.0  # above 9.02 tanh is 1 in single precision
 
-_SMALL = 1e-4  # below, x - x^3 / 3 is exact to double precision
+_SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 @compiled
 def squash(values: NDArray[np.float32]) -> None:
     """Replace every entry of ``values`` [k, rows] by its hyperbolic tangent, in place.
 
-    The error is slightly above half a unit in the last place.
+    The error is little more than half a unit in the last place.
     """
     for j in range(values.shape[0]):
         row = values[j]
@@ -52,17 +52,17 @@ def layers_of(name: str, hidden: int, tensors: Mapping[str, Float32s]) -> Layers
 
 @compiled
 def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
-    """Compute one layer of a network, ``y = weight x + bias``, and write it into ``y``; rows are independent.
+    """Compute one layer of a network, ``y = weight x + bias``.
 
-    Inputs are added in groups of four, ``(a + b) + (c + d)``, always in this order, without fused or reordered
-    operations (no fastmath). This halves the rounding error of a plain running sum, and the result does not depend on
-    the other rows.
+    The products are added in groups of four, ``(a + b) + (c + d)``, always in this order, without fused or reordered
+    operations (no fastmath). The rounding error is half that of a running sum. Each column of ``x`` is computed
+    independently.
 
     Args:
-        weight: [O, K] for K inputs and O outputs.
-        bias: [O].
+        weight: weights of K inputs and O outputs, [O, K].
+        bias: bias of each output, [O].
         x: inputs, [K, rows].
-        y: result, [O, rows].
+        y: receives the outputs, [O, rows].
 
     """
     inputs = weight.shape[1]

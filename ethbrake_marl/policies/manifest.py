@@ -23,9 +23,9 @@ _PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "sta
 
 
 def installed_versions() -> dict[str, str]:
-    """Return name -> version of Python, this package and every package that a training's results depend on.
+    """Return name -> version of Python, of this package, and of every package on which training results may depend.
 
-    Packages that have added a part to this process (``registry.versions_used``) are included.
+    This includes packages whose entry points are used in this process (``registry.versions_used``).
     """
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES} | versions_used()
 
@@ -40,20 +40,20 @@ class _Strict(FileModel):
 
 
 class FeatureDefinition(_Strict):
-    """Definition of a registered feature at the time when the policy was trained."""
+    """Definition of a registered feature at the time of the training."""
 
-    name: Annotated[str, Field(max_length=64)]  # name under which it was registered
-    of: Of  # ``own``: of the vehicle itself; ``neighbour``: of a neighbour
+    name: Annotated[str, Field(max_length=64)]  # name under which the feature was registered
+    of: Of  # ``own``: feature of the vehicle itself; ``neighbour``: feature of a neighbour
     unit: str  # unit of the value
     scale: float  # the observed number is clip(value / scale, low, high)
     low: float  # least observed number
     high: float  # largest observed number
     unknown: float  # value for an unknown neighbour, in ``unit``
-    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # its values in a few test worlds
+    tried: Annotated[tuple[float, ...], Field(max_length=64)]  # values of the feature in a few test worlds
 
 
 class ObservationSchema(_Strict):
-    """The observation of the policy: neighbours on each side, feature names in order, and a hash of the scaling."""
+    """Description of an observation: number of neighbours, feature names in order, and a hash of the scaling."""
 
     front: Neighbours  # number of observed neighbours ahead
     rear: Neighbours  # number of observed neighbours behind
@@ -63,7 +63,7 @@ class ObservationSchema(_Strict):
 
     @classmethod
     def of(cls, spec: ObservationSpec) -> Self:
-        """Describe the observation ``spec``, so that a later change of a name, unit, scale or bound is detected."""
+        """Return the description of the observation ``spec``, in which later changes of its features are detected."""
         names = tuple(f.name for f in spec.features)
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
         return cls(
@@ -82,67 +82,68 @@ class ObservationSchema(_Strict):
 
     @property
     def spec(self) -> ObservationSpec:
-        """The observation with these features; raises ``UnknownName`` if one of them does not exist any more."""
+        """The observation with these features; raises ``UnknownName`` if a feature does not exist any more."""
         return choose_observation(self.features)
 
 
 class Manifest(_Strict):
-    """Everything about a policy except its tensors; an action is a fraction of the own capacity, -1 = full braking.
+    """Description of a policy: everything except the tensors.
 
-    Format 3 is for a mixture of experts, 4 for a network that scores actions, 5 for one that also chooses among
-    policies. Any other network keeps format 2, which earlier versions can read.
+    The network determines the format version: 3 for a mixture of experts, 4 for a network that scores actions, 5 for a
+    network that also scores policies, and 2 for any other network.
     """
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"  # marks the file as a manifest
-    format_version: Literal[2, 3, 4, 5] = 2  # depends on the network, see above
+    format_version: Literal[2, 3, 4, 5] = 2  # format version of the network
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]  # name of the training algorithm
     network: NetworkSpec  # sizes and kind of the networks
     observation: ObservationSchema  # features that the policy observes
-    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # meaning of an action
+    action: Literal["fraction_of_own_capacity"] = "fraction_of_own_capacity"  # unit of an action; -1 is full braking
     learners: Annotated[tuple[str, ...], Field(min_length=1)]  # vehicles that the policy learned to control
-    scenario: dict[str, JsonValue]  # scenario of the training, every value
-    reward: dict[str, JsonValue]  # reward of the training, every setting
-    seeds: dict[str, int]  # seeds of the training, by purpose
-    steps: Annotated[int, Field(ge=0)]  # decisions of learners in training
-    versions: dict[str, str]  # package -> version, at the time of training
+    scenario: dict[str, JsonValue]  # all values of the scenario of the training
+    reward: dict[str, JsonValue]  # all settings of the reward of the training
+    seeds: dict[str, int]  # purpose -> seed of the training
+    steps: Annotated[int, Field(ge=0)]  # number of learners' decisions in training
+    versions: dict[str, str]  # package -> version at the time of training
     weights_sha256: Sha256  # hash of the file with the tensors
-    manifest_sha256: Sha256  # hash of all fields above, see ``content_sha256``
+    manifest_sha256: Sha256  # hash of all other fields, see ``content_sha256``
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Manifest:
         network, features, step = self.network, self.observation.features, self.scenario.get("time_step_s")
         if self.format_version != network.format_version:
             raise ValueError(
-                f"format_version: {self.format_version} for {network.networks} networks and output {network.output};"
-                f" must be {network.format_version}"
+                f"format_version = {self.format_version}: must be {network.format_version} with"
+                f" networks = {network.networks} and output {network.output}"
             )
         if len(features) != network.observation_size:
             raise ValueError(
-                f"{len(features)} observation features for a network that takes {network.observation_size}"
+                f"observation.features: has {len(features)} features; must have {network.observation_size}, the"
+                " observation_size of the network"
             )
         if any(name.startswith(("contact.", "contact_far.")) for name in features) and (
             isinstance(step, bool) or not isinstance(step, int | float) or not step > 0.0
         ):
-            raise ValueError(f"scenario: time_step_s = {step!r}; contact features need a number above 0")
+            raise ValueError(f"scenario: time_step_s = {step!r}: must be a number above 0 for contact features")
         for name in self.learners:
             if re.fullmatch(r"vehicle_[1-9][0-9]?", name) is None:
-                raise ValueError(f"learners: {name!r} is no vehicle; vehicles are vehicle_1, vehicle_2, ...")
+                raise ValueError(f"learners: {name!r}: must be a vehicle's name, such as vehicle_2")
         if len(set(self.learners)) < len(self.learners):
-            raise ValueError(f"learners: {', '.join(self.learners)}: each vehicle learns once")
+            raise ValueError(f"learners: {', '.join(self.learners)}: must name each vehicle only once")
         vehicles, roles = self.scenario.get("vehicles"), self.scenario.get("roles")
         for name in self.learners:
             if isinstance(vehicles, int) and int(name.removeprefix("vehicle_")) > vehicles:
-                raise ValueError(f"learners: {name}: the scenario has {vehicles} vehicles")
+                raise ValueError(f"learners: {name}: must be one of the {vehicles} vehicles of the scenario")
             if isinstance(roles, dict) and roles.get(name) != "learner":
-                raise ValueError(f"learners: {name}: does not learn in the scenario's roles")
+                raise ValueError(f"learners: {name}: must be a learner in the scenario's roles")
         return self
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a manifest's plain content, leaving out the key ``manifest_sha256``.
+    """Return the SHA-256 of a manifest's content without the key ``manifest_sha256``.
 
-    The content is written as JSON with sorted keys, no spaces, ASCII. The hash ties names, architecture and weights
-    together and detects accidents and edits; it is not a signature.
+    The content is written as ASCII JSON with sorted keys and without spaces. The hash detects damage and edits of
+    names, architecture or weights; it is not a signature.
     """
     hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
     return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The networks of a policy: their sizes, and the table of their tensors."""
+"""The networks of a policy: sizes, and names and shapes of the tensors."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ class TensorRow(NamedTuple):
     shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """Return the row of this tensor as part of a larger policy: the name becomes ``part.name``."""
+        """Return the row of this tensor as part of another policy, with the name ``part.name``."""
         return self._replace(name=f"{part}.{self.name}")
 
 
 class NetworkSpec(FileModel):
     """The networks of a policy: an actor, and optionally a critic, both multilayer perceptrons on the same observation.
 
-    The action is ``output(actor(observation))`` in [-1, 1]. ``clip`` clips the actor's mean to the bounds (PPO's
-    Gaussian, whose noise is one number per action). ``tanh`` squashes it (SAC's Gaussian, whose noise is a second head
-    of the actor). Without ``value_hidden`` there is no critic: a policy needs none to act.
+    The action is ``output(actor(observation))`` in [-1, 1]. Output ``clip`` clips the actor's mean to [-1, 1] (PPO: a
+    Gaussian with one noise parameter per action). Output ``tanh`` applies tanh to the mean (SAC: a Gaussian whose noise
+    is a second head of the actor). Without ``value_hidden`` there is no critic, which a policy does not need to act.
 
-    ``networks`` above 1 is a mixture of experts: that many actors of this shape, and a gating network with
-    ``gate_hidden`` layers that scores them. The expert with the highest score acts, the first one if scores are equal.
-    The gating network is evaluated at every decision and has no memory. A mixture has neither noise nor critic.
+    With ``networks`` above 1 the policy is a mixture of experts: ``networks`` actors of this shape, and a gating
+    network with ``gate_hidden`` layers, which scores the actors at every decision. The actor with the highest score
+    acts; of equal scores, the first one. A mixture of experts has no noise and no critic.
 
-    Output ``choice`` scores ``choices`` actions, evenly spaced from -1 to 1. The action with the highest score is
-    taken, the lowest one if scores are equal. There is neither noise nor critic. The actor may also score whole
-    policies, ``among``; their scores come before those of the actions, and all of them get the same observation.
+    With output ``choice`` the actor scores ``choices`` actions, evenly spaced from -1 to 1. The action with the highest
+    score is taken; of equal scores, the lowest action. There is no noise and no critic. The actor may also score whole
+    policies (``among``), which get the same observation. The scores of the policies precede the scores of the actions.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
@@ -51,7 +51,7 @@ class NetworkSpec(FileModel):
     policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]  # width of each hidden layer of an actor
     value_hidden: PerhapsHidden  # width of each hidden layer of the critic; empty: no critic
     activation: Activation  # function between the layers
-    output: Literal["clip", "tanh", "choice"]  # what makes an action of the actor's outputs
+    output: Literal["clip", "tanh", "choice"]  # function from the actor's outputs to the action
     # number of actions that output "choice" scores; None for other outputs
     choices: Annotated[int | None, Field(ge=2, le=4096, exclude_if=lambda choices: choices is None)] = None
     # number of actors; above 1: a mixture of experts
@@ -60,32 +60,35 @@ class NetworkSpec(FileModel):
     among: Annotated[tuple[NetworkSpec, ...], Field(max_length=16, exclude_if=not_)] = ()  # policies that are scored
 
     @model_validator(mode="after")
-    def _a_gate_between_several(self) -> NetworkSpec:
+    def _settings_fit(self) -> NetworkSpec:
         if (self.networks > 1) != bool(self.gate_hidden):
             raise ValueError(
-                f"networks = {self.networks} with gate_hidden = {list(self.gate_hidden)}; several need a gate"
+                f"gate_hidden = {list(self.gate_hidden)}: must be given with several networks, and only then; networks"
+                f" = {self.networks}"
             )
         if self.networks > 1 and self.value_hidden:
-            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty beside several networks")
+            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty with several networks")
         if (self.output == "choice") != (self.choices is not None):
             raise ValueError(
-                f"choices = {self.choices} with output {self.output}; output choice needs a number of them"
+                f"choices = {self.choices}: must be a number with output choice, and left out with any other output;"
+                f" output is {self.output}"
             )
         if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
-            raise ValueError("output choice is for one network without a critic, and one action")
+            raise ValueError("output = 'choice': must have one network, no critic, and action_size 1")
         for m, member in enumerate(self.among):
             if self.choices is None or member.among:
-                raise ValueError("among: is for output choice, and its policies choose among no others")
+                raise ValueError("among: must have output choice, and policies without among")
             if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
                 raise ValueError(
                     f"among[{m}]: observation_size and action_size are {member.observation_size} and"
-                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as beside among"
+                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as in the network"
+                    " that chooses"
                 )
         return self
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """First part of the tensor names of each actor: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
+        """Prefix of each actor's tensor names: ``("policy",)``, or ``("network_1", "network_2", ...)``."""
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
@@ -96,16 +99,16 @@ class NetworkSpec(FileModel):
 
     @property
     def format_version(self) -> Literal[2, 3, 4, 5]:
-        """Format version that the manifest of a policy with this network has."""
+        """Format version of a manifest with this network."""
         if self.choices is not None:
             return 5 if self.among else 4
         return 2 if self.networks == 1 else 3
 
     @property
     def tensors(self) -> tuple[TensorRow, ...]:
-        """Name and shape of every tensor in a bundle with this network, all float32.
+        """Name and shape of every float32 tensor in a bundle with this network.
 
-        Weights are [outputs, inputs] as in ``y = W x + b``.
+        The shape of weights is (outputs, inputs), as in ``y = W x + b``.
         """
         actors = [row for name in self.actors for row in self._network(name, self.policy_hidden, self._outputs)]
         if self.networks > 1:
@@ -122,7 +125,7 @@ class NetworkSpec(FileModel):
 
     @property
     def _outputs(self) -> int:
-        """Number of outputs of each actor: its actions, or with output ``choice`` its scores."""
+        """Number of outputs of each actor: size of an action, or with output ``choice`` the number of scores."""
         return self.action_size if self.choices is None else len(self.among) + self.choices
 
     def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:

@@ -15,14 +15,14 @@ from ethbrake_marl.policies.network_spec import Activation, Float32s, NetworkSpe
 
 
 def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mapping[str, Float32s]) -> bytes:
-    """Return the ONNX model of a policy, as bytes; it computes actions and the accelerations that these command.
-
-    Raises ``MissingExtra`` without the package onnx.
+    """Return the ONNX model of a policy, as bytes. The model computes actions and commanded accelerations.
 
     Args:
         manifest: manifest of the policy.
-        observation: its observation, which must contain the own braking and driving capacities.
-        tensors: its tensors, by name.
+        observation: observation of the policy; it must contain the vehicle's braking and driving capacities.
+        tensors: name -> tensor of the policy.
+
+    Raises ``MissingExtra`` if the package onnx is not installed.
 
     """
     with naming_extras():
@@ -44,7 +44,7 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
     bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
 
     def network(name: str, hidden: int, activation: Activation) -> str:
-        """Add the network whose tensors begin with ``name``, from the observation on; return its output's name."""
+        """Add the network whose tensor names begin with ``name``; return the name of its output."""
         x = "observation"
         for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
             weight, bias = (constant(f"{layer}.{part}", tensors[f"{layer}.{part}"]) for part in ("weight", "bias"))
@@ -54,7 +54,7 @@ def onnx_model(manifest: Manifest, observation: ObservationSpec, tensors: Mappin
         return x
 
     def actor(spec: NetworkSpec, prefix: str) -> str:
-        """Add the policy whose tensors begin with ``prefix``; return the name of its actions [n, 1]."""
+        """Add the policy whose tensor names begin with ``prefix``; return the name of its output, actions [n, 1]."""
         outputs = [network(prefix + name, len(spec.policy_hidden), spec.activation) for name in spec.actors]
         x = outputs[0]
         if len(outputs) > 1:  # take the expert that the gating network selects

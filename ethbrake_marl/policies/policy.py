@@ -1,4 +1,4 @@
-"""A policy in memory: its manifest, its tensors and its deterministic action."""
+"""A policy in memory: manifest, tensors and deterministic action."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ WEIGHTS = "weights.safetensors"
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy in memory: manifest, tensors, and ``policy(observation)`` for the deterministic action.
+    """A policy in memory, with manifest and tensors. Calling ``policy(observation)`` returns the deterministic action.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -59,14 +59,14 @@ class Policy:
         return Actor(self.manifest.network, self.tensors)
 
     def __call__(self, observation: Float32s) -> Float32s:
-        """Map observation [n, F] float32 to action [n, A] float32 in [-1, 1]; row k depends on row k alone."""
+        """Return the action [n, A] for the observations [n, F], float32, in [-1, 1]; rows are independent."""
         return self._actor(observation)
 
     @cached_property
     def observation(self) -> ObservationSpec:
-        """The observation that this policy takes, with the time step of the scenario that it was trained on.
+        """The observation that this policy takes, with the time step of its training scenario.
 
-        It is built from the feature names on first use. Raises ``UnknownName`` if a feature does not exist any more.
+        Raises ``UnknownName`` if a feature does not exist any more.
         """
         spec, step = self.manifest.observation.spec, self.manifest.scenario.get("time_step_s")
         return spec.at_steps_of(float(step)) if isinstance(step, int | float) else spec
@@ -82,21 +82,21 @@ class Policy:
 
     @property
     def drivers(self) -> dict[str, Policy]:
-        """Vehicle -> policy for each vehicle that the policy learned to control: ``{"vehicle_2": policy}``."""
+        """Name of each vehicle that the policy learned to control -> this policy: ``{"vehicle_2": policy}``."""
         return dict.fromkeys(self.manifest.learners, self)
 
     @classmethod
     def make(
         cls, tensors: Mapping[str, Float32s], *, observation: ObservationSpec | ObservationSchema, **manifest: Any
     ) -> Self:
-        """Make a policy from tensors and the fields of its manifest; hashes and format are computed.
+        """Make a policy from tensors and the fields of its manifest; hashes and format version are computed.
 
         Args:
             tensors: weights and biases by name, see ``NetworkSpec.tensors``.
             observation: the observation that the networks take.
             **manifest: the other fields of ``Manifest``; ``versions`` defaults to the installed versions.
 
-        Raises ``InvalidInput`` naming the tensor or field that does not fit.
+        Raises ``InvalidInput`` naming the invalid tensor or field.
 
         """
         data = _serialise(tensors)
@@ -115,7 +115,7 @@ class Policy:
 
     @property
     def among(self) -> tuple[Policy, ...]:
-        """The policies that this policy's network chooses among (``NetworkSpec.among``); empty for most policies."""
+        """The policies among which this policy's network chooses (``NetworkSpec.among``); empty for most policies."""
         follows = {"network", "observation", "format_version", "weights_sha256", "manifest_sha256"}
         fields = self.manifest.model_dump(exclude=follows)
         members = []
@@ -127,13 +127,13 @@ class Policy:
 
     @staticmethod
     def stands_in(folder: Path) -> bool:
-        """Return whether ``folder`` contains the files of a policy bundle; they are not read."""
+        """Return whether ``folder`` contains the files of a policy bundle, without reading them."""
         return all((folder / name).is_file() for name in (MANIFEST, WEIGHTS))
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write the bundle as a new folder, completely or not at all; raise ``AlreadyExists`` if the folder exists.
 
-        With ``replace`` an existing folder is deleted once the new one is written.
+        With ``replace``, an existing folder is deleted after the new folder was written.
         """
         own = content_sha256(self.manifest.model_dump(mode="json"))  # keys of older versions are not written
         manifest = self.manifest.model_copy(update={"manifest_sha256": own})
@@ -144,9 +144,10 @@ class Policy:
     def to_onnx(self) -> bytes:
         """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
-        The acceleration is the action times the own braking capacity (action below 0) or driving capacity (above 0),
-        both read from the observation. Results agree with this package's within rounding, not to the bit, because
-        products are summed in another order. Raises ``MissingExtra`` if the package onnx is not installed.
+        The acceleration is the action times the vehicle's braking capacity (action below 0) or driving capacity (action
+        above 0). Both capacities are read from the observation. Results of the ONNX model agree with this package up to
+        rounding errors, because products are summed in another order. Raises ``MissingExtra`` if the package onnx is
+        not installed.
         """
         return onnx_model(self.manifest, self.observation, self.tensors)
 
@@ -156,10 +157,10 @@ def _serialise(tensors: Mapping[str, Float32s]) -> bytes:
 
 
 def checked_tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
-    """Load the tensors of a policy from safetensors ``data``, after checking names and shapes against its ``manifest``.
+    """Load the tensors of a policy from safetensors ``data``: name -> read-only array.
 
-    The result maps names to read-only arrays. Raises ``ValueError`` naming the first tensor that does not fit or is not
-    finite.
+    Raises ``ValueError`` naming the first tensor whose name or shape differs from ``manifest``, or that has an entry
+    that is not finite.
     """
     rows = [ArrayRow(row.name, "F32", row.shape) for row in manifest.network.tensors]
     check_arrays(safetensors_headers(data), rows, "tensor")
@@ -169,6 +170,6 @@ def checked_tensors(data: bytes, manifest: Manifest) -> dict[str, Float32s]:
         raise ValueError(f"not a safetensors file ({error})") from None
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
-            raise ValueError(f"tensor {name!r} holds a number that is not finite")
+            raise ValueError(f"tensor {name!r}: contains a number that is not finite")
         tensor.setflags(write=False)
     return tensors

@@ -1,7 +1,7 @@
-"""Policies that ship with the package, and how they are chosen by name.
+"""Policies that are shipped with the package, loaded by name.
 
-Each is a folder in ``_policies/`` with a bundle and ``card.md``, which says what the policy was trained on, how good it
-is and where it fails.
+Each shipped policy is a folder in ``_policies/`` with a bundle and ``card.md``. The card says in which scenario the
+policy was trained, how good it is, and where it fails.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ _FOLDER = Path(__file__).resolve().parents[1] / "_policies"
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Return name -> folder of the bundle of every shipped policy."""
+    """Return the name of every shipped policy -> folder of its bundle."""
     return {path.parent.name: path.parent for path in sorted(_FOLDER.glob("*/policy"))}
 
 
 def load_shipped(name: str) -> Policy:
-    """Load the shipped policy called ``name``, such as ``universal``; raise ``UnknownName`` with a suggestion."""
+    """Load the shipped policy called ``name``, such as ``universal``; raise ``UnknownName`` for an unknown name."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)
@@ -29,10 +29,10 @@ def load_shipped(name: str) -> Policy:
 
 
 def load_named_policy(name: str) -> Policy:
-    """Load a policy: a shipped one by its name, otherwise from a folder.
+    """Load a shipped policy by its name, or any policy by its path.
 
-    ``name``: a shipped policy's name, or the path of a run or a bundle; a folder called ``ppo`` is written ``./ppo``.
-    Raises what ``load_policy`` raises, and ``UnknownName`` for ``shipped/NAME``, an old spelling.
+    ``name`` is the name of a shipped policy, or the path of a run or a bundle. Write ``./ppo`` for a folder called
+    ``ppo``. Raises the errors of ``load_policy``, and ``UnknownName`` for the old spelling ``shipped/NAME``.
     """
     refuse_shipped_path(name)
     return load_shipped(name) if name in shipped_policies() else load_policy(name)

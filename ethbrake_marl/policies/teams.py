@@ -1,4 +1,4 @@
-"""Policies of several learners that were trained together, one for each: in memory and as a folder of bundles."""
+"""Policies of several learners that were trained together, in memory and as a folder with one bundle per learner."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ethbrake_marl.policies.policy import MANIFEST, Policy
 
 @dataclass(frozen=True)
 class PolicyTeam:
-    """Policies of learners that were trained together, one for each."""
+    """Policies of several learners that were trained together, one policy for each learner."""
 
-    drivers: Mapping[str, Policy]  # vehicle -> policy, front to rear: ``{"vehicle_2": policy, ...}``
+    drivers: Mapping[str, Policy]  # vehicle name -> policy, front to rear: ``{"vehicle_2": policy, ...}``
 
     @property
     def steps(self) -> int:
@@ -25,26 +25,27 @@ class PolicyTeam:
         return next(iter(self.drivers.values())).steps
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-        """Write a folder with one bundle per learner, in ``vehicle_2/`` and so on, each as by ``Policy.save``.
+        """Write a folder with one bundle per learner in subfolders such as ``vehicle_2/``, with ``Policy.save``.
 
-        Raises ``AlreadyExists`` if the folder exists; with ``replace`` it is deleted once the new one is written.
+        Raises ``AlreadyExists`` if the folder exists. With ``replace``, an existing folder is deleted after the new
+        folder was written.
         """
         with new_folder(Path(folder), replace=replace) as partial:
             for name, policy in self.drivers.items():
                 policy.save(partial / name)
 
 
-Trained = Policy | PolicyTeam  # result of a training: one policy for all learners, or one for each
+Trained = Policy | PolicyTeam  # result of a training: one policy for all learners, or one policy for each learner
 
 
 def read_trained(folder: Path) -> Trained:
     """Read the policy or team that ``save`` wrote into ``folder``.
 
-    Raises ``CorruptBundle`` if there is neither, and what ``load_policy`` raises.
+    Raises ``CorruptBundle`` if ``folder`` contains no policy and no team, and the errors of ``load_policy``.
     """
     if (folder / MANIFEST).exists():
         return load_policy(folder)
     names = sorted((path.name for path in folder.glob("vehicle_*")), key=lambda name: int(name.split("_")[1]))
     if not names:
-        raise CorruptBundle(f"{folder}: holds neither a bundle nor one for each learner")
+        raise CorruptBundle(f"{folder}: must contain a policy bundle, or one folder vehicle_... per learner")
     return PolicyTeam({name: load_policy(folder / name) for name in names})

@@ -1,4 +1,4 @@
-"""Scenarios: strict YAML files that describe families of worlds, and reproducible lists of worlds drawn from them."""
+"""Scenarios: YAML files that describe how worlds are drawn, and reproducible lists of worlds drawn from these files."""
 
 from typing import TYPE_CHECKING
 

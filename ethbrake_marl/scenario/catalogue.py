@@ -1,4 +1,4 @@
-"""The catalogue of scenarios. Shipped and registered scenarios are found by name, other files by path."""
+"""The catalogue of scenarios: find shipped and registered scenarios by name, and other scenario files by path."""
 
 from __future__ import annotations
 
@@ -24,21 +24,22 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    It lies in the checkout or in the installed package. Raises ``InvalidInput`` if neither folder exists: the
-    installation is damaged.
+    The folder is in the checkout or in the installed package. Raises ``InvalidInput`` if neither exists.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
         return checkout
     if not installed.is_dir():
         meaning = "recipes" if folder == "train" else folder
-        raise InvalidInput(f"the shipped {meaning} are missing: neither {checkout} nor {installed} exists; reinstall")
+        raise InvalidInput(
+            f"the shipped {meaning} are missing: neither {checkout} nor {installed} exists; reinstall the package"
+        )
     return installed
 
 
 _SUFFIXES = (".yaml", ".yml")
 
-FOLDERS: dict[str, Path] = {}  # path as text -> registered folder
+FOLDERS: dict[str, Path] = {}  # registered folders: path as text -> path
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +47,8 @@ class CatalogueEntry:
     """Name, title and file of a shipped or registered scenario."""
 
     name: str  # name of the scenario
-    title: str  # one line for lists and figures
-    path: Path  # its file
+    title: str  # one-line title for lists and figures
+    path: Path  # path of the scenario's file
     origin: str = "shipped"  # ``shipped``, or the path of the registered folder
 
     @property
@@ -57,17 +58,17 @@ class CatalogueEntry:
 
 
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
-    """Register the scenarios of a folder by name: every ``my-name.yaml`` directly in it becomes ``--scenario my-name``.
+    """Register the scenarios of a folder by name: a file ``my-name.yaml`` in it becomes ``--scenario my-name``.
 
-    A file is checked when it is used. Registering the same folder again changes nothing. Raises ``InvalidInput`` for a
-    folder that is missing or has no such file; ``AlreadyExists`` if one of its names belongs to a shipped scenario or
-    to one of another registered folder.
+    Subfolders are ignored. A file is checked only when it is used. Registering the same folder again changes nothing.
+    Raises ``InvalidInput`` for a folder that does not exist or has no such file, and ``AlreadyExists`` if one of its
+    names belongs to a shipped scenario or to a scenario of another registered folder.
     """
     path = Path(folder).resolve()
     if not path.is_dir():
-        raise InvalidInput(f"scenarios {os.fspath(folder)!r}: there is no such folder")
+        raise InvalidInput(f"folder of scenarios {os.fspath(folder)!r}: does not exist")
     if not _files_of(path):
-        raise InvalidInput(f"scenarios {os.fspath(folder)!r}: no file in it ends in .yaml")
+        raise InvalidInput(f"folder of scenarios {os.fspath(folder)!r}: has no file that ends in .yaml")
     known = str(path) in FOLDERS
     FOLDERS[str(path)] = path
     try:
@@ -81,10 +82,10 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
     """Load a scenario by name, by path of its file, or from a mapping with the content of such a file.
 
-    A ``Scenario`` is returned unchanged. ``scenario_path`` says how names and paths are found.
+    A ``Scenario`` is returned unchanged. The docstring of ``scenario_path`` explains how the file is found.
 
-    Raises ``UnknownName`` with a suggestion for an unknown name; ``InvalidInput`` with file, line, path inside the file
-    and value for a file that does not describe a scenario, or whose ``name`` differs from the file's name.
+    Raises ``UnknownName`` with a suggestion for an unknown name. Raises ``InvalidInput``, which names file, line, key
+    and value, if the file is not a valid scenario or its ``name`` differs from the file's name.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -97,11 +98,11 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
 def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     """Return the path of a scenario's file. If ``name_or_path`` is a path, the file need not exist.
 
-    Text that ends in ``.yaml`` or ``.yml`` is a path. A shipped scenario is found by name, ``stress-wide``; if its name
-    begins with the name of its folder, ``stress/wide`` means the same, unless such a file exists. A registered scenario
-    is found by name. Any other name, ``mine`` or ``my/folder/mine``, means ``mine.yaml`` in ``folder``. Shipped and
-    registered names come first, so a stray file cannot change what a command in a paper means. Raises ``UnknownName``
-    with a suggestion for an unknown name.
+    A text that ends in ``.yaml`` or ``.yml`` is a path. Shipped and registered scenarios are found by name, such as
+    ``stress-wide``. If the name of a shipped scenario begins with the name of its folder, ``stress/wide`` means the
+    same scenario, unless a file of this name exists. Any other name, ``mine`` or ``my/folder/mine``, means the file
+    ``mine.yaml`` or ``my/folder/mine.yaml`` below ``folder``. Shipped and registered names have priority, so other
+    files cannot change the meaning of a command. Raises ``UnknownName`` with a suggestion for an unknown name.
     """
     text = str(name_or_path)
     path = folder / text
@@ -122,16 +123,16 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     raise unknown_name("scenario", text, paths)
 
 
-BENCHMARK = (  # each ships with a table of best known harm, the basis of shares of the possible reduction
+BENCHMARK = (  # scenarios that ship with a table of best known harm, which the share of the possible reduction needs
     *("paper-random", "paper-random-brake-only", "paper-random-obstacle", "paper-delay-high", "paper-distance"),
     *("realistic-motorway", "realistic-mixed", "stress-wide", "cooperation-2-blocked", "cooperation-2-five"),
 )
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped ones such as ``standards``.
+    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios (``standards``).
 
-    The list is empty for any other name.
+    The result is empty for any other name.
     """
     if name == "benchmark":
         return list(BENCHMARK)
@@ -150,9 +151,9 @@ def list_scenarios() -> list[CatalogueEntry]:
 
 
 def _known_paths() -> dict[str, Path]:
-    """Return name -> file of every shipped and registered scenario.
+    """Return the file of every shipped and registered scenario, by name.
 
-    Raise ``AlreadyExists`` if two have the same name.
+    Raise ``AlreadyExists`` if two scenarios have the same name.
     """
     shipped = _shipped_paths()
     known = dict(shipped)
@@ -160,9 +161,7 @@ def _known_paths() -> dict[str, Path]:
         for path in _files_of(folder):
             if path.stem in known:
                 other = "a shipped scenario" if path.stem in shipped else f"{known[path.stem]}"
-                raise AlreadyExists(
-                    f"scenario {path}: {other} has the name {path.stem!r} already; give the file another one"
-                )
+                raise AlreadyExists(f"scenario {path}: {other} already has the name {path.stem!r}; rename the file")
             known[path.stem] = path
     return known
 
@@ -180,8 +179,8 @@ def _load(path: Path) -> Scenario:
     scenario = Scenario.from_document(_with_members(document, path.parent))
     if scenario.name != path.stem:
         raise InvalidInput(
-            f"{document.where(('name',))}: name = {scenario.name}: must be the file's name, {path.stem}"
-            f" (or rename the file to {scenario.name}{path.suffix})"
+            f"{document.where(('name',))}: name = {scenario.name}: must be the file's name without ending,"
+            f" {path.stem}; change the name, or rename the file to {scenario.name}{path.suffix}"
         )
     return scenario
 
@@ -210,10 +209,10 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
     """Return the content of one scenario, with the rows of its table read from the table's file.
 
     Args:
-        document: file that contains the scenario, for messages.
-        at: path of the scenario inside the document; ``()``: all of it.
-        content: the scenario's content.
-        folder: folder that the path of the table's file starts from.
+        document: file that contains the scenario, for error messages.
+        at: path of the scenario (keys and indices) inside the document; ``()``: the whole document is the scenario.
+        content: content of the scenario.
+        folder: folder to which the path of the table's file is relative.
 
     """
     table = content.get("table") if isinstance(content, dict) else None
@@ -221,7 +220,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
         return content
     path, where = Path(table["file"]), document.where((*at, "table", "file"))
     if path.is_absolute() or ".." in path.parts:
-        raise InvalidInput(f"{where}: table.file = {table['file']}: must be a path from the scenario's folder on")
+        raise InvalidInput(f"{where}: table.file = {table['file']}: must be a relative path in the scenario's folder")
     with document.refusing_at((*at, "table", "file")):
         rows = read_rows(folder / path, table.get("columns"), table.get("weights"))
         entries = {key: value for key, value in table.items() if key != "file"}  # the file's name does not matter
@@ -241,19 +240,19 @@ def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:
 
 _HEAD = """\
 # Scenario {name}, started from {based_on}.
-# A quantity is a number, or is drawn for every world:
+# A quantity is a fixed number, or a distribution from which every world draws a value:
 #   {{uniform: [low, high]}}, {{loguniform: [low, high]}}
 #   {{normal: {{mean: 20, sd: 1, low: 18, high: 22}}}}    truncated to [low, high]
-#   {{lognormal: {{median: 1.1, sigma: 0.4, low: 0.3, high: 3}}}}    its logarithm is normal, truncated
+#   {{lognormal: {{median: 1.1, sigma: 0.4, low: 0.3, high: 3}}}}    truncated to [low, high]
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
-# One entry stands for every vehicle (each draws its own value); a list has one entry per vehicle, front to rear.
+# A single entry is for all vehicles, each of which draws its own value. A list has one entry per vehicle.
 """
 
 
 def check_file_name(kind: str, name: str) -> None:
-    """Raise ``InvalidInput`` unless ``name`` is valid for a scenario or recipe, and so for its file.
+    """Raise ``InvalidInput`` unless ``name`` is a valid name of a scenario or recipe and of its file.
 
-    ``kind`` is ``"scenario"`` or ``"recipe"``, for the message.
+    ``kind``: ``"scenario"`` or ``"recipe"``, for the error message.
     """
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
@@ -263,11 +262,11 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
-    """Return a commented YAML file for a new scenario ``name`` with the values of the scenario ``based_on``.
+    """Return the text of a commented YAML file for a new scenario ``name`` with the values of ``based_on``.
 
-    All keys are written out. A key for another way to declare gaps or speeds is included as a comment with an example.
-    Save the text as ``<name>.yaml``. With ``rows_file`` a table refers to this CSV file instead of holding its rows;
-    ``rows_text`` is the file's text. Raises ``InvalidInput`` for an invalid name or an unknown ``based_on``.
+    The text contains every key; a key that ``based_on`` does not use is a comment with an example. Save it as
+    ``<name>.yaml``. If ``rows_file`` is given, a table refers to this CSV file instead of containing its rows;
+    ``rows_text`` returns the content of that file. Raises ``InvalidInput`` for an invalid name or unknown ``based_on``.
     """
     check_file_name("scenario", name)
     base = load_scenario(based_on)
@@ -275,9 +274,9 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
     values = {
         **{key: value for key, value in base_keys.items() if not base.members or key == "mixture"},
         "name": name,
-        "title": "One line for lists and figures",
+        "title": "One-line title for lists and figures",
         "description": "What this scenario is for.",
-        "source": f"Values of {base.name}, to be changed." + f" Its rows: {base.source}" * (base.table is not None),
+        "source": f"Values of {base.name}, to be changed." + f" Its table: {base.source}" * (base.table is not None),
     }
     if base.table is not None and rows_file:
         weights = {} if base.table.weights is None else {"weights": WEIGHT}
@@ -298,7 +297,7 @@ _EXAMPLES = {
     "table": "{file: rows.csv, columns: [gap_1_m, gap_2_m]}",
     "roles": "{vehicle_2: learner}",
     "v2x": "nominal",
-}  # examples for optional keys that are not quantities
+}  # examples of optional keys that are not quantities
 
 
 def _line(key: str, values: Mapping[str, object]) -> str:
@@ -312,7 +311,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry of a mixture's list with a shorter ``scenario``: only the name, if it equals a shipped one."""
+    """Return an entry of a mixture's list; if its scenario equals a shipped one, ``scenario`` is only the name."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry
@@ -323,13 +322,13 @@ def _comment(key: str) -> str:
     if rule is None:
         return str(Scenario.model_fields[key].description)
     other = {**QUANTITY.alternatives, **{new: usual for usual, new in QUANTITY.alternatives.items()}}.get(key)
-    besides = f"; either this or {other}" if other else ""
-    besides = "; only beside line_speed_mps" if key == "speed_deviations_mps" else besides
+    besides = f"; give either this key or {other}" if other else ""
+    besides = "; only together with line_speed_mps" if key == "speed_deviations_mps" else besides
     return f"{rule.meaning}; {rule.interval}{', below horizon_s' if key == 'latency_s' else ''}{besides}"
 
 
 def _value(value: object) -> str:
-    """Format a value for the line of its key; a mapping of texts, such as roles, becomes one line per entry."""
+    """Return the text of a value in a scenario file; a mapping of texts, such as roles, has one line per entry."""
     if isinstance(value, dict) and all(isinstance(entry, str) for entry in value.values()):
         return "".join(f"\n  {key}: {flow_text(entry)}" for key, entry in value.items())
     return f" {flow_text(value)}"

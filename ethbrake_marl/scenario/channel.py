@@ -1,25 +1,26 @@
-"""The channel between vehicles: V2X messages on each link, losses, and on-board sensing as the fall-back.
+"""The channel between vehicles: V2X messages on each link, losses, and sensors that see the neighbours.
 
-A message carries its sender's state, capacities and latency, or the pieces that ``tells`` names. On the link from
-vehicle j to vehicle i, i can use it from this time on:
+A link is the direction from a sending vehicle j to a receiving vehicle i. A message contains the sender's place, speed,
+acceleration, braking capacity, latency and mass, or the items listed in ``tells``. Vehicle i can use the first message
+of vehicle j from this time on, in s after the alert:
 
-    tau_ij = U(0, T) + k T + L_radio + t_proc + t_act        (T the message period)
+    tau_ij = U(0, T) + k T + L_radio + t_proc + t_act
 
-``U(0, T)`` is the wait for the next message. ``k`` is the number of periods lost to a burst (Gilbert-Elliott channel:
-``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)``). On the share ``lost`` of the links no message ever arrives. Sensors see
-the direct neighbours, with a delay of ``sensing_s``, called a hop. Vehicle i can react from
+T is the message period. ``U(0, T)`` is the wait for the next message. ``k`` is the number of periods during which a
+burst of losses destroys every message; in a stationary Gilbert-Elliott channel ``P(k >= m) = (p / (p + r))
+(1 - r)^(m - 1)``. With probability ``lost`` no message ever arrives on a link. Sensors see the direct neighbours after
+a delay drawn from ``sensing_s``, called a *hop*. Vehicle i can react to the emergency from this time on:
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
-on, because nobody reacts to an emergency before learning of it: by Vehicle 1's own message, or by seeing the vehicle
-ahead brake. Vehicle i knows of vehicle j from ``max(latency_i, tau_ij)``, or for a direct neighbour in sight from
-``max(latency_i, hop_ij)`` if that is earlier. Of latencies a vehicle observes only the own parts: delays that the
-channel draws become visible only when they end. Under the preset ``paper``, the paper's rule, a vehicle knows
-everything from its own latency on.
+Before this time it has neither received the message of Vehicle 1 nor seen the vehicle ahead brake. Vehicle i knows the
+state of vehicle j from ``max(latency_i, tau_ij)`` on. If j is a direct neighbour in sight, it knows this state from
+``max(latency_i, hop_ij)`` on if that is earlier. A latency that a vehicle observes is the own latency without delays of
+the channel. Under the preset ``paper`` a vehicle knows everything from its own latency on.
 
-With ``persistence: first`` that is all: from its first message on, the present state of j is known. With ``periodic``
-messages follow every T, each lost or not by the same Gilbert-Elliott channel. What i knows of j is then as old as the
-newest message that arrived (``physics.messages``).
+With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
+periodic``, a message is sent in every period T and may be lost by the same Gilbert-Elliott channel; vehicle i then
+knows the state in the newest message that arrived (``physics.messages``).
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ Senses = Literal["both", "front", "none"]
 
 Persistence = Literal["first", "periodic"]
 
-Tells = tuple[Piece, ...] | Mapping[str, tuple[Piece, ...]]  # for all vehicles, or by name
+Tells = tuple[Piece, ...] | Mapping[str, tuple[Piece, ...]]  # contents of messages: for all vehicles, or by name
 
 Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 
@@ -60,28 +61,32 @@ Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 class Equipage(FileModel):
     """V2X equipment of one vehicle or of a type of vehicles."""
 
-    sends: bool = Field(default=True, description="whether others can hear of it")
-    hears: Hears = Field(default="all", description="whose messages it gets, of those that the channel brings")
+    sends: bool = Field(default=True, description="whether the vehicle sends messages")
+    hears: Hears = Field(
+        default="all",
+        description="senders whose messages the vehicle receives, if the channel delivers them: all, front (vehicles"
+        " ahead) or none",
+    )
 
 
 class Equipped(NamedTuple):
     """V2X equipment of the vehicles in n worlds.
 
-    It has a single row (n = 1) if all worlds share it, or if it says what every vehicle has at least in all worlds.
+    It has a single row (n = 1) if all worlds have the same equipment, or if it is the least equipment in any world.
     """
 
     sends: Bools  # [n, N] whether vehicle i sends messages
-    hears: Ints  # [n, N] whose messages vehicle i gets: 0 everybody's, 1 only those from ahead, 2 nobody's
+    hears: Ints  # [n, N] senders whose messages vehicle i receives: 0 all vehicles, 1 vehicles ahead, 2 none
 
     @classmethod
     def of(cls, equipage: Sequence[Equipage]) -> Equipped:
-        """Return the equipment of one world whose vehicle i has ``equipage[i]``, [1, N]."""
+        """Return the equipment of one world in which vehicle i has the equipment ``equipage[i]``, [1, N]."""
         hears = [get_args(Hears).index(each.hears) for each in equipage]
         return cls(np.array([[each.sends for each in equipage]]), np.array([hears]))
 
     @property
     def unheard(self) -> Bools:
-        """Whether vehicle i never gets a message from vehicle j, [n, N, N]."""
+        """Whether vehicle i (second axis) never receives a message from vehicle j (third axis), [n, N, N]."""
         receiver, sender = np.indices((self.sends.shape[1],) * 2)
         hears = self.hears[:, :, np.newaxis]
         unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
@@ -89,45 +94,48 @@ class Equipped(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """All settings that decide what each vehicle knows, and when; symbols as at the top of this file."""
+    """All settings that determine what each vehicle knows, and when. The module docstring explains the symbols."""
 
-    # delay tau of a link: "latency": none beyond the receiver's own latency; "fixed": link_latency_s; "messages": drawn
-    # from the settings of messages and losses below
+    # how the delay tau of a link arises: "latency": tau is the receiver's own latency; "fixed": tau is link_latency_s;
+    # "messages": tau is drawn with the settings of messages and losses below
     timing: Literal["latency", "fixed", "messages"]
-    hears: Hears = "all"  # whose messages a vehicle receives: everybody's, only from vehicles ahead, nobody's
+    hears: Hears = "all"  # senders whose messages a vehicle receives: all, front (vehicles ahead) or none
     senses: Senses = "both"  # which direct neighbours are in sight
     link_latency_s: float = 0.0  # delay tau of every link for timing "fixed" (s)
     loss_begins: float = 0.0  # p, probability per message period that a burst of losses begins
-    loss_ends: float = 1.0  # r, probability per message period that it ends; mean burst 1 / r periods
-    lost: float = 0.0  # share of links on which no message ever arrives
-    message_period_s: float = 0.1  # T
-    radio_s: float = 0.02  # L_radio
-    processing_s: float = 0.1  # t_proc
-    actuation_s: float = 0.2  # t_act
-    sensing_s: tuple[float, float] = (0.8, 1.1)  # range from which a hop is drawn uniformly
-    persistence: Persistence = "first"  # after the first message, the present is known, or the newest message
-    tells: Tells | None = None  # pieces that a message contains; None: USUAL_PIECES
+    loss_ends: float = 1.0  # r, probability per message period that a burst ends; its mean length is 1 / r periods
+    lost: float = 0.0  # probability that no message ever arrives on a link
+    message_period_s: float = 0.1  # T, time between two messages (s)
+    radio_s: float = 0.02  # L_radio, time of transmission (s)
+    processing_s: float = 0.1  # t_proc, time until the receiver has processed a message (s)
+    actuation_s: float = 0.2  # t_act, time until the receiver's brakes respond (s)
+    sensing_s: tuple[float, float] = (0.8, 1.1)  # range of the uniform distribution of a hop (s)
+    persistence: Persistence = "first"  # known after the first message: the present state, or the newest message
+    tells: Tells | None = None  # items of PIECES that a message contains; None: USUAL_PIECES
 
     def contents(self, vehicles: int) -> Bools | None:
-        """Return whether messages of each vehicle contain each of ``PIECES``, [N, len(PIECES)]; None: as usual."""
+        """Return whether the messages of each vehicle contain each item of ``PIECES``, [N, len(PIECES)].
+
+        Return None if ``tells`` is not given: then the messages contain ``USUAL_PIECES``.
+        """
         if self.tells is None:
             return None
         each: list[tuple[Piece, ...]] = [USUAL_PIECES] * vehicles
         for i in range(vehicles):
             each[i] = self.tells.get(f"vehicle_{i + 1}", each[i]) if isinstance(self.tells, Mapping) else self.tells
-        return np.array([[piece in told for piece in PIECES] for told in each])
+        return np.array([[piece in pieces for piece in PIECES] for pieces in each])
 
     @property
     def delay_s(self) -> float:
-        """Time from sending a message to its use (s); infinite if no messages are sent."""
+        """Time from sending a message until the receiver can use it (s); infinite if no messages are sent."""
         if self.timing == "messages":
             return self.radio_s + self.processing_s + self.actuation_s
         return self.link_latency_s if self.timing == "fixed" else math.inf
 
     def samples(self, time_step_s: float) -> int:
-        """Return how many samples of its state a vehicle stores for delayed messages; 0 without periodic messages.
+        """Return how many samples of its own state a vehicle stores for its messages; 0 without periodic messages.
 
-        ``time_step_s``: time between two samples, which is the time between two decisions (s).
+        ``time_step_s``: time between two decisions (s); a vehicle stores one sample at each decision.
         """
         return Messages.ring_length(self.delay_s, time_step_s) if self.persistence == "periodic" else 0
 
@@ -143,16 +151,18 @@ CHANNELS = {
 
 PRESETS = tuple(CHANNELS)  # names of the built-in presets; ``register_preset`` adds more to CHANNELS
 
-_LATEST = np.array([[1.0, 0.0, 1.0, 1.0]])  # uniform numbers of the latest possible message that is not lost
+_LATEST = np.array(
+    [[1.0, 0.0, 1.0, 1.0]]
+)  # uniform numbers of a link with the largest delay at which a message arrives
 
-_OF_LATER = ("message_period_s", "loss_begins", "loss_ends")  # settings that apply to messages after the first
+_OF_LATER = ("message_period_s", "loss_begins", "loss_ends")  # settings of the messages after the first one
 
 _OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
 
 def _known_preset(name: str) -> str:
     *names, last = CHANNELS
-    require(name in CHANNELS, (), name, f"must be {', '.join(names)} or {last}")
+    require(name in CHANNELS, (), name, f"must be a preset: {', '.join(names)} or {last}")
     return name
 
 
@@ -166,11 +176,14 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 def _pieces(value: Any) -> Tells | None:
-    """Check and sort what messages contain: a list of pieces for all vehicles, or one for each named vehicle."""
+    """Check the value of ``tells`` and return it in the order of ``PIECES``.
+
+    ``value`` is a list of items for all vehicles, or a mapping from vehicle names to such lists.
+    """
     if value is None:
         return None
     by_name = isinstance(value, Mapping)
-    right = f"must be a list of {', '.join(PIECES)}, or such a list for each vehicle by name"
+    right = f"must be a list of items from {', '.join(PIECES)}, or a mapping from vehicle names to such lists"
     require(isinstance(value, list | tuple) or (by_name and len(value) > 0), (), value, right)
     pieces: dict[str, tuple[Piece, ...]] = {}
     for name, listed in value.items() if by_name else [("", value)]:
@@ -179,7 +192,7 @@ def _pieces(value: Any) -> Tells | None:
         for k, piece in enumerate(listed):
             hint = suggestion(piece, PIECES) if isinstance(piece, str) else ""
             require(piece in PIECES, (*at, k), piece, f"{hint}; known: {', '.join(PIECES)}".removeprefix("; "))
-        require(len(set(listed)) == len(listed), at, listed, "names a piece twice")
+        require(len(set(listed)) == len(listed), at, listed, "must not list an item twice")
         pieces[name] = tuple(piece for piece in PIECES if piece in listed)
     return pieces if by_name else pieces[""]
 
@@ -195,52 +208,51 @@ class _TellsSchema:
 class V2X(FileModel):
     """The V2X channel of a scenario: a preset and the settings that differ from it; see ``docs/cooperation.md``.
 
-    In YAML it is written as the preset's name alone, or as a mapping.
+    In YAML, ``v2x`` is the name of a preset or a mapping.
     """
 
-    preset: Preset = Field(
-        default="paper", description="where to start from; the other keys take the place of its values"
-    )
+    preset: Preset = Field(default="paper", description="preset whose values are used for keys that are left out")
     hears: Hears | None = Field(
-        default=None, description="whose messages a vehicle gets: everybody's, only those from ahead, nobody's"
+        default=None, description="senders whose messages a vehicle receives: all, front (vehicles ahead) or none"
     )
-    senses: Senses | None = Field(default=None, description="which direct neighbours are in sight")
+    senses: Senses | None = Field(default=None, description="direct neighbours in sight: both, front or none")
     link_latency_s: Seconds | None = Field(
-        default=None, description="fixed delay of every link, in place of the generated one"
+        default=None, description="fixed delay of every link, instead of a drawn one"
     )
-    lost: Share | None = Field(
-        default=None, description="share of links, not of vehicles, on which nothing ever arrives"
-    )
+    lost: Share | None = Field(default=None, description="share of links (not of vehicles) on which no message arrives")
     message_period_s: Annotated[float, Field(gt=0.0, le=60.0, allow_inf_nan=False)] | None = Field(
         default=None, description="T, time between two messages"
     )
     loss_begins: Share | None = Field(
-        default=None, description="p, chance per message period that a burst of losses begins"
+        default=None, description="p, probability per message period that a burst of losses begins"
     )
     loss_ends: Annotated[float, Field(ge=0.01, le=1.0, allow_inf_nan=False)] | None = Field(
-        default=None, description="r, chance per message period that it ends"
+        default=None, description="r, probability per message period that a burst of losses ends"
     )
-    radio_s: Seconds | None = Field(default=None, description="L_radio, time on the air")
-    processing_s: Seconds | None = Field(default=None, description="t_proc, time until the receiver has read it")
-    actuation_s: Seconds | None = Field(default=None, description="t_act, time until the brakes answer")
+    radio_s: Seconds | None = Field(default=None, description="L_radio, time of transmission")
+    processing_s: Seconds | None = Field(
+        default=None, description="t_proc, time until the receiver has processed a message"
+    )
+    actuation_s: Seconds | None = Field(default=None, description="t_act, time until the receiver's brakes respond")
     sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = Field(
-        default=None, description="[low, high]: the delay of sight, a hop, is drawn evenly from it"
+        default=None, description="[low, high]: range of the uniform delay after which a neighbour is seen (a hop)"
     )
     persistence: Persistence | None = Field(
         default=None,
         exclude_if=not_,
-        description="whether what was once heard stays present, or grows old until the next message",
+        description="what a receiver knows after the first message: first: always the present state of the sender;"
+        " periodic: the state in the newest message that arrived",
     )
     tells: Annotated[Any, BeforeValidator(_pieces), _TellsSchema] = Field(
         default=None,
         exclude_if=lambda tells: tells is None,
-        description="what a message contains, for all vehicles or by name: place, speed, acceleration,"
+        description="contents of messages, for all vehicles or by vehicle name: place, speed, acceleration,"
         " braking_capacity, latency, mass, intent; by default all but intent",
     )
     vehicles: dict[str, Equipage] | None = Field(
         default=None,
         exclude_if=not_,
-        description="vehicle -> what it has of V2X, where that differs: {vehicle_3: {sends: false, hears: none}}",
+        description="V2X equipment of single vehicles that differs: {vehicle_3: {sends: false, hears: none}}",
     )
 
     @model_validator(mode="before")
@@ -254,38 +266,37 @@ class V2X(FileModel):
     def _possible(self) -> V2X:
         channel = self.channel
         sent = channel.hears != "none" and channel.timing != "latency"
-        right = "nobody sends messages one by one here; give a preset that generates them, such as nominal"
+        right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
         self._require(channel.persistence == "first" or sent, "persistence", right)
         if channel.hears == "none":
             self._leave_out(
-                ("link_latency_s", "lost", "vehicles", "tells", *_OF_MESSAGES), "hears none has no messages"
+                ("link_latency_s", "lost", "vehicles", "tells", *_OF_MESSAGES),
+                "hears: none means that no vehicle gets messages",
             )
         elif channel.timing == "fixed":
             later = _OF_LATER if channel.persistence == "periodic" else ()
             parts = tuple(name for name in _OF_MESSAGES if name not in later)
-            self._leave_out(parts, "a fixed link_latency_s has no generated messages")
+            self._leave_out(parts, "link_latency_s fixes the delay of messages")
         elif channel.timing == "latency":
-            self._leave_out((*_OF_MESSAGES, "vehicles"), f"preset {self.preset} has no generated messages")
+            self._leave_out((*_OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
         if channel.senses == "none":
-            self._leave_out(("sensing_s",), "senses none has nobody in sight")
+            self._leave_out(("sensing_s",), "senses: none means that no vehicle is in sight")
         low, high = channel.sensing_s
         self._require(low <= high, "sensing_s", "low must not be above high")
         silent = channel.timing == "messages" or channel.hears == "none" or channel.lost > 0.0
         blind = channel.senses == "none" and silent and channel.timing != "latency"
-        right = (
-            "without sight of the vehicle ahead, one that hears nothing would never react; use senses: both or front"
-        )
+        right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
         # name a key that the user gave: of the presets only paper has senses none
         self._require(not blind, "senses" if self.senses is not None else "lost", right)
         return self
 
     def _leave_out(self, names: tuple[str, ...], why: str) -> None:
-        """Raise an error for the first of the keys ``names`` that is given, because it would have no effect.
+        """Raise an error if one of the keys ``names`` is given although it has no effect.
 
-        ``why`` says the reason in the message.
+        ``why``: reason, for the error message.
         """
         for name in names:
-            self._require(getattr(self, name) is None, name, f"{why}; leave it out")
+            self._require(getattr(self, name) is None, name, f"has no effect, because {why}; leave it out")
 
     def _require(self, holds: bool, name: str, right: str) -> None:
         value = getattr(self, name)
@@ -299,24 +310,24 @@ class V2X(FileModel):
 
     @property
     def channel(self) -> Channel:
-        """The preset's channel with the given settings replaced."""
+        """The channel: the values of the preset, replaced by the settings that are given."""
         values = {name: getattr(self, name) for name in Channel._fields[1:] if getattr(self, name) is not None}
         base = CHANNELS[self.preset]
         return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **values)
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency."""
+        """Whether the channel differs from the paper's rule (a vehicle knows everything after its own latency)."""
         return self.channel != CHANNELS["paper"]
 
     @property
     def delays(self) -> bool:
-        """Whether the channel differs from the paper's rule in more than what messages contain."""
+        """Whether the channel differs from the paper's rule in anything but the contents of messages."""
         return self.channel._replace(tells=None) != CHANNELS["paper"]
 
     @property
     def drawn(self) -> bool:
-        """Whether what is known, and when, is random: it differs from world to world."""
+        """Whether the channel is random: what vehicles know, and when, differs from world to world."""
         channel = self.channel
         low, high = channel.sensing_s
         by_messages = channel.timing == "messages" and channel.hears != "none"
@@ -325,11 +336,11 @@ class V2X(FileModel):
         return self.by_link and (by_messages or lossy or (channel.senses != "none" and low != high))
 
     def latest_reaction_s(self, own_latency_s: Floats, equipped: Equipped) -> Floats:
-        """Return an upper bound of the time at which each vehicle can react, [N] s.
+        """Return an upper bound of the time from which each vehicle can react, [N] s.
 
         Args:
-            own_latency_s: upper bounds of the vehicles' own latencies, without the channel, [N] s.
-            equipped: equipment that the vehicles have at least in every world, [1, N].
+            own_latency_s: upper bounds of the vehicles' own latencies, without delays of the channel, [N] s.
+            equipped: least V2X equipment of the vehicles in any world, [1, N].
 
         """
         channel, latest = self.channel, own_latency_s.copy()
@@ -348,14 +359,14 @@ class V2X(FileModel):
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return these vehicles with the latencies, and the times of first knowledge, that the channel gives them.
+        """Return ``vehicles`` with the latencies and the times of first knowledge that result from the channel.
 
-        The previous latencies, which must be without a channel, become ``own_latency_s``.
+        The previous latencies, which must not include delays of a channel, become ``own_latency_s``.
 
         Args:
-            vehicles: parameters of n worlds.
+            vehicles: parameters of the vehicles in n worlds.
             u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
-            equipped: V2X equipment, of each world or one for all.
+            equipped: V2X equipment, one row per world or one row for all worlds.
 
         """
         (N, channel), (heard, seen) = (vehicles.latency_s.shape[1], self.channel), self.heard_and_seen(u, equipped)
@@ -369,13 +380,13 @@ class V2X(FileModel):
         return replace(vehicles, latency_s=latency, known_from_s=known)
 
     def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return when vehicle i can use the first message of vehicle j, and when i sees j, [n, N, N] s each.
+        """Return (heard, seen): when vehicle i can use the first message of vehicle j, and the delay of seeing j.
 
-        Infinite means never.
+        Both have shape [n, N, N] (world, i, j) and unit s. Infinite means never.
 
         Args:
             u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
-            equipped: V2X equipment, of each world or one for all.
+            equipped: V2X equipment, one row per world or one row for all worlds.
 
         """
         N = equipped.sends.shape[1]
@@ -391,14 +402,14 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return these worlds with what each vehicle knows when, and the columns of periodic messages.
+        """Return ``worlds`` with this channel: times of first knowledge, and the columns of periodic messages.
 
         Args:
             worlds: worlds without a channel, at the alert (time 0).
-            u: uniform numbers for the links, [n, N * N * PER_LINK] in [0, 1).
-            key: seed of each world's later losses, [n] in [0, 1).
-            time_step_s: time between two decisions, at which vehicles sample their states.
-            equipped: V2X equipment, of each world or one for all.
+            u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
+            key: seed of the later message losses of each world, [n] in [0, 1).
+            time_step_s: time between two decisions (s); vehicles sample their states at each decision.
+            equipped: V2X equipment, one row per world or one row for all worlds.
 
         """
         channel, contents = self.channel, self.channel.contents(worlds.N)
@@ -415,21 +426,21 @@ class V2X(FileModel):
         return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
-        """Return worlds from the user with this channel; raise ``InvalidInput`` if the channel is random.
+        """Return worlds of the user with this channel; raise ``InvalidInput`` if the channel is random.
 
         Args:
             worlds: worlds without a channel.
-            time_step_s: time between two decisions, s.
-            where: source of the worlds, for the message.
-            equipped: V2X equipment of the vehicles, one row for all worlds; None: the scenario draws it.
+            time_step_s: time between two decisions (s).
+            where: source of the worlds, for the error message.
+            equipped: V2X equipment of the vehicles, one row for all worlds; None: the equipment is random.
 
         """
         if not self.by_link:
             return worlds
         if self.drawn or equipped is None:
             raise InvalidInput(
-                f"{where}: the scenario draws what each vehicle knows when (v2x: {self.preset}); take one whose channel"
-                " is fixed, for instance scenario.replace(v2x='paper')"
+                f"{where}: the channel of the scenario (v2x: {self.preset}) is random, so worlds of your own need a"
+                " scenario with a fixed channel, for instance scenario.replace(v2x='paper')"
             )
         n, N = worlds.speeds_mps.shape
         return self.with_channel(worlds, np.zeros((n, self.width(N))), np.zeros(n), time_step_s, equipped)
@@ -438,13 +449,13 @@ class V2X(FileModel):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    ``k >= m`` exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``: the inverse distribution function of the stationary
-    Gilbert-Elliott channel. It uses multiplication only, so every machine gets the same k.
+    ``k >= m`` holds exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This is the inverse distribution function of the
+    stationary Gilbert-Elliott channel. It is computed without logarithms, so every machine gets the same k.
 
     Args:
         u: uniform numbers in [0, 1).
-        loss_begins: probability p per message that a good channel turns bad.
-        loss_ends: probability r per message that a bad channel turns good again.
+        loss_begins: probability p per message period that a burst of losses begins.
+        loss_ends: probability r per message period that a burst of losses ends.
 
     """
     bound = loss_begins / (loss_begins + loss_ends)
@@ -458,13 +469,13 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 def link_delays(channel: Channel, u: Floats) -> Floats:
-    """Return the delay tau (s) of each link, [...]; infinite: no message arrives.
+    """Return the delay tau of each link in s, [...]; infinite if no message arrives.
 
-    Minus infinity for timing ``latency``, where only the receiver's own latency counts.
+    For the timing ``latency`` the delay is minus infinity, because only the receiver's own latency counts.
 
     Args:
         channel: settings of the channel.
-        u: uniform numbers in [0, 1) of each link, [..., PER_LINK].
+        u: uniform numbers in [0, 1) for each link, [..., PER_LINK].
 
     """
     delay = np.full(u.shape[:-1], -np.inf if channel.timing == "latency" else channel.link_latency_s)
@@ -479,18 +490,21 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
-    """Register a channel under a name, so that every scenario can use ``v2x: name``.
-
-    Args:
-        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        settings: what ``v2x`` in a scenario would contain, for example ``{"preset": "nominal", "lost": 0.1}``.
+    """Register a channel as a preset, so that every scenario can use it as ``v2x: name``.
 
     Registering the same channel again changes nothing. Raises ``AlreadyExists`` if the name belongs to another channel,
-    ``InvalidInput`` for an invalid name or settings that are not a channel.
+    and ``InvalidInput`` for an invalid name or invalid settings.
+
+    Args:
+        name: name of the preset, 1 to 64 characters ``a-z``, ``0-9``, ``-``, ``_``; the first is a letter or digit.
+        settings: content of ``v2x`` in a scenario, for example ``{"preset": "nominal", "lost": 0.1}``.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise InvalidInput(f"preset {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+        raise InvalidInput(
+            f"preset {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a letter or"
+            " digit"
+        )
     if not isinstance(settings, Mapping):
         raise InvalidInput(f"preset {name!r}: settings = {settings!r:.80}: must be a mapping such as {{'lost': 0.1}}")
     try:
@@ -498,4 +512,4 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
     except ValidationError as error:
         raise explain(Document(f"preset {name!r}", dict(settings), {}), error, Wording(V2X)) from None
     if CHANNELS.setdefault(name, channel) != channel:
-        raise AlreadyExists(f"preset {name!r} is registered already; give another name")
+        raise AlreadyExists(f"preset {name!r}: another channel is already registered under this name; choose another")

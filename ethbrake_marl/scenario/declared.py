@@ -1,4 +1,4 @@
-"""``ScenarioFields``: the fields of a scenario file, and what follows from the fields alone."""
+"""``ScenarioFields``: the fields of a scenario file, their checks, and properties derived from them."""
 
 from __future__ import annotations
 
@@ -39,30 +39,35 @@ from ethbrake_marl.scenario.vehicle_types import (
 
 
 class ScenarioFields(FileModel):
-    """The declared fields of a scenario, and what follows from the declaration alone. See ``Scenario``."""
+    """The fields of a scenario file, their checks, and properties derived from them. Base class of ``Scenario``."""
 
-    name: str = Field(pattern=NAME_PATTERN, description="name; equal to the file's name without .yaml")
-    title: str = Field(default="", description="one line for lists and figures")
+    name: str = Field(pattern=NAME_PATTERN, description="name of the scenario: the file's name without .yaml")
+    title: str = Field(default="", description="one-line title for lists and figures")
     description: str = Field(default="", description="what the scenario is for")
     source: str = Field(default="", description="where the values come from")
-    vehicles: int = Field(default=3, ge=2, le=64, description="number of vehicles N, vehicle_1 in front")
+    vehicles: int = Field(default=3, ge=2, le=64, description="number of vehicles N, with vehicle_1 in front")
     vehicle_types: VehicleTypes | None = Field(
-        default=None, exclude_if=not_, description="what a car, a truck, ... is: type -> weight and quantities"
+        default=None,
+        exclude_if=not_,
+        description="vehicle types by name, such as car and truck: weight and quantities of each type",
     )
     types: Types | None = Field(
         default=None,
         exclude_if=not_,
-        description="which types may stand where: a type, any, or a weight for each; one entry for all or one for each",
+        description="possible types of each vehicle: a type's name, any, or a mapping from types to weights; give one"
+        " entry for all vehicles or a list with one entry per vehicle",
     )
     mixture: Annotated[tuple[Member, ...], Field(strict=False)] | None = Field(
-        default=None, exclude_if=not_, description="scenarios that each world is drawn from one of, by weight"
+        default=None, exclude_if=not_, description="scenarios with weights; each world is drawn from one of them"
     )
     table: Table | None = Field(
-        default=None, exclude_if=not_, description="measured rows of which every world takes one; the rest is drawn"
+        default=None,
+        exclude_if=not_,
+        description="rows of measured values, one of which every world takes; quantities without a column are drawn",
     )
     time_step_s: float = Field(default=0.1, ge=1e-3, allow_inf_nan=False, description="time between two decisions")
     horizon_s: float = Field(
-        default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time after which an episode is cut off"
+        default=8.0, gt=0.0, le=3600.0, allow_inf_nan=False, description="time at which an episode is truncated"
     )
     gaps_m: PerVehicle | None = Field(default=None, description=MEANING["gaps_m"])
     time_gaps_s: PerVehicle | None = Field(default=None, description=MEANING["time_gaps_s"])
@@ -85,7 +90,7 @@ class ScenarioFields(FileModel):
     restitution: Quantity = Field(default=0.1, description=MEANING["restitution"])
     roles: dict[str, Role] = Field(
         default_factory=lambda data: Roles.complete(None, data.get("vehicles", 3)),
-        description="learner or a script for each vehicle; vehicles left out of a given mapping brake fully",
+        description="role of each vehicle: learner, or the name of a script; a vehicle without an entry brakes fully",
     )
     obstacle_gap_m: Quantity | None = Field(default=None, description=MEANING["obstacle_gap_m"])
     obstacle_margin_m: Quantity | None = Field(default=None, description=MEANING["obstacle_margin_m"])
@@ -97,26 +102,32 @@ class ScenarioFields(FileModel):
     harm_weight: PerVehicle | None = Field(default=None, exclude_if=not_, description=MEANING["harm_weight"])
     alert_s: Quantity | None = Field(default=None, exclude_if=not_, description=MEANING["alert_s"])
     follower: Follower | None = Field(
-        default=None, exclude_if=not_, description="one more vehicle behind the line, at the speed of the last one"
+        default=None,
+        exclude_if=not_,
+        description="additional vehicle behind the last vehicle of the line, at the same speed",
     )
     early_impacts: Literal["keep", "reject"] = Field(
-        default="keep", description="what happens to worlds with an impact before the first learner may act"
+        default="keep",
+        description="keep or reject worlds with an impact no later than the time at which the first learner can act",
     )
 
     objective: ObjectiveName | Annotated[tuple[ObjectiveName, ...], Field(strict=False)] = Field(
-        default="total", description="whose harm a reward counts: one for all vehicles, or one for each"
+        default="total",
+        description="whose harm a reward counts: one objective for all vehicles, or a list with one per vehicle",
     )
     observation: ListedFeatures | ListedByVehicle | None = Field(
         default=None,
         exclude_if=not_,
-        description="what vehicles observe, or by name what each does: groups and single features, in this order",
+        description="features and groups of features that a vehicle observes, in this order: one list for all"
+        " vehicles, or a mapping from vehicle names to lists",
     )
     v2x: V2X = Field(
-        default_factory=V2X, description="what each vehicle knows when: a preset, and what differs from it"
+        default_factory=V2X,
+        description="what each vehicle knows, and when: name of a preset, or a mapping with the settings that differ",
     )
 
     _members: tuple[ScenarioFields, ...] = PrivateAttr(default=())
-    _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # columns of the table, by what they give
+    _columns: dict[Entry, TableColumn] = PrivateAttr(default_factory=dict)  # table's columns, by quantity and index
     _recordings: TableColumn | None = PrivateAttr(default=None)
 
     @model_validator(mode="after")
@@ -130,21 +141,23 @@ class ScenarioFields(FileModel):
 
     @classmethod
     def of_dump(cls, content: Mapping[str, Any]) -> Self:
-        """Rebuild a scenario from the result of ``model_dump``, which also writes keys with default values.
+        """Rebuild a scenario from the result of ``model_dump``, which includes keys with default values.
 
-        Raises ``ValueError`` if the content is not a scenario.
+        Raises ``ValueError`` if the content does not describe a scenario.
         """
         usual = {key: (None, field.default) for key, field in cls.model_fields.items()}
 
-        def given(part: Any) -> Any:
+        def without_none(part: Any) -> Any:
             if isinstance(part, Mapping):
-                return {key: given(value) for key, value in part.items() if value is not None}
-            return [given(each) for each in part] if isinstance(part, list | tuple) else part
+                return {key: without_none(value) for key, value in part.items() if value is not None}
+            return [without_none(each) for each in part] if isinstance(part, list | tuple) else part
 
-        usual["v2x"] = None, given(V2X().model_dump(mode="json"))  # next to a mixture it would apply to all members
+        # next to a mixture, the default v2x would apply to all members
+        usual["v2x"] = None, without_none(V2X().model_dump(mode="json"))
 
         def declared(scenario: Mapping[str, Any]) -> dict[str, Any]:
-            values = {key: given(value) for key, value in scenario.items() if given(value) not in usual.get(key, ())}
+            stripped = {key: without_none(value) for key, value in scenario.items()}
+            values = {key: value for key, value in stripped.items() if value not in usual.get(key, ())}
             if "mixture" in values:
                 values["mixture"] = [{**each, "scenario": declared(each["scenario"])} for each in values["mixture"]]
             return values
@@ -156,36 +169,36 @@ class ScenarioFields(FileModel):
     )
     @classmethod
     def _given(cls, value: Any) -> Any:
-        """Refuse ``null`` as the value of a quantity: a key that is not used must be left out."""
+        """Raise an error for ``null`` as the value of a quantity; the key must be left out instead."""
         require(value is not None, (), value, LEAVE_OUT)
         return value
 
     @field_validator(*QUANTITY.needed, mode="before")
     @classmethod
     def _needed(cls, value: Any, info: ValidationInfo) -> Any:
-        """Require a value for a quantity without default, unless every vehicle type or the table gives it.
+        """Raise an error if a quantity that has no default lacks a value.
 
-        A mixture needs none either.
+        No value is needed if every vehicle type, or the table, declares the quantity, or if the scenario is a mixture.
         """
         key, data = str(info.field_name), info.data
         kinds = data.get("vehicle_types")
         without = None if kinds is None else next((k for k, kind in kinds.items() if getattr(kind, key) is None), None)
         if value is not LEFT_OUT:
             require(value is not None, (), value, LEAVE_OUT)
-            require(kinds is None or without is not None, (), value, "every type declares it; leave it out")
+            right = f"must be left out, because every vehicle type declares {key}"
+            require(kinds is None or without is not None, (), value, right)
             return value
         if data.get("mixture") is None and {"vehicle_types", "mixture"} <= data.keys() and not is_tabled(data, key):
             if kinds is None:
                 raise PydanticCustomError("missing", "missing", {"at": ()})
-            right = f"type {without} does not declare it: give it there, or here for every type that does not"
-            require(without is None, (), UNSHOWN, right)
+            require(without is None, (), UNSHOWN, undeclared_by_type(key, without))
         return None
 
     @field_validator("vehicle_types", "types", "mixture", "table", mode="before")
     @classmethod
     def _not_empty(cls, value: Any) -> Any:
         empty = value is None or (isinstance(value, dict | list | tuple) and not value)
-        require(not empty, (), value, "must not be empty; a key that is not used is left out")
+        require(not empty, (), value, "must not be empty; leave the key out if you do not need it")
         return value
 
     @field_validator("types")
@@ -195,24 +208,24 @@ class ScenarioFields(FileModel):
         if not {"vehicles", "vehicle_types"} <= info.data.keys():
             return value
         vehicles, kinds = info.data["vehicles"], info.data["vehicle_types"]
-        require(kinds is not None, (), value, "needs vehicle_types, which says what the types are")
+        require(kinds is not None, (), value, "can be used only with the key vehicle_types, which declares the types")
         listed = isinstance(value, tuple)
-        right = f"has {len(value)} entries; {vehicles} vehicles need {vehicles}, or one for all"
+        right = f"has {len(value)} entries; must have {vehicles}, one per vehicle, or be a single entry for all"
         require(not listed or len(value) == vehicles, (), UNSHOWN, right)
         for index, entry in enumerate(value if listed else (value,)):
             at: YamlPath = (index,) if listed else ()
             names = [entry] if isinstance(entry, str) else list(entry)
-            require(len(names) > 0, at, entry, "must name a type")
+            require(len(names) > 0, at, entry, "must name at least one vehicle type")
             for name in names:
                 hint = suggestion(name, kinds) or f"known: {', '.join(kinds)}"
                 known = name in kinds or (name == ANY and isinstance(entry, str))
-                require(known, at, entry, f"unknown type {name}; {hint}")
+                require(known, at, entry, f"unknown vehicle type {name}; {hint}")
         return value
 
     @field_validator("table")
     @classmethod
     def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Check that every column of the table exists for this line and that its numbers are in range."""
+        """Check that every column of the table is known for this number of vehicles, and its numbers are in range."""
         if value is None or "vehicles" not in info.data:
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
@@ -237,7 +250,7 @@ class ScenarioFields(FileModel):
         listed = isinstance(value, tuple)
         if listed and vehicles is not None:
             count, per = rule.count(vehicles), "one per pair" if rule.per == "pair" else "one per vehicle"
-            right = f"has {len(value)} entries; {vehicles} vehicles need {count} ({per}), or one for all"
+            right = f"has {len(value)} entries; must have {count}, {per}, or be a single entry for all"
             require(len(value) == count, (), UNSHOWN, right)
         for index, entry in enumerate(value if listed else (value,)):
             low, high = support(entry)
@@ -291,7 +304,7 @@ class ScenarioFields(FileModel):
 
     @property
     def members(self) -> tuple[ScenarioFields, ...]:
-        """The scenarios that a mixture consists of; empty for any other scenario."""
+        """The scenarios of a mixture; an empty tuple for a scenario that is not a mixture."""
         return self._members
 
     @cached_property
@@ -306,12 +319,12 @@ class ScenarioFields(FileModel):
 
     @property
     def scripts(self) -> dict[int, str]:
-        """Index (from 0) -> script of every vehicle that does not learn."""
+        """Scripts of the vehicles that do not learn: vehicle index (from 0) -> script."""
         roles = [self.roles[name] for name in self.vehicle_names]
         return {i: role for i, role in enumerate(roles) if role != LEARNER}
 
     def play_pieces(self, worlds: Worlds, driven: Sequence[int] = ()) -> Worlds:
-        """Return these worlds with the pieces of ``profile`` scripts: braking by a fixed sequence of commands.
+        """Return ``worlds`` with the commands of all ``profile`` scripts, which brake by a fixed sequence of commands.
 
         ``driven``: indices (from 0) of controlled vehicles, which follow no script.
         """
@@ -319,26 +332,26 @@ class ScenarioFields(FileModel):
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether there is an obstacle ahead of Vehicle 1; for a mixture: in one of its scenarios or more."""
+        """Whether there is an obstacle ahead of Vehicle 1; for a mixture: in at least one of its scenarios."""
         if self.members:
             return any(member.has_obstacle for member in self.members)
         return self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
 
     @property
     def has_friction(self) -> bool:
-        """Whether the friction of the road is declared; for a mixture: in one of its scenarios or more."""
+        """Whether the friction of the road is declared; for a mixture: in at least one of its scenarios."""
         return any(member.has_friction for member in self.members) or self.declares("friction")
 
     @property
     def builds_up(self) -> bool:
-        """Whether brakes may build up (have a finite rate); for a mixture: in one of its scenarios or more."""
+        """Whether braking builds up or falls at a finite rate; for a mixture: in at least one of its scenarios."""
         own = self.declares("brake_rate_mps3") or self.declares("release_rate_mps3")
         return own or any(member.builds_up for member in self.members)
 
     def declares(self, field: str) -> bool:
         """Return whether the scenario declares the quantity ``field``, for example ``"mass_t"``.
 
-        It may do so under the key itself, in a vehicle type, or for all vehicles in its table.
+        The declaration may be the key itself, a key of a vehicle type, or columns of the table for all vehicles.
         """
         kinds = (self.vehicle_types or {}).values() if field in QUANTITY.of_a_type else ()
         return (
@@ -349,31 +362,31 @@ class ScenarioFields(FileModel):
 
     @property
     def table_entries(self) -> dict[Entry, TableColumn]:
-        """Columns of the scenario's table, ``{("gaps_m", 0): column}`` by quantity and index; empty without one."""
+        """Columns of the scenario's table by quantity and index, ``{("gaps_m", 0): column}``; empty without a table."""
         return self._columns
 
     @property
     def recordings(self) -> TableColumn | None:
-        """Column of the table that says from which recording each row comes; None without one, and for a mixture."""
+        """Table column with the recording of each row; None if the table has no such column, and for a mixture."""
         return self._recordings
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from the paper's rule: a vehicle knows everything after its own latency.
+        """Whether ``v2x`` differs from the paper's rule (a vehicle knows everything once its own latency has elapsed).
 
-        For a mixture: in one of its scenarios or more.
+        For a mixture: whether it differs in at least one of the scenarios.
         """
         return any(member.by_link for member in self.members) or self.v2x.by_link
 
     @property
     def types_of_line(self) -> TypesOfLine | None:
-        """The vehicle types that are possible at each place of the line, and their weights; None without types."""
+        """The possible vehicle types at each place of the line, with their weights; None without vehicle types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     def equipped(self, types: Ints | None = None) -> Equipped:
         """Return the V2X equipment of the vehicles in worlds with these vehicle ``types`` (indices, [n, N]).
 
-        Without ``types``: one row, [1, N], with the equipment that every vehicle has at least, whatever its type.
+        Without ``types`` the result has one row, [1, N]: the least equipment that each vehicle has with any type.
         """
         line, each = self.types_of_line, []
         own = self.v2x.vehicles or {}
@@ -393,9 +406,9 @@ class ScenarioFields(FileModel):
     def possible_quantities(self, field: str) -> tuple[dict[int, AnyTypeQuantity], ...]:
         """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
 
-        For example ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys are indices of the types that are possible
-        there; without types the only one is 0. A type that does not declare the quantity gets the declaration outside
-        the types. Raises like ``quantities``.
+        An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys of a mapping are the indices of the vehicle's
+        possible types; without vehicle types the only key is 0. For a type that does not declare the quantity, the
+        value is the declaration outside the types. Raises the same errors as ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
@@ -412,7 +425,7 @@ class ScenarioFields(FileModel):
     def supports(self, field: str) -> tuple[tuple[float, float], ...]:
         """Return (smallest, largest) value of the quantity ``field`` for each vehicle, pair or world.
 
-        All vehicle types that are possible are considered.
+        The range of a vehicle includes all its possible types.
         """
         supports = []
         for each in self.possible_quantities(field):
@@ -423,34 +436,39 @@ class ScenarioFields(FileModel):
     def quantities(self, field: str) -> tuple[AnyQuantity, ...]:
         """Return the declaration of the quantity ``field``: a number or distribution for each vehicle, pair or world.
 
-        Gaps have one entry per pair; restitution and line speed have one per world. Raises ``InvalidInput`` for a key
-        that this scenario does not use, for example ``gaps_m`` if ``time_gaps_s`` is given.
+        Gaps have one entry per pair; restitution and line speed have one per world. Raises ``InvalidInput`` for a
+        mixture, and for a key that this scenario does not use, for example ``gaps_m`` if it declares ``time_gaps_s``.
         """
         declared: AnyQuantity | tuple[AnyQuantity, ...] | None = getattr(self, QUANTITY.declared[field].name)
         if self.members:
-            raise InvalidInput(f"scenario {self.name!r}: is a mixture; its members say what {field} is")
+            raise InvalidInput(
+                f"scenario {self.name!r}: is a mixture, so its members declare {field}; see Scenario.members"
+            )
         if declared is None and not self.declares(field):
-            raise InvalidInput(f"scenario {self.name!r}: {field} is not given; it is derived, see Scenario.bounds")
+            raise InvalidInput(
+                f"scenario {self.name!r}: does not declare {field}; if {field} follows from other quantities,"
+                " Scenario.bounds gives its range"
+            )
         count = QUANTITY.declared[field].count(self.vehicles)
         entries: tuple[Any, ...] = declared if isinstance(declared, tuple) else (declared,) * count
         return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of a quantity, for each vehicle, pair or world, however it is declared.
+        """Return (smallest, largest) value of a quantity for each vehicle, pair or world, whether declared or derived.
 
         Args:
-            field: key of the quantity as a world has it: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
-            dry: do not limit braking and driving capacities by the friction of the road.
+            field: key of a quantity that every world has: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
+            dry: True: do not limit braking and driving capacities by the friction of the road.
 
         """
         bounds = [world_quantities(member, _supports_of(member)) for member in self.members or (self,)]
-        at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # for members that declare no rate
+        at_once = np.full((2, self.vehicles), QUANTITY.declared[field].high)  # for members that declare no brake rate
         lows, highs = zip(*((each if dry else on_road(each)).get(field, at_once) for each in bounds), strict=True)
         return tuple(zip(np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist(), strict=True))
 
     @property
     def farthest_obstacle_m(self) -> float:
-        """Largest possible distance (m) from Vehicle 1 to an obstacle that is declared by ``obstacle_margin_m``."""
+        """Largest possible distance (m) from Vehicle 1 to the obstacle, if ``obstacle_margin_m`` is declared."""
         positions = on_road(world_quantities(self, _supports_of(self)))
         low, high = ({key: bounds[[row]] for key, bounds in positions.items()} for row in (0, 1))
         slowest = high | {key: low[key] for key in ("braking_capacity_mps2", "brake_rate_mps3") if key in low}
@@ -460,14 +478,15 @@ class ScenarioFields(FileModel):
 
 
 def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]) -> dict[str, Floats]:
-    """Return every quantity of k worlds, [k, entries] each, from the declared ones.
+    """Return every quantity of k worlds by key, [k, entries] each, computed from the declared quantities.
 
-    Derived quantities are ``speed = line speed + own deviation`` and ``gap = time gap x speed of the pair's rear
-    vehicle``. Both increase with their inputs, so bounds of the declared values give bounds of the derived ones.
+    Derived quantities are ``speed = line speed + own deviation``, ``gap = time gap x speed of the pair's rear vehicle``
+    and ``latency = own latency + time of the alert``. All increase with the declared quantities, so bounds of declared
+    values give bounds of derived values.
 
     Args:
         scenario: the scenario that declares the quantities.
-        declared: function of a key such as ``"time_gaps_s"`` that returns its values in the k worlds, [k, entries].
+        declared: function that maps a key such as ``"time_gaps_s"`` to its values in the k worlds, [k, entries].
 
     """
     other = {"gaps_m": scenario.time_gaps_s, "speeds_mps": scenario.line_speed_mps}
@@ -485,10 +504,10 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
 
 
 def on_road(found: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Return the quantities of worlds with capacities limited by friction: at most friction times gravity.
+    """Return ``found`` with braking and driving capacities limited to friction times gravity.
 
-    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. Without friction
-    nothing is limited.
+    ``found`` maps keys such as ``"friction"`` and ``"braking_capacity_mps2"`` to values, [k, entries]. Without the key
+    ``"friction"`` nothing is limited.
     """
     return as_road_allows(found, found["friction"]) if "friction" in found else dict(found)
 
@@ -498,13 +517,14 @@ def obstacle_gap(
 ) -> Floats | None:
     """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
-    The distance is declared, or it is ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin beyond the point where
-    Vehicle 1 stops by full braking.
+    The distance is either declared itself or results from a declared margin, the distance from the point where Vehicle
+    1 stops by full braking to the obstacle: ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``, with speed v_1,
+    latency tau_1 and braking capacity a_1 of Vehicle 1 (for brakes that act at once).
 
     Args:
         scenario: the scenario that declares the obstacle.
-        found: other quantities of these worlds, [k, entries] by key.
-        declared: function of ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` that returns its value in each world, [k].
+        found: the other quantities of these worlds by key, [k, entries] each.
+        declared: function that maps ``"obstacle_gap_m"`` or ``"obstacle_margin_m"`` to its value in each world, [k].
 
     """
     if scenario.declares("obstacle_gap_m"):
@@ -517,5 +537,13 @@ def obstacle_gap(
 
 
 def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Return a function: key of a quantity -> smallest and largest value for each vehicle or pair, [2, entries]."""
+    """Return a function that maps a key to the smallest and largest value for each vehicle or pair, [2, entries]."""
     return lambda key: np.array(scenario.supports(key)).T
+
+
+def undeclared_by_type(key: str, kind: str) -> str:
+    """Return the error message for a quantity ``key`` that the vehicle type ``kind`` does not declare."""
+    return (
+        f"vehicle type {kind} does not declare {key}; declare {key} in this type, or outside vehicle_types for all"
+        " types without it"
+    )

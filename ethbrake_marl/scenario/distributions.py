@@ -1,7 +1,7 @@
-"""A quantity of a scenario: a fixed number, or a declared distribution.
+"""Quantities of a scenario: a quantity is a fixed number or a distribution.
 
-Each distribution is drawn from one uniform number ``u`` in [0, 1), by its inverse cumulative distribution function. So
-a quantity uses exactly one uniform number, whatever its distribution is.
+Every distribution turns one uniform number ``u`` in [0, 1) into a value, by its inverse cumulative distribution
+function.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from ethbrake_marl.files.model import FileModel, refuse, require
 from ethbrake_marl.physics.elementary import exp_each, log, normal_probability, normal_quantile_each
 from ethbrake_marl.physics.state import Floats
 
-LEAVE_OUT = "must be a number or a distribution; a key that is not used is left out"
+LEAVE_OUT = "must be a number or a distribution; leave the key out if you do not need it"
 
-LEAST_MASS = 1e-6  # least probability of a normal distribution within its bounds; below, the inverse loses precision
+# least probability that a value of the untruncated normal distribution lies within the bounds; the inverse
+# distribution function loses precision below
+LEAST_MASS = 1e-6
 
-_LEAST = f"[low, high] must hold at least {LEAST_MASS:g} of the untruncated distribution"
+_LEAST = f"the untruncated distribution must have a probability of at least {LEAST_MASS:g} in [low, high]"
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -33,10 +35,10 @@ Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
 
 
 class _Distribution(FileModel):
-    """Base class of the distributions, such as ``Uniform``, that a scenario file may name for a quantity.
+    """Base class of the distributions that a quantity in a scenario file may have, such as ``Uniform``.
 
-    A subclass declares its parameters as fields, and defines two members: the property ``support``, which is the
-    smallest and largest possible value; and ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
+    A subclass declares its parameters as fields. It also defines the property ``support``, the smallest and largest
+    possible value, and the method ``value(u)``, which turns uniform numbers ``u`` in [0, 1) into values.
     """
 
 
@@ -58,15 +60,15 @@ class Uniform(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape: ``low + (high - low) u``.
 
-        A value is never above high: u is at most 1 - 2^-53, so (high - low) u rounds to less than the rounded high -
-        low.
+        No value is above high. Because u is at most 1 - 2^-53, the rounded product (high - low) u is below the rounded
+        difference high - low.
         """
         low, high = self.uniform
         return low + (high - low) * u
 
 
 class LogUniform(_Distribution):
-    """``{loguniform: [low, high]}``: the logarithm is uniform, so 1 to 2 is as likely as 2 to 4."""
+    """``{loguniform: [low, high]}``: the logarithm of the value is uniform, so 1 to 2 is as likely as 2 to 4."""
 
     loguniform: Pair = Field(description="[low, high], both above 0")
 
@@ -74,7 +76,9 @@ class LogUniform(_Distribution):
     def _ordered(self) -> LogUniform:
         low, high = self.loguniform
         require(low > 0.0, ("loguniform",), self.loguniform, "low must be above 0")
-        require(math.isfinite(high / low), ("loguniform",), self.loguniform, "low must not be so near to 0")
+        require(
+            math.isfinite(high / low), ("loguniform",), self.loguniform, "low is too near to 0: high / low overflows"
+        )
         require(low <= high, ("loguniform",), self.loguniform, "low must not be above high")
         return self
 
@@ -90,9 +94,9 @@ class LogUniform(_Distribution):
 
 
 class NormalShape(_Distribution):
-    """Mean and standard deviation of a normal distribution before truncation, and the bounds of the truncation."""
+    """Parameters of a truncated normal distribution: mean and standard deviation before truncation, and bounds."""
 
-    mean: Number  # before truncation
+    mean: Number  # mean before truncation
     sd: Number  # standard deviation before truncation
     low: Number  # smallest possible value
     high: Number  # largest possible value
@@ -101,7 +105,7 @@ class NormalShape(_Distribution):
 class Normal(_Distribution):
     """``{normal: {mean, sd, low, high}}``: a normal distribution truncated to [low, high]."""
 
-    normal: NormalShape  # its parameters
+    normal: NormalShape  # parameters of the distribution
 
     @model_validator(mode="after")
     def _possible(self) -> Normal:
@@ -113,7 +117,7 @@ class Normal(_Distribution):
         return self
 
     def _bounds(self) -> tuple[float, float]:
-        """Return the probabilities that the untruncated distribution is below low, and below high."""
+        """Return the probabilities that a value of the untruncated distribution is below low, and below high."""
         shape = self.normal
         low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
         return low, high
@@ -126,8 +130,8 @@ class Normal(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``; Q is the normal quantile, p_low and p_high are the
-        probabilities of being below the bounds.
+        A value is ``mean + sd Q(p_low + (p_high - p_low) u)``. Q is the quantile function of the standard normal
+        distribution; p_low and p_high are the probabilities of a value below low and below high before truncation.
         """
         shape = self.normal
         below, above = self._bounds()
@@ -136,19 +140,19 @@ class Normal(_Distribution):
 
 
 class LogNormalShape(_Distribution):
-    """Median and standard deviation of the logarithm, before truncation, and the bounds of the truncation."""
+    """Parameters of a truncated lognormal distribution: median, standard deviation of the logarithm, and bounds."""
 
-    median: Number  # before truncation
+    median: Number  # median before truncation
     sigma: Number  # standard deviation of the logarithm, before truncation
     low: Number  # smallest possible value
     high: Number  # largest possible value
 
 
 class LogNormal(_Distribution):
-    """``{lognormal: {median, sigma, low, high}}``: the logarithm is normal; truncated to [low, high]."""
+    """``{lognormal: {median, sigma, low, high}}``: a lognormal distribution truncated to [low, high]."""
 
-    lognormal: LogNormalShape  # its parameters
-    _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm
+    lognormal: LogNormalShape  # parameters of the distribution
+    _of_logarithm: Normal = PrivateAttr()  # distribution of the logarithm of a value
 
     @model_validator(mode="after")
     def _possible(self) -> LogNormal:
@@ -171,22 +175,22 @@ class LogNormal(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        A value is ``exp(x)``; x has the truncated normal distribution of the logarithm.
+        A value is ``exp(x)``, where x has a normal distribution truncated to [log(low), log(high)].
         """
         drawn = exp_each(self._of_logarithm.value(u).ravel()).reshape(u.shape)
         return np.clip(drawn, *self.support)
 
 
 class Choice(_Distribution):
-    """``{choice: [a, b, ...]}``: one of these values, with equal probability or in proportion to ``weights: [...]``."""
+    """``{choice: [a, b, ...]}``: one of the listed values, equally likely or in proportion to ``weights: [...]``."""
 
     choice: Numbers  # the possible values
-    weights: Numbers | None = None  # weight of each value; None: equal
+    weights: Numbers | None = None  # weight of each value; None: all values are equally likely
 
     @model_validator(mode="after")
     def _weighted(self) -> Choice:
         if self.weights is not None:
-            fits = f"must have as many entries as choice, {len(self.choice)}"
+            fits = f"must have as many entries as choice ({len(self.choice)})"
             require(len(self.weights) == len(self.choice), ("weights",), self.weights, fits)
             positive = all(w > 0.0 for w in self.weights) and math.isfinite(sum(self.weights))
             require(positive, ("weights",), self.weights, "every weight must be above 0, and their sum finite")
@@ -200,7 +204,7 @@ class Choice(_Distribution):
     def value(self, u: Floats) -> Floats:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        It is the first entry whose cumulative weight (of a total of 1) is above u.
+        A value is the first entry of ``choice`` whose cumulative weight, normalised to a total of 1, is above u.
         """
         cumulative = np.cumsum(np.asarray(self.weights or (1.0,) * len(self.choice)))
         cumulative /= cumulative[-1]
@@ -209,11 +213,11 @@ class Choice(_Distribution):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class TableColumn:
-    """A column of a scenario's table of measured values; every world takes one row of the table, by weight."""
+    """A column of a scenario's table of measured values; every world takes one row of the table, drawn by weight."""
 
     name: str  # name of the column, such as ``gap_1_m``
-    rows: NDArray[Any] = data_field(compare=False)  # [rows] value in each row of the table; a text if it is a recording
-    cumulative: Floats = data_field(compare=False)  # [rows] cumulative weight of the rows, up to 1
+    rows: NDArray[Any] = data_field(compare=False)  # [rows] value in each row; texts in the column ``recording``
+    cumulative: Floats = data_field(compare=False)  # [rows] cumulative weight of the rows; the last one is 1
 
     def __repr__(self) -> str:
         return f"column {self.name} of the table"
@@ -225,7 +229,7 @@ class TableColumn:
 
     @property
     def middle(self) -> TableColumn:
-        """Column whose only row is the weighted median of this column."""
+        """A column with a single row: the weighted median of this column."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))
@@ -233,15 +237,15 @@ class TableColumn:
     def value(self, u: Floats) -> NDArray[Any]:
         """Return the values drawn by uniform numbers ``u`` in [0, 1), in the same shape.
 
-        It is the value of the first row whose cumulative weight is above u.
+        A value comes from the first row whose cumulative weight is above u.
         """
         return self.rows[np.searchsorted(self.cumulative, u, side="right")]
 
 
 def _kind(value: object) -> str | None:
-    """Return the tag of the kind of ``Quantity`` that a value from a file means, such as ``"#uniform"``.
+    """Return the tag of the class in ``Quantity`` that checks a value from a file, such as ``"#uniform"``.
 
-    None for a list, or a mapping without a known distribution. The tag decides which error messages are shown.
+    Return None for a list, or for a mapping without a known distribution.
     """
     if isinstance(value, _Distribution):
         return f"#{type(value).__name__.lower()}"
@@ -265,13 +269,15 @@ Quantity = Annotated[
 
 
 class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``, in a vehicle type only: a linear function of the vehicle's load, from 0 to 1.
+    """``{with_load: [empty, full]}``: a linear function of the vehicle's load (0 to 1); allowed in vehicle types only.
 
-    ``spread`` is a distribution around 0 of a random amount that each vehicle adds.
+    ``spread`` is the distribution, around 0, of a random amount that is added to each vehicle's value.
     """
 
-    with_load: Pair = Field(description="[empty, full]: at load 0 and at load 1")
-    spread: Quantity = Field(default=0.0, exclude_if=not_, description="what each vehicle adds to it by chance")
+    with_load: Pair = Field(description="[empty, full]: value at load 0, value at load 1")
+    spread: Quantity = Field(
+        default=0.0, exclude_if=not_, description="distribution around 0 of a random amount that is added to the value"
+    )
 
     @field_validator("spread")
     @classmethod
@@ -287,9 +293,9 @@ class WithLoad(_Distribution):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return ``empty + (full - empty) load``, plus the random amount that the uniform numbers ``u`` give.
+        """Return ``empty + (full - empty) load``, plus the random amount that the uniform numbers ``u`` draw.
 
-        ``load`` in [0, 1] and ``u`` in [0, 1) have the same shape, as has the result.
+        ``load`` in [0, 1], ``u`` in [0, 1) and the result have the same shape.
         """
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))

@@ -1,4 +1,4 @@
-"""``Follower``: one more vehicle behind the line of a scenario, at the speed of the last one."""
+"""``Follower``: an additional vehicle behind the last vehicle of a scenario, at the same speed."""
 
 from __future__ import annotations
 
@@ -14,22 +14,26 @@ from ethbrake_marl.scenario.fields import QUANTITY
 
 
 class Follower(FileModel):
-    """A vehicle behind the last one, at the same speed, that brakes fully after its latency.
+    """An additional vehicle behind the last vehicle, at the same speed, which brakes fully after its latency.
 
-    Without values it has latency and hardest braking of UN Regulation 157's competent driver, 0.75 s and 0.774 g; its
-    time gap, 0.6 s, is ours. It brakes at once, without that driver's build-up. Its mass is that of the last vehicle.
+    The default latency (0.75 s) and braking capacity (0.774 g) are those of the competent driver in UN Regulation 157.
+    The default time gap (0.6 s) is our choice. The follower's brakes act at once; the driver of the regulation has a
+    build-up time. Its mass equals the mass of the last vehicle.
     """
 
-    time_gap_s: float = Field(default=0.6, gt=0.0, le=60.0, description="its time gap behind the last vehicle")
-    braking_capacity_mps2: float = Field(default=7.59, gt=0.0, le=30.0, description="its hardest braking")
-    latency_s: float = Field(default=0.75, ge=0.0, le=60.0, description="time from the alert until it brakes")
+    time_gap_s: float = Field(
+        default=0.6, gt=0.0, le=60.0, description="time gap from the last vehicle of the line to the follower"
+    )
+    braking_capacity_mps2: float = Field(default=7.59, gt=0.0, le=30.0, description="braking capacity of the follower")
+    latency_s: float = Field(default=0.75, ge=0.0, le=60.0, description="time from the alert until the follower brakes")
 
 
 def with_follower(document: Document, build: Callable[[Document], Any]) -> Document:
-    """Return the document of the line with the vehicle that the key ``follower`` adds, and without that key.
+    """Return the document with the follower as one more vehicle of the line, and without the key ``follower``.
 
-    Tables and lists are completed for it. An invalid follower gives the document unchanged; the schema refuses it
-    later. Raises ``InvalidInput`` for an invalid line, for vehicle types, and where the last vehicle's speed is drawn.
+    Tables and lists get entries for this vehicle. If the follower is invalid, the document is returned unchanged, and
+    the schema rejects it later. Raises ``InvalidInput`` if the line is invalid, if it has vehicle types, or if the
+    speed of the last vehicle is random and not in the table.
 
     Args:
         document: parsed file with a key ``follower``.
@@ -44,7 +48,8 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
     line = build(Document(document.file, content, document.lines))
     if "vehicle_types" in content:
         raise InvalidInput(
-            f"{where}: cannot stand beside vehicle_types; write out the line of {line.vehicles + 1} instead"
+            f"{where}: cannot be combined with vehicle_types; set vehicles: {line.vehicles + 1} and declare the last"
+            " vehicle like the others"
         )
     N, own = line.vehicles, {"braking_capacity_mps2": follower.braking_capacity_mps2, "latency_s": follower.latency_s}
     for key, rule in QUANTITY.declared.items():
@@ -56,7 +61,9 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
     speed, gaps = (QUANTITY.declared[key].column_of(N - k) for k, key in ((1, "speeds_mps"), (2, "gaps_m")))
     columns = list(content["table"]["columns"]) if "table" in content else []
     if speed not in columns and low != high:
-        raise InvalidInput(f"{where}: the speed of vehicle_{N} is drawn; it must be a number, or stand in the table")
+        raise InvalidInput(
+            f"{where}: the speed of vehicle_{N} is random; it must be a fixed number or a column of the table"
+        )
     if speed in columns or gaps in columns:
         rows = []
         for row in content["table"]["rows"]:

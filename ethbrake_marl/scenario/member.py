@@ -13,9 +13,9 @@ from ethbrake_marl.scenario.vehicle_types import Weight
 
 
 class _MemberSchema:
-    """Annotation of the field with one scenario of a mixture: its JSON schema allows a mapping or a text.
+    """Pydantic annotation of ``Member.scenario``: the field's JSON schema allows a mapping or a text.
 
-    In a file the text is the name of a scenario or the path of its file.
+    In a file, the text is the name of a scenario or the path of its file.
     """
 
     @classmethod
@@ -26,9 +26,13 @@ class _MemberSchema:
 class Member(FileModel):
     """One scenario of a mixture, with its weight relative to the others.
 
-    In a file, ``scenario`` is a name, a path, or what a scenario file says. Loading replaces a name or a path by what
-    that file says, so here it always is a mapping from keys of a scenario to their values.
+    In a file, ``scenario`` is a scenario's name, the path of its file, or the content of such a file. Loading replaces
+    a name or path by the content of that file, so this field is always a mapping from keys to values.
     """
 
-    scenario: Annotated[dict[str, Any], _MemberSchema] = Field(description="a name, a path, or what its file says")
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other scenarios")
+    scenario: Annotated[dict[str, Any], _MemberSchema] = Field(
+        description="name of a scenario, path of its file, or the content of such a file"
+    )
+    weight: Weight = Field(
+        default=1.0, description="how likely a world is drawn from this scenario, relative to the other scenarios"
+    )

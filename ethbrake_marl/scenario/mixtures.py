@@ -1,7 +1,4 @@
-"""Mixtures of scenarios: each world is drawn from one of them, the *members*, and equals this member's own world.
-
-The member is drawn by weight.
-"""
+"""Mixtures of scenarios: each world is drawn from one of several scenarios, the *members*, chosen by weight."""
 
 from __future__ import annotations
 
@@ -17,8 +14,9 @@ from ethbrake_marl.scenario.member import Member
 
 WORDS = ("title", "description", "source")
 
-_OWN = {"name", *WORDS, "mixture"}  # the mixture's own keys; every other key applies to all members
+_OWN = {"name", *WORDS, "mixture"}  # keys of the mixture itself; every other key applies to all members
 
+# keys that must have the same value in all members
 _ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "roles", "objective", "observation")
 
 _SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # keys that the mixture takes over if all members agree
@@ -27,10 +25,9 @@ AnyScenario = TypeVar("AnyScenario", bound=ScenarioFields)
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return ``content`` of a scenario file with the keys and values of ``changes``.
+    """Return ``content`` of a scenario file with the keys of ``changes`` replaced or added.
 
-    A new way to declare gaps or speeds replaces the old one: with ``time_gaps_s`` in the changes, ``gaps_m`` is
-    dropped.
+    A new way to declare gaps or speeds replaces the old way: if ``changes`` has ``time_gaps_s``, ``gaps_m`` is removed.
     """
     old = {key for pair in QUANTITY.alternatives.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:
@@ -41,11 +38,12 @@ def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> d
 def build_members(
     document: Document, build: Callable[[Document], AnyScenario]
 ) -> tuple[Document, tuple[AnyScenario, ...]]:
-    """Build the scenarios that the ``mixture`` of a file lists; return the completed document and these scenarios.
+    """Build the scenarios listed under the key ``mixture``; return the completed document and these scenarios.
 
-    Keys next to ``mixture`` replace those of every listed scenario. Keys in which all scenarios agree are added to the
-    document. An invalid list gives the document unchanged and no scenarios; the schema refuses it later. Raises
-    ``InvalidInput`` naming the invalid scenario, or the key in which two of them differ.
+    Keys next to ``mixture`` replace the same keys in every listed scenario. A key for which all scenarios have the same
+    value is added to the document. If the list is invalid, the document is returned unchanged, without scenarios, and
+    the schema rejects it later. Raises ``InvalidInput`` naming the invalid scenario, or the key in which two scenarios
+    must not differ.
 
     Args:
         document: parsed file with a key ``mixture``.
@@ -74,20 +72,20 @@ def _is_whole(entry: Any) -> bool:
 def member_content(member: ScenarioFields) -> dict[str, Any]:
     """Return everything that determines the worlds of one scenario of a mixture, as plain data.
 
-    These are declared values and shared settings, without title, description and source.
+    The result has the declared values and the shared settings, without title, description and source.
     """
     declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
     return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
 
 
 def _member_document(document: Document, i: int, entry: Mapping[str, Any], beside: Mapping[str, Any]) -> Document:
-    """Return the document of one scenario of a mixture, without texts, with its line numbers.
+    """Return one scenario of a mixture as a document, without title, description and source.
 
     Args:
         document: parsed file of the mixture.
-        i: position of the scenario in its list.
-        entry: the list's entry at this position.
-        beside: keys next to the mixture, which replace those of the scenario.
+        i: position of the scenario in the mixture's list, from 0.
+        entry: entry of the list at this position.
+        beside: keys and values next to ``mixture``, which replace the same keys of the scenario.
 
     """
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}
@@ -101,42 +99,46 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
 def _check_members(document: Document, members: Sequence[ScenarioFields]) -> None:
     """Raise ``InvalidInput`` if the scenarios ``members`` of a mixture cannot be drawn together.
 
-    None may be a mixture, their names must differ, and they must fit into one batch. ``document``: the mixture's file,
-    for messages.
+    No member may be a mixture, their names must differ, and all must have the same number of vehicles, time step,
+    horizon, roles, objective and observation. ``document``: the mixture's file, for error messages.
     """
     where = f"{document.where(('mixture',))}: mixture"
     first = members[0]
     if (vehicles := document.content.get("vehicles", first.vehicles)) != first.vehicles:
         raise InvalidInput(
-            f"{where}: vehicles = {vehicles}: its scenarios have {first.vehicles}, which nothing beside them can change"
+            f"{where}: vehicles = {vehicles}: must be {first.vehicles}, the number of vehicles in its scenarios; a"
+            " mixture cannot change it"
         )
     for k, member in enumerate(members):
         if member.members:
             raise InvalidInput(f"{where}[{k}]: {member.name} is a mixture itself; list its scenarios here")
         if member.name in [other.name for other in members[:k]]:
-            raise InvalidInput(f"{where}[{k}]: {member.name} is given twice; give it once, with the sum of the weights")
+            raise InvalidInput(
+                f"{where}[{k}]: {member.name} is listed twice; list it once, with the sum of its weights"
+            )
         for key in _ONE_FOR_ALL:
-            one, other = (_told(each, key) for each in (first, member))
+            one, other = (_value_text(each, key) for each in (first, member))
             if one != other:
-                way = "" if key == "vehicles" else f"; give {key} beside mixture, and it holds for all"
+                way = "" if key == "vehicles" else f"; to use one {key} for all, write it next to the key mixture"
                 raise InvalidInput(
-                    f"{where}: {key} must be the same in all: {first.name} has {one}, {member.name} has {other}{way}"
+                    f"{where}: {key} must be the same in all scenarios: {first.name} has {one}, {member.name} has"
+                    f" {other}{way}"
                 )
         samples = [each.v2x.channel.samples(each.time_step_s) for each in (first, member)]
         if samples[0] != samples[1]:
             raise InvalidInput(
-                f"{where}: v2x.persistence must be the same in all, and so must the delay of periodic messages:"
-                f" {first.name} and {member.name} differ; give v2x beside mixture, and it holds for all"
+                f"{where}: v2x.persistence, and the delay of periodic messages, must be the same in all scenarios:"
+                f" {first.name} and {member.name} differ; to use one v2x for all, write it next to the key mixture"
             )
         says = [each.v2x.channel.tells is not None for each in (first, member)]
         if says[0] != says[1]:
             giver, silent = (first, member) if says[0] else (member, first)
             raise InvalidInput(
-                f"{where}: {giver.name} has v2x.tells and {silent.name} has none: give it in each, if need be the usual"
-                f" [{', '.join(USUAL_PIECES)}]"
+                f"{where}: {giver.name} has v2x.tells, but {silent.name} does not; write v2x.tells in every scenario"
+                f" (the default is [{', '.join(USUAL_PIECES)}])"
             )
 
 
-def _told(scenario: ScenarioFields, key: str) -> str:
+def _value_text(scenario: ScenarioFields, key: str) -> str:
     value = getattr(scenario, key)
     return "nothing" if value is None else flow_text(dict(value) if key == "roles" else value, 120)

@@ -1,4 +1,4 @@
-"""The random numbers of a scenario as a unit cube, with one coordinate per number that it draws."""
+"""The random numbers of a scenario as points of a unit cube, with one coordinate per random number of a world."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _UNUSED = 0.5  # value of uniform numbers without effect
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """The numbers that a scenario draws, as coordinates of a unit cube: names and places."""
+    """Coordinates of the unit cube of a scenario: name and place of each random number that a world is drawn from."""
 
-    scenario: ScenarioFields  # the scenario that draws them
+    scenario: ScenarioFields  # the scenario whose worlds the points of the cube determine
     names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
-    places: tuple[Place, ...]  # stream and column of each coordinate among a world's uniform numbers
+    places: tuple[Place, ...]  # stream and column of each coordinate among the uniform numbers of a world
 
     def sample(self, points: Floats) -> tuple[Sample, Bools]:
-        """Return the worlds at ``points`` of the unit cube, and whether the scenario accepts each, [n].
+        """Return the worlds at ``points`` of the unit cube, and whether the scenario accepts each world, [n].
 
-        A scenario that rejects early impacts does not accept a world that has one.
+        A world is not accepted if it has an early impact and the scenario says ``early_impacts: reject``.
 
         Args:
-            points: coordinates in [0, 1) in the order of ``names``, [n, coordinates].
+            points: coordinates of n points in [0, 1), in the order of ``names``, [n, coordinates].
 
         """
         n, vehicles = len(points), self.scenario.vehicles
@@ -58,7 +58,7 @@ class Ranges:
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return name -> (stream, column) of the uniform number of every quantity that the scenario draws."""
+    """Return the place of the uniform number of every random quantity: name -> (stream, column)."""
     used: list[str] = []
 
     def note(key: str) -> Floats:
@@ -79,9 +79,9 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return name -> (stream, column) of the uniform numbers of each vehicle's type and load.
+    """Return the places of the uniform numbers of vehicle types and loads: name -> (stream, column).
 
-    Only of those that have an effect: a type that is drawn, and a load on which some quantity depends.
+    Numbers without effect are left out: a type if only one is possible, a load if no quantity depends on it.
     """
     if scenario.types_of_line is None:
         return {}
@@ -106,20 +106,23 @@ def _name(key: str, index: int) -> str:
 
 
 def ranges(scenario: ScenarioFields) -> Ranges:
-    """Return every number that the scenario draws, as coordinates of a unit cube.
+    """Return the coordinates of the scenario's unit cube, one for every random number of a world.
 
-    Raises ``InvalidInput`` for a scenario that draws nothing, for a mixture, and for a channel other than ``paper``,
-    because a point of the cube would not determine a world of these.
+    Raises ``InvalidInput`` if the scenario has nothing random, if it is a mixture, or if its channel is not ``paper``.
+    In a mixture, and with other channels, a point of the cube would not determine a world.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)
-        raise InvalidInput(f"scenario {scenario.name!r}: is a mixture; take one of its scenarios: {members}")
+        raise InvalidInput(f"scenario {scenario.name!r}: is a mixture; use one of its scenarios: {members}")
     if scenario.v2x.delays:
         raise InvalidInput(
-            f"scenario {scenario.name!r}: v2x: draws delays and losses, which no table of worlds holds; give v2x: paper"
-            " (--set v2x=paper)"
+            f"scenario {scenario.name!r}: its v2x channel has delays and losses, which a table of worlds cannot store;"
+            " use v2x: paper (--set v2x=paper)"
         )
     entries = {**_of_types(scenario), **_of_quantities(scenario)}
     if not entries:
-        raise InvalidInput(f"scenario {scenario.name!r}: draws nothing: all its worlds are the same")
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: has nothing random, so all its worlds are the same; give at least one"
+            " quantity a distribution"
+        )
     return Ranges(scenario, tuple(entries), tuple(entries.values()))

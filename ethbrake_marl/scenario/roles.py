@@ -1,4 +1,4 @@
-"""Roles: which vehicle learns, names of scripts (``name[:argument]``), and commands of scripts that need no state."""
+"""Roles: which vehicles learn, which scripts the others follow, and commands of scripts that do not need the state."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SPEC = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
 
 class ScriptSpec(NamedTuple):
-    """``name[:argument]``, for example ``constant:3.5``: the name of an agent in a scenario or on the command line."""
+    """Name of an agent with an optional argument, in a scenario or on the command line, such as ``constant:3.5``."""
 
     name: str  # name of the agent, such as ``constant``
     argument: str | None  # text after the colon, such as ``3.5``; None: no colon
@@ -41,27 +41,27 @@ class ScriptSpec(NamedTuple):
     def parse(spec: str) -> ScriptSpec:
         """Parse ``spec``, a text ``name[:argument]``.
 
-        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. A Python
-        file is refused too: a scenario from somebody else must not run code.
+        Raises ``InvalidInput`` unless the name matches ``[a-z][a-z0-9_@.-]*`` and the argument has no spaces. Also
+        raises it for a Python file, because loading somebody else's scenario must not run code.
         """
         match = _SPEC.fullmatch(spec) if isinstance(spec, str) else None
         if match is None:
             raise InvalidInput(
-                f"agent {spec!r}: must be name or name:argument, the name in lower case letters, digits and _ @ . -,"
-                " for instance full_brake or constant:3.5"
+                f"agent {spec!r}: must be name or name:argument, for instance full_brake or constant:3.5; a name begins"
+                " with a letter a-z and continues with a-z, 0-9, _, @, . and -"
             )
         if match["name"].endswith(".py") or ".py:" in spec:
             raise InvalidInput(
-                f"agent {spec!r}: is a function of a Python file, and those are loaded only where a person names them"
-                " (--agents); no scenario does. A package that you install can give it a name"
+                f"agent {spec!r}: is a function in a Python file; a scenario cannot use one, only the option --agents"
+                " can. To use it in a scenario, register it under a name in a package that you install"
             )
         return ScriptSpec(match["name"], match["argument"])
 
     @property
     def deceleration_mps2(self) -> float | None:
-        """Deceleration a of ``constant:a`` (negative: drive); None for any other script.
+        """Deceleration a of ``constant:a`` (m/s2, negative for driving); None for any other script.
 
-        Raises ``InvalidInput`` if a is missing or not a finite number.
+        Raises ``InvalidInput`` if the deceleration is missing or not a finite number.
         """
         if self.name != "constant":
             return None
@@ -75,10 +75,10 @@ class ScriptSpec(NamedTuple):
 
     @property
     def pieces(self) -> tuple[tuple[float, float], ...]:
-        """Pieces of a ``profile``, as (start in s after the latency, braking in m/s2); empty for any other script.
+        """Pieces (intervals of constant braking) of a ``profile``; an empty tuple for any other script.
 
-        A piece is a time interval of constant braking. Raises ``InvalidInput`` unless times start at 0 and increase,
-        and no braking is negative.
+        A piece is (start in s after the latency, deceleration in m/s2). Raises ``InvalidInput`` unless the starts begin
+        with 0 and increase, and no deceleration is negative.
         """
         if self.name != _PROFILE:
             return ()
@@ -91,9 +91,9 @@ class ScriptSpec(NamedTuple):
         return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
 
     def is_state_free(self) -> bool:
-        """Return whether the script needs no state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
+        """Return whether the script does not need the state: ``full_brake``, ``coast``, ``constant:a`` or a profile.
 
-        Raises ``InvalidInput`` if such a script has an argument it does not take, or lacks the one it needs.
+        Raises ``InvalidInput`` if the argument of such a script is missing, invalid or not allowed.
         """
         if self.name == _PROFILE:
             return len(self.pieces) > 0
@@ -106,11 +106,12 @@ class ScriptSpec(NamedTuple):
     def command(
         self, braking_capacity_mps2: ArrayLike, driving_capacity_mps2: ArrayLike | None = None
     ) -> Floats | None:
-        """Return the command (m/s2) of a script that needs no state, in the shape of ``braking_capacity_mps2``.
+        """Return the command (m/s2, negative for braking) of a script that does not need the state.
 
-        ``full_brake`` -> -capacity, ``coast`` -> 0, ``constant:a`` -> -a, ``profile`` -> its first piece; None for any
-        other script. Raises ``InvalidInput`` if a, or a piece, exceeds the braking capacity of some vehicle, or -a the
-        ``driving_capacity_mps2``, if given.
+        The result has the shape of ``braking_capacity_mps2``. It is -capacity for ``full_brake``, 0 for ``coast``, -a
+        for ``constant:a``, the command of the first piece for a ``profile``, and None for any other script. Raises
+        ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or a forward acceleration its
+        driving capacity (checked only if ``driving_capacity_mps2`` is given).
         """
         capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
         if not self.is_state_free():
@@ -119,38 +120,47 @@ class ScriptSpec(NamedTuple):
         if deceleration is None:
             return -capacity if self.name == "full_brake" else np.zeros(capacity.shape)
         if not np.all(deceleration <= capacity):
-            raise InvalidInput(f"agent {str(self)!r}: above the braking capacity {np.min(capacity):g} m/s2")
+            raise InvalidInput(
+                f"agent {str(self)!r}: brakes harder than the braking capacity of {np.min(capacity):g} m/s2 allows"
+            )
         if driving_capacity_mps2 is not None and not np.all(-deceleration <= np.asarray(driving_capacity_mps2)):
             raise InvalidInput(
-                f"agent {str(self)!r}: above the driving capacity {np.min(driving_capacity_mps2):g} m/s2"
+                f"agent {str(self)!r}: drives harder than the driving capacity of {np.min(driving_capacity_mps2):g}"
+                " m/s2 allows"
             )
         return np.full(capacity.shape, 0.0 - (self.pieces[0][1] if self.pieces else deceleration))
 
 
 def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
-    """Return the pieces of a ``profile``, ``((s, m/s2), ...)``, after checking them; raise ``InvalidInput`` if invalid.
+    """Return the pieces of a ``profile``, ((start in s, deceleration in m/s2), ...); raise ``InvalidInput`` if invalid.
 
-    ``given``: a list ``[[s after the latency, m/s2 of braking], ...]``, from a file and so of any type.
+    ``given``: unchecked value from a file; it should be a list ``[[start, deceleration], ...]``.
     """
-    right = f"a profile is 1 to {MOST_PIECES} pieces [s after the latency, m/s2 of braking], such as [[0, 3], [1, 7]]"
+    right = (
+        f"a profile must be a list of 1 to {MOST_PIECES} pieces [start in s after the latency, deceleration in m/s2],"
+        " such as [[0, 3], [1, 7]]"
+    )
     if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
         raise InvalidInput(right)
     for piece in given:
         numbers = isinstance(piece, list | tuple) and len(piece) == 2
         if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
-            raise InvalidInput(f"{right}; both in [0, 3600], which {piece!r:.60} is not")
+            raise InvalidInput(f"{right}; a piece must be two numbers in [0, 3600], which {piece!r:.60} is not")
     if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
-        raise InvalidInput(f"{right}; times begin with 0 and rise")
+        raise InvalidInput(f"{right}; the first start must be 0, and the starts must increase")
     return tuple((float(begins), float(braking)) for begins, braking in given)
 
 
 def _role_text(role: object) -> object:
-    """Convert a role from a file to the name of a script: ``{profile: [[0, 3], [1, 7]]}`` is ``profile:0=3,1=7``."""
+    """Convert a role from a file to text: ``{profile: [[0, 3], [1, 7]]}`` becomes ``profile:0=3,1=7``.
+
+    A role that is not a mapping is returned unchanged.
+    """
     if not isinstance(role, dict):
         return role
     try:
         if set(role) != {_PROFILE}:
-            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} and nothing beside it")
+            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} without other keys")
         pieces = checked_pieces(role[_PROFILE])
     except InvalidInput as error:
         refuse((), role, str(error))
@@ -161,7 +171,7 @@ def _role_text(role: object) -> object:
 def _role_content(role: str) -> str | dict[str, list[list[float]]]:
     """Convert a role to its form in a scenario file: ``profile:0=3`` to ``{"profile": [[0.0, 3.0]]}``.
 
-    Other roles stay as they are.
+    Any other role is returned unchanged.
     """
     pieces = ScriptSpec.parse(role).pieces
     return {_PROFILE: [list(piece) for piece in pieces]} if pieces else role
@@ -192,24 +202,26 @@ Role = Annotated[
 
 
 class Roles(dict[str, str]):
-    """Vehicle -> ``learner`` or a script; immutable, like the rest of a scenario."""
+    """Immutable mapping from vehicle names to roles: ``learner`` or the name of a script."""
 
     def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
-        raise InvalidInput("roles of a scenario are frozen; use scenario.replace(roles=...) or scenario.with_learners")
+        raise InvalidInput(
+            "roles of a scenario cannot be changed; make a new scenario with scenario.replace(roles=...) or"
+            " scenario.with_learners"
+        )
 
     __setitem__ = __delitem__ = __ior__ = _refuse
     update = setdefault = pop = popitem = clear = _refuse
 
     def __reduce__(self) -> tuple[type[Roles], tuple[dict[str, str]]]:
-        """Copy and pickle through the constructor."""
         return Roles, (dict(self),)
 
     @staticmethod
     def complete(given: Mapping[str, str] | None, vehicles: int) -> Roles:
-        """Return a role for each of ``vehicles`` vehicles: ``learner`` or the name of a script.
+        """Return the role of each of ``vehicles`` vehicles: ``learner`` or the name of a script.
 
-        ``given`` maps names such as ``vehicle_2`` to roles; a vehicle that it leaves out brakes fully. None: vehicle_2
-        learns and the others brake fully.
+        ``given`` maps names such as ``vehicle_2`` to roles; a vehicle without a role brakes fully. If ``given`` is
+        None, vehicle_2 learns and all other vehicles brake fully.
         """
         roles = {"vehicle_2": LEARNER} if given is None else given
         names = [f"vehicle_{i + 1}" for i in range(vehicles)]

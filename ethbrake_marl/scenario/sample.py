@@ -1,4 +1,4 @@
-"""A sample of a list of worlds: the worlds, their numbers in the list, and their vehicle types and scenarios."""
+"""``Sample``: worlds drawn from a scenario, with their numbers in the list, vehicle types, scenarios and recordings."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ _Texts = NDArray[np.str_]
 
 
 def recording_of(texts: _Texts) -> _Texts:
-    """Return the recording that each text of the column ``recording`` names, [n]: what stands before its last ": "."""
+    """Return the name of the recording in each text of the column ``recording``, [n]: the part before the last ": "."""
     before, _, after = np.char.rpartition(texts, ": ").T
     names: _Texts = np.where(before == "", after, before)
     return names
 
 
 def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
-    """Return the name of each world's cluster, [n]; only clusters are independent. None: all worlds are.
+    """Return the name of each world's cluster, [n], or None if all worlds are independent.
 
-    A cluster is a recording, which is the text before the last ``": "``: vehicles of the same platoon, which stand
-    after it, depend on each other too. A world without a recording, in a mixture, is a cluster of its own.
+    Worlds of the same cluster depend on each other. A cluster is all worlds of one recording, whichever vehicles of the
+    recording they come from. A world without a recording, in a mixture, is a cluster of its own.
 
     Args:
-        kinds: columns of text by name, as ``Sample.kinds``.
-        index: [n] number of each world in its list.
+        kinds: columns of text by name, such as ``Sample.kinds``.
+        index: number of each world in its list, [n].
 
     """
     column = kinds.get(RECORDING)
@@ -52,16 +52,16 @@ class Sample:
     worlds: Worlds  # at t = 0
     index: Ints  # [n] number of each world in the list of its seed
     rejected: int  # number of draws that were rejected for an early impact
-    types: _Texts | None = None  # [n, N] type of every vehicle; "": no type; None: a scenario without types
-    scenarios: _Texts | None = None  # [n] member of a mixture that each world was drawn from; None: no mixture
-    recordings: _Texts | None = None  # [n] recording that each world's row comes from; "": none; None: no such column
+    types: _Texts | None = None  # [n, N] type of every vehicle, "" if it has none; None: the scenario has no types
+    scenarios: _Texts | None = None  # [n] scenario of a mixture that each world was drawn from; None: no mixture
+    recordings: _Texts | None = None  # [n] recording that each world comes from, "" if none; None: no such column
 
     def __repr__(self) -> str:
         numbers = f"numbers {self.index.min()} to {self.index.max()}" if len(self.index) else "no numbers"
         return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
     def take(self, rows: ArrayLike) -> Sample:
-        """Return the worlds selected by ``rows`` (indices or a mask [n]); always a copy, with ``rejected`` 0."""
+        """Return a copy of the worlds selected by ``rows`` (indices or a mask [n]), with ``rejected`` = 0."""
         some = np.asarray(rows)
         texts = (None if each is None else each[some] for each in (self.types, self.scenarios, self.recordings))
         return Sample(self.worlds.take(some), self.index[some], 0, *texts)
@@ -70,8 +70,8 @@ class Sample:
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Either all parts have types (or scenarios, or recordings) or none has. ``rejected``: number of rejected draws
-        to note in the result.
+        Types must be present in all of ``parts`` or in none; the same holds for scenarios and for recordings.
+        ``rejected``: number of rejected draws in the result.
         """
         index = np.concatenate([part.index for part in parts])
         order = np.argsort(index)
@@ -84,7 +84,10 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns of text, [n] each: ``scenario`` of a mixture, ``recording`` of a row, ``vehicle_1_type`` and on."""
+        """Columns of text by name, [n] each: ``scenario``, ``recording``, ``vehicle_1_type`` ...; absent ones left out.
+
+        ``scenario`` exists for a mixture, ``recording`` for a table with recordings, types for vehicle types.
+        """
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
         columns |= {} if self.recordings is None else {RECORDING: self.recordings}
         types = () if self.types is None else self.types.T
@@ -92,13 +95,14 @@ class Sample:
 
     @property
     def clusters(self) -> _Texts | None:
-        """Name of each world's cluster, [n] (``clusters_of``); None: all worlds are independent."""
+        """Name of each world's cluster, [n], or None if all worlds are independent; see ``clusters_of``."""
         return clusters_of(self.kinds, self.index)
 
     def count_kinds(self) -> str:
-        """Return a text that counts the worlds of each scenario of a mixture and of each vehicle type.
+        """Return a text with the number of worlds for each scenario of a mixture and each vehicle type.
 
-        For example ``"; vehicle_1_type: car 7, truck 3"``; of recordings only how many there are. Empty without any.
+        An example is ``"; vehicle_1_type: car 7, truck 3"``. For recordings the text says only how many different
+        ones there are. The text is empty if ``kinds`` is empty.
         """
         text = ""
         for kind, column in self.kinds.items():

@@ -1,4 +1,4 @@
-"""Draw the worlds of a scenario's lists. World k of a seed has the same bits however many worlds are drawn."""
+"""Draw worlds from a scenario. World k of a seed is the same, bit for bit, however many worlds are drawn."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CHANNELS: dict[str, int] = {"list": 0, "training": 1}
 
 MOST_ATTEMPTS = 1000  # draws of one world after which its scenario counts as unusable
 
-_PATIENCE = 10  # attempts for a whole list before one world is tried up to MOST_ATTEMPTS
+_PATIENCE = 10  # attempts for all rejected worlds together, before one of them is tried up to MOST_ATTEMPTS times
 
 MOST_AT_ONCE = 10_000_000  # largest number of worlds in one sample; draw a longer list in parts
 
@@ -47,27 +47,28 @@ _NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
     """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
 
-    World k has the same bits for every ``n`` and ``first``. World k of a mixture is drawn from one of its scenarios, by
-    weight, and equals that scenario's own world k under the same seed, bit for bit. So results on a mixture can be
-    compared with results on its scenarios, world by world.
+    World k is the same, bit for bit, for every ``n`` and ``first``. World k of a mixture is drawn from one of its
+    scenarios, chosen by weight, and equals world k of that scenario under the same seed, bit for bit. Results on a
+    mixture can therefore be compared world by world with results on its scenarios.
 
     Args:
         scenario: the scenario to draw from.
         n: number of worlds.
         seed: seed of the list, a whole number of at least 0.
         first: number of the first world in the list, from 0.
-        channel: ``"list"`` for evaluation, ``"training"`` for training: two independent lists per seed.
+        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list of each kind, and the
+            two lists are independent.
 
-    Raises ``InvalidInput`` for a negative seed or ``first``, for ``n < 1``, or if early impacts are rejected and
-    (almost) every draw has one.
+    Raises ``InvalidInput`` for a negative seed or ``first``, for ``n < 1``, or if the scenario rejects early impacts
+    and some world has one in each of ``MOST_ATTEMPTS`` draws.
 
     """
     for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
         check_whole_number(name, value, least)
     if not n <= MOST_AT_ONCE:
-        raise InvalidInput(f"number of worlds = {n}: at most {MOST_AT_ONCE:,} at once; draw a longer list in parts")
+        raise InvalidInput(f"number of worlds = {n}: must be at most {MOST_AT_ONCE:,}; draw a longer list in parts")
     if not int(first) + int(n) <= _MOST_WORLDS:
-        raise InvalidInput(f"sample: first = {first!r}: a list has {_MOST_WORLDS} worlds")
+        raise InvalidInput(f"sample: first = {first!r}: first + n must be at most {_MOST_WORLDS}, the length of a list")
     if channel not in CHANNELS:
         raise InvalidInput(f"sample: channel {channel!r}: must be one of {', '.join(CHANNELS)}")
     if scenario.mixture is None:
@@ -88,9 +89,9 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
 
 
 def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Ints:
-    """Return the scenario of a mixture from which each world is drawn, as an index into ``scenario.members``, [n].
+    """Return the scenario that each world of a mixture is drawn from, as an index into ``scenario.members``, [n].
 
-    The index is 0 without a mixture. Arguments are the same as in ``sample``.
+    The index is 0 if the scenario is not a mixture. The arguments have the same meaning as in ``sample``.
     """
     cumulative = np.cumsum([member.weight for member in scenario.mixture or ()] or [1.0])
     u = uniform_numbers(seed, channel, 0, first, n, OF_WORLD, of=MIXTURE)[:, 0]
@@ -98,20 +99,20 @@ def members_of(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, c
 
 
 def middle_world(scenario: ScenarioFields) -> Worlds:
-    """Return one world (n = 1) in which every quantity that ``scenario`` draws is the median of its distribution."""
+    """Return one world (n = 1) in which every random quantity of ``scenario`` is the median of its distribution."""
     alone = scenario.model_copy()
     alone._columns = {entry: column.middle for entry, column in scenario.table_entries.items()}
     return sample_by(alone, lambda width, of: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
 
 
 def sample_by(scenario: ScenarioFields, numbers: Callable[[int, tuple[int, ...]], Floats], index: Ints) -> Sample:
-    """Return the worlds that given uniform numbers produce; early impacts are not rejected.
+    """Return the worlds that result from the uniform numbers ``numbers``; early impacts are not rejected.
 
     Args:
-        scenario: the scenario to draw from; not a mixture.
-        numbers: function (width, stream) -> uniform numbers in [0, 1), [n, width]; the stream is a tuple such as
-            ``fields.TYPES``, or ``()`` for the main stream.
-        index: number of each world in its list, [n], to be noted in the sample.
+        scenario: the scenario to draw from; it must not be a mixture.
+        numbers: function (width, stream) that returns uniform numbers in [0, 1), [n, width]. The stream is a tuple
+            such as ``fields.TYPES``, or ``()`` for the main stream.
+        index: number of each world in its list, [n]; becomes ``Sample.index``.
 
     """
     line, typed = scenario.types_of_line, None
@@ -143,12 +144,12 @@ def drawn_quantities(
 ) -> Callable[[str], Floats]:
     """Return a function that maps the key of a declared quantity to its values in n worlds, [n, entries].
 
-    There is one entry per vehicle, per pair or per world, as ``QUANTITY`` says for the key.
+    The number of entries is one per vehicle, one per pair or one per world; ``QUANTITY`` defines this for each key.
 
     Args:
         scenario: the scenario that declares the quantities.
-        numbers: source of uniform numbers, as for ``sample_by``.
-        typed: type (index) and load of every vehicle, both [n, N]; None without types.
+        numbers: source of uniform numbers, the same function as in ``sample_by``.
+        typed: type (index) and load of every vehicle, both [n, N]; None if the scenario has no vehicle types.
 
     """
     streams: dict[tuple[int, ...], Floats] = {(): numbers(BLOCK * scenario.vehicles, ())}
@@ -181,17 +182,17 @@ def uniform_numbers(
 ) -> Floats:
     """Return uniform numbers in [0, 1) for worlds ``first`` to ``first + n - 1``, [n, width].
 
-    Row k depends only on (seed, channel, attempt, of, first + k, width). A number is the upper 53 bits of a Philox
-    integer.
+    Row k depends only on (seed, channel, attempt, of, first + k, width). Each number is the upper 53 bits of a 64-bit
+    integer from the Philox generator, divided by 2^53.
 
     Args:
         seed: seed of the list.
         channel: ``"list"`` or ``"training"``.
-        attempt: number of the draw, from 0; a world that is rejected is drawn again with the next attempt.
+        attempt: number of the draw, from 0; a rejected world is drawn again with the next attempt number.
         first: number of the first world in the list, from 0.
         n: number of worlds.
-        width: numbers per world, a multiple of 4.
-        of: a separate stream of numbers, such as ``fields.V2X_NEWS``; ``()``: the main stream.
+        width: how many numbers each world gets, a multiple of 4.
+        of: independent stream that the numbers come from, such as ``fields.V2X_NEWS``; ``()`` is the main stream.
 
     """
     sequence = np.random.SeedSequence([seed], spawn_key=(CHANNELS[channel], attempt, *of))
@@ -203,9 +204,10 @@ def uniform_numbers(
 
 
 def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Channel) -> Sample:
-    """Return the worlds with the ascending numbers ``index`` [n] of the scenario's list.
+    """Return the worlds whose numbers in the scenario's list are ``index`` (ascending, [n]).
 
-    Early impacts are rejected if the scenario says so. Other arguments are the same as in ``sample``.
+    Worlds with early impacts are drawn again if the scenario says ``early_impacts: reject``. The other arguments have
+    the same meaning as in ``sample``.
     """
     drawn = _draw(scenario, seed, channel, 0, index)
     if scenario.early_impacts == "keep" or not scenario.learners:
@@ -217,10 +219,10 @@ def _draw_numbers(scenario: ScenarioFields, index: Ints, seed: int, channel: Cha
 
 
 def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
-    """Return whether each world has an impact before, or just when, the first learner can act, [n].
+    """Return whether each world has an impact no later than the time at which the first learner can act, [n].
 
-    Until then scripted vehicles follow their scripts, which must not depend on the state, and learners coast; so no
-    learner can prevent this impact. The scenario must have a learner.
+    No learner can prevent such an impact: until that time learners coast and the other vehicles follow their scripts.
+    Scripts must not depend on the state (otherwise ``InvalidInput`` is raised). The scenario must have a learner.
     """
     vehicles = worlds.vehicles
     command = np.zeros(worlds.speeds_mps.shape)
@@ -230,8 +232,8 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
         )
         if scripted is None:
             raise InvalidInput(
-                f"scenario {scenario.name!r}: early_impacts: reject needs scripts that do not depend on the state;"
-                f" {script!r} of vehicle_{i + 1} does"
+                f"scenario {scenario.name!r}: early_impacts: reject needs scripts that do not depend on the state, but"
+                f" the script {script!r} of vehicle_{i + 1} depends on it"
             )
         command[:, i] = scripted
     first_action_s = worlds.first_decision_s(scenario.learners)
@@ -247,7 +249,7 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
         seed: seed of the list.
         channel: ``"list"`` or ``"training"``.
         drawn: worlds of the first attempt.
-        early: whether each of them is rejected for an early impact, [n].
+        early: whether each world in ``drawn`` is rejected for an early impact, [n].
 
     """
     parts, pending, rejected = [drawn.take(~early)], drawn.index[early], int(early.sum())
@@ -268,8 +270,8 @@ def _redraw(scenario: ScenarioFields, seed: int, channel: Channel, drawn: Sample
 def _redraw_one(scenario: ScenarioFields, seed: int, channel: Channel, index: Ints) -> None:
     """Raise ``InvalidInput`` if all remaining attempts to draw world number ``index`` [1] are rejected.
 
-    Testing one world first makes a list whose draws are all rejected fail early. Other arguments are the same as in
-    ``sample``.
+    Testing a single world first reports a scenario without acceptable worlds sooner than drawing the whole list. The
+    other arguments have the same meaning as in ``sample``.
     """
     for attempt in range(_PATIENCE, MOST_ATTEMPTS):
         if not early_impact(scenario, _draw(scenario, seed, channel, attempt, index).worlds)[0]:
@@ -281,16 +283,16 @@ def _unusable(scenario: ScenarioFields, world: int) -> InvalidInput:
     learners = ", ".join(scenario.vehicle_names[i] for i in scenario.learners)
     gaps = "time_gaps_s" if scenario.gaps_m is None else "gaps_m"
     return InvalidInput(
-        f"scenario {scenario.name!r}: early_impacts: reject, but {MOST_ATTEMPTS} draws of world {world} all have an"
-        f" impact before {learners} may act; give larger {gaps}, a smaller latency_s, or early_impacts: keep"
+        f"scenario {scenario.name!r}: early_impacts: reject, but in all {MOST_ATTEMPTS} draws of world {world} an"
+        f" impact happens before {learners} can act; use larger {gaps}, a smaller latency_s, or early_impacts: keep"
     )
 
 
 def _draw(scenario: ScenarioFields, seed: int, channel: Channel, attempt: int, index: Ints) -> Sample:
-    """Draw the worlds with the ascending numbers ``index`` [n] once; early impacts are not rejected.
+    """Draw the worlds whose numbers are ``index`` (ascending, [n]) once; early impacts are not rejected.
 
-    ``attempt``: number of the draw, from 0, which selects the random numbers. Other arguments are the same as in
-    ``sample``.
+    ``attempt``: number of the draw, from 0, which selects the random numbers. The other arguments have the same meaning
+    as in ``sample``.
     """
     first, last = int(index[0]), int(index[-1])
 

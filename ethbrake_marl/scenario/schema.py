@@ -1,4 +1,4 @@
-"""``Scenario``: a validated, immutable description of a family of worlds."""
+"""``Scenario``: a validated, immutable description of how worlds are drawn."""
 
 from __future__ import annotations
 
@@ -32,24 +32,27 @@ _DISTRIBUTION = (
 
 
 class ScenarioWording(Wording):
-    """Wording of the error messages about a scenario, or part of one."""
+    """Texts of the error messages about a scenario, or part of one."""
 
     def instead(self, key: str) -> str:
         """Return a hint for an unknown key that people often try: other words for friction, and slopes.
 
-        Empty for any other key.
+        For any other key the hint is empty.
         """
         if "friction" in key or key == "mu":
-            return "friction is that of the road, one for the whole line, for instance friction: 0.5"
+            return "declare the friction of the road with the key friction, for instance friction: 0.5"
         if key in ("grade", "slope"):
-            return "the model has no slopes; downhill, braking capacities are 9.81 x grade less, driving ones more"
+            return (
+                "the model has no slopes; for a road downhill, lower the braking capacities by 9.81 x grade m/s2 and"
+                " raise the driving capacities as much"
+            )
         return ""
 
     def needed(self, path: YamlPath) -> str:
-        """Return a sentence on what is needed at ``path`` (keys and indices inside the file), with an example."""
+        """Return what must be written at ``path`` (keys and indices inside the file), with an example."""
         key = path[-1]
         if path[0] == "mixture":
-            return "it is needed, for instance {scenario: paper-random, weight: 2}"
+            return "write, for instance, {scenario: paper-random, weight: 2}"
         if isinstance(key, int):
             return "two numbers [low, high] are needed"
         rule = QUANTITY.declared.get(key)
@@ -61,16 +64,16 @@ class ScenarioWording(Wording):
             )
             return f"a number is needed, as in {{{'log' * ('lognormal' in path)}normal: {{{shape}}}}}"
         if rule is None:
-            return f"it is needed, for instance {key}: my-scenario"
+            return f"write, for instance, {key}: my-scenario"
         other = (
             f", or {QUANTITY.alternatives[key]}: {QUANTITY.declared[QUANTITY.alternatives[key]].example}"
             if key in QUANTITY.alternatives
             else ""
         )
-        return f"the {rule.meaning} is needed, for instance {key}: {rule.example}{other}"
+        return f"write, for instance, {key}: {rule.example}{other} ({rule.meaning})"
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair that the value at ``path`` belongs to, such as ``vehicle_2``; else an empty text.
+        """Return the vehicle or pair that the value at ``path`` belongs to, such as ``vehicle_2``, or an empty text.
 
         ``path``: keys and indices inside the file, for example ``("speeds_mps", 1)``.
         """
@@ -78,22 +81,22 @@ class ScenarioWording(Wording):
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return what a quantity must be, with a suggestion for a misspelt distribution; empty for other values.
+        """Return a text that says what an invalid quantity must be, with a suggestion for a misspelt distribution.
 
-        ``detail``: one mistake, as pydantic reports it.
+        The text is empty if the invalid value is not a quantity. ``detail``: one mistake, as pydantic reports it.
         """
         if detail["type"] == "quantity":
             return f"must be a number, {_DISTRIBUTION}{_misspelt(detail['input'])}"
         if detail["type"] == "float_type" and detail["loc"][-1] == "#number":
             return f"must be a number or a distribution, {_DISTRIBUTION}"
         if detail["loc"][:1] == ("mixture",) and detail["loc"][-1] == "scenario":
-            return "must be what a scenario says; names are read where they stand in a file (load_scenario)"
+            return "must be the content of a scenario as a mapping; a scenario's name works only with load_scenario"
         return ""
 
 
 def _misspelt(given: Any) -> str:
     if isinstance(given, dict) and "with_load" in given:
-        return "; with_load stands in a type of vehicle_types"
+        return "; with_load is allowed only in vehicle_types"
     hints = [suggestion(key, DISTRIBUTIONS) for key in given if isinstance(key, str)] if isinstance(given, dict) else []
     return "".join(f"; {hint}" for hint in hints if hint)
 
@@ -102,10 +105,10 @@ class Scenario(ScenarioFields):
     """A line of vehicles, the distribution of each quantity, and the vehicles that learn.
 
     A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``, ``{normal: {mean, sd, low,
-    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. One entry applies to every vehicle,
-    and each vehicle draws its own value; a list has one entry per vehicle, or per pair for gaps. Every way to build a
-    scenario (``Scenario(...)``, ``load_scenario``, ``replace``) raises the same ``InvalidInput``: where, value, what
-    would be right.
+    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. A single entry applies to every
+    vehicle, and each vehicle draws its own value from it. A list has one entry per vehicle, or per pair for gaps.
+    ``Scenario(...)``, ``load_scenario`` and ``replace`` raise ``InvalidInput`` for an invalid value. The message names
+    the place and the value and says what would be right.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random").replace(mass_t=[4.5, 5.5, 40.0])
@@ -152,8 +155,8 @@ class Scenario(ScenarioFields):
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
         """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
 
-        World k of a seed is always the same, bit for bit. ``channel``: ``"list"`` for evaluation, ``"training"`` for
-        training; the two are independent. Raises ``InvalidInput`` for an invalid number. See ``sampling.sample``.
+        World k of a seed is always the same, bit for bit. ``channel``: ``"list"`` (worlds for evaluation) or
+        ``"training"``, two independent lists. Raises ``InvalidInput`` for an invalid number. See ``sampling.sample``.
         """
         return sample(self, n, seed, first=first, channel=channel)
 
@@ -162,9 +165,9 @@ class Scenario(ScenarioFields):
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Collection[str]) -> dict[str, Any]:
-        """Return every value, including defaults, as plain data, except the keys ``without``.
+        """Return every value of the scenario, including defaults, as plain data, except the keys ``without``.
 
-        For a mixture this includes the values of its scenarios, without their titles, descriptions and sources.
+        The content of a mixture includes the values of its scenarios, without title, description and source.
         """
         content = self.model_dump(mode="json", exclude=set(without))
         if self.mixture is not None and self.members:
@@ -175,17 +178,18 @@ class Scenario(ScenarioFields):
         return content
 
     def replace(self, **changes: Any) -> Scenario:
-        """Return the scenario with changed values, for example ``replace(mass_t=2.0)``, checked again.
+        """Return a copy of the scenario with changed values, for example ``replace(mass_t=2.0)``.
 
-        A new way to declare gaps or speeds replaces the old one. In a mixture the values change in every scenario.
+        A new way to declare gaps or speeds replaces the old way. In a mixture the values change in every scenario.
+        Raises ``InvalidInput`` if the result is not a valid scenario.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Sequence[str | int]) -> Scenario:
-        """Return the scenario with exactly these learners, by name (``vehicle_2``) or index (from 0).
+        """Return the scenario with exactly these learners, given by name (``vehicle_2``) or index (from 0).
 
-        A former learner that is not listed brakes fully; other scripts stay. Raises ``InvalidInput`` for an unknown
-        vehicle or one listed twice.
+        A former learner that is not listed brakes fully; all scripts stay as they are. Raises ``InvalidInput`` for an
+        unknown vehicle, or a vehicle that is listed twice.
         """
         if isinstance(learners, str):
             raise InvalidInput(f"learners: {learners!r}: must be a list of vehicles, for instance [{learners!r}]")
@@ -202,7 +206,7 @@ class Scenario(ScenarioFields):
             return vehicle
         if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.vehicles:
             raise InvalidInput(
-                f"learners: {vehicle!r}: must be a name (vehicle_1 ... vehicle_{self.vehicles}) or an index"
+                f"learners: {vehicle!r}: a vehicle must be a name (vehicle_1 ... vehicle_{self.vehicles}) or an index"
                 f" from 0 to {self.vehicles - 1}"
             )
         return self.vehicle_names[vehicle]
@@ -211,7 +215,7 @@ class Scenario(ScenarioFields):
 def as_scenario(game: Game) -> Scenario:
     """Return ``game`` itself if it is a ``Scenario``; raise ``InvalidInput`` for any other game."""
     if not isinstance(game, Scenario):
-        raise InvalidInput(f"game {game.name!r}: is a {type(game).__name__}; a Scenario is needed here")
+        raise InvalidInput(f"game {game.name!r}: is a {type(game).__name__}; must be a Scenario here")
     return game
 
 
@@ -242,13 +246,13 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the JSON schema of a quantity's range, for a number and for the numbers in a distribution or list.
+    """Return the JSON schema that limits a quantity, as a number or inside a distribution or list, to its range.
 
     Args:
         key: key of the quantity.
         low: smallest allowed value.
         high: largest allowed value.
-        positive: ``low`` itself is not allowed.
+        positive: whether ``low`` itself is excluded.
 
     """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
@@ -260,7 +264,7 @@ def _range(key: str, low: float, high: float, positive: bool = False) -> dict[st
 
 
 def _build(scenario: Scenario, document: Document) -> None:
-    """Check the content of ``document`` and fill the new, empty ``scenario`` with it."""
+    """Check the content of ``document`` and set the fields of the new, empty ``scenario`` from it."""
     if not isinstance(document.content, dict):
         raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
     members: tuple[Scenario, ...] = ()
@@ -276,9 +280,9 @@ def _build(scenario: Scenario, document: Document) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Convert numpy numbers and arrays in ``value`` to Python's, which the strict schema accepts.
+    """Return ``value`` with numpy numbers and arrays converted to Python numbers and lists, also inside containers.
 
-    Scenarios become their content; mappings and lists are converted inside.
+    A ``Scenario`` is converted to its content.
     """
     if isinstance(value, Scenario):
         return value.declared()

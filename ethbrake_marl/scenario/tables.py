@@ -1,4 +1,4 @@
-"""Worlds with initial conditions from the user: a table with one row per world, or one state for ``reset``."""
+"""Build worlds from the user's initial conditions: a table with one row per world, or a state for ``reset``."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _ALWAYS_IN_A_TABLE = ("gaps_m", "speeds_mps")
 class _Naming:
     """How error messages name a value: by column and row of a table, or by key and index of a state."""
 
-    where: str  # the file, or what else was given, such as ``initial states``
+    where: str  # path of the file, or a description such as ``initial states``
     kind: Literal["file", "table", "state"]  # CSV file, columns in memory, or one state by key
-    lines: Sequence[int] = ()  # of a file: line on which each row begins
+    lines: Sequence[int] = ()  # for a file: line on which each row begins
 
     def entry(self, entry: Entry) -> str:
         field, index = entry
@@ -52,7 +52,7 @@ class _Naming:
 
 
 def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
-    """Return key -> rule of the quantities that every world of this scenario has."""
+    """Return the quantities that every world of this scenario has: key -> rule."""
     there = {"obstacle_gap_m": scenario.has_obstacle, "friction": scenario.has_friction}
     return QUANTITY.usual | {
         key: rule for key, rule in QUANTITY.optional.items() if there.get(key, scenario.declares(key))
@@ -60,18 +60,20 @@ def _quantities(scenario: ScenarioFields) -> dict[str, QuantityRule]:
 
 
 def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Naming) -> Worlds:
-    """Build worlds from checked columns; take quantities without a column from the scenario, where they must be fixed.
+    """Build worlds from columns of numbers; take quantities without a column from the scenario.
+
+    Raises ``InvalidInput`` for a value out of range, and for a quantity that has no column and is random.
 
     Args:
         given: values of each column, [n], by quantity and index.
         scenario: the scenario that the worlds belong to.
-        naming: how messages name a value.
+        naming: how error messages name a value.
 
     """
     if scenario.members:
         raise InvalidInput(
-            f"{naming.where}: scenario {scenario.name!r} is a mixture, and nothing says which of its scenarios a world"
-            f" belongs to; take one of them: {', '.join(member.name for member in scenario.members)}"
+            f"{naming.where}: scenario {scenario.name!r} is a mixture, so it is unknown to which of its scenarios a"
+            f" world belongs; use one of these scenarios: {', '.join(member.name for member in scenario.members)}"
         )
     n = len(next(iter(given.values()))) if given else 1
     full: dict[str, Floats] = {}
@@ -85,7 +87,9 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
                 column = _fixed(scenario, field, index, full)
             if column is None:
                 missing = naming.entry((field, index))
-                raise InvalidInput(f"{naming.where}: {missing} is missing, and random in scenario {scenario.name!r}")
+                raise InvalidInput(
+                    f"{naming.where}: {missing} is missing; scenario {scenario.name!r} has no fixed value for it"
+                )
             good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
             _require_all(good, naming, (field, index), column, f"must be {rule.interval}")
             full[field][:, index] = column
@@ -100,16 +104,16 @@ def _worlds(given: Mapping[Entry, Floats], scenario: ScenarioFields, naming: _Na
 
 
 def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, Floats]) -> Floats | None:
-    """Return the scenario's fixed value of one entry of a quantity, [n] or [1]; None if it is random.
+    """Return the scenario's fixed value of one entry of a quantity, [n] or [1]; None if the value is random.
 
-    A time gap is converted with the speeds in ``full``; an obstacle's margin counts from where Vehicle 1 stops with the
-    values in ``full``.
+    A gap that is declared as a time gap depends on the speeds in ``full``. An obstacle that is declared by a margin
+    depends on the values of Vehicle 1 in ``full``.
 
     Args:
         scenario: the scenario that declares the quantity.
         field: key of the quantity, such as ``"gaps_m"``.
-        index: vehicle or pair, from 0.
-        full: quantities of the n worlds that are known already, [n, entries] by key.
+        index: index of the vehicle or pair, from 0.
+        full: the quantities of the n worlds that are already known, by key, [n, entries] each.
 
     """
     if field == "obstacle_gap_m":
@@ -126,7 +130,7 @@ def _fixed(scenario: ScenarioFields, field: str, index: int, full: Mapping[str, 
 def _check_together(full: Mapping[str, Floats], scenario: ScenarioFields, naming: _Naming) -> None:
     for index in range(scenario.vehicles):
         latency, speed, limit = (full[f][:, index] for f in ("latency_s", "speeds_mps", "speed_limit_mps"))
-        right = f"must be below the scenario's horizon_s ({scenario.horizon_s:g} s)"
+        right = f"must be below horizon_s of the scenario ({scenario.horizon_s:g} s)"
         _require_all(latency < scenario.horizon_s, naming, ("latency_s", index), latency, right)
         good = speed <= limit
         limit_mps = limit[np.argmin(good)]  # limit in the world that the message names
@@ -139,10 +143,10 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
 
     Args:
         good: whether the value is valid in each world, [n].
-        naming: how messages name a value.
+        naming: how error messages name a value.
         entry: quantity and index of the value.
-        column: the values, [n].
-        right: what would be valid, for the message.
+        column: the value in each world, [n].
+        right: what would be valid, for the error message.
 
     """
     if not good.all():
@@ -151,18 +155,18 @@ def _require_all(good: Bools, naming: _Naming, entry: Entry, column: Floats, rig
 
 
 def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> list[Entry]:
-    """Return quantity and index of each column of a table with this header.
+    """Return (quantity, index) of each column of a table with this header.
 
-    Raises ``InvalidInput``, with ``where`` in its text, for unknown, repeated and missing columns.
+    Raises ``InvalidInput``, whose message begins with ``where``, for unknown, repeated and missing columns.
     """
     known = table_columns(scenario)
     if twice := [name for name, times in Counter(header).items() if times > 1]:
-        raise InvalidInput(f"{where}: column {twice[0]!r} is given twice")
+        raise InvalidInput(f"{where}: column {twice[0]!r} occurs twice")
     for name in header:
         if name == RECORDING:
             raise InvalidInput(
-                f"{where}: column {name!r}: worlds that are read carry no recordings, so intervals would take them as"
-                " independent; make the table the scenario's own (key table), or leave the column out"
+                f"{where}: column {name!r} cannot be read here, and without it confidence intervals would treat all"
+                " worlds as independent; put the table into the scenario (key table), or remove the column"
             )
         if name not in known:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
@@ -170,7 +174,9 @@ def _known_columns(header: list[str], scenario: ScenarioFields, where: str) -> l
             raise InvalidInput(f"{where}: unknown column {name!r}; {hint}{separator}")
     for name, (field, _) in known.items():
         if field in _ALWAYS_IN_A_TABLE and name not in header:
-            raise InvalidInput(f"{where}: column {name!r} is missing; {scenario.vehicles} vehicles need it")
+            raise InvalidInput(
+                f"{where}: column {name!r} is missing; a table for {scenario.vehicles} vehicles must have it"
+            )
     return [known[name] for name in header]
 
 
@@ -182,9 +188,9 @@ def _numbers(what: str, value: ArrayLike) -> Floats:
 
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
-    """Return the header of a CSV file, its rows (at least one), and the line number at which each row begins.
+    """Return the header of a CSV file, its rows (at least one), and the number of the line on which each row begins.
 
-    Values are texts and are not checked.
+    The values are unchecked texts.
     """
     rows: list[list[str]] = []
     lines: list[int] = []
@@ -203,23 +209,25 @@ def _read_csv(file: Path) -> tuple[list[str], list[list[str]], list[int]]:
     if not rows or not rows[0]:
         raise InvalidInput(f"{file}, line 1: must name the columns, for instance gap_1_m,gap_2_m,speed_1_mps,...")
     if len(rows) == 1:
-        raise InvalidInput(f"{file}: has a header but no rows; one row is one world")
+        raise InvalidInput(f"{file}: has a header but no rows; add one row per world")
     return [name.strip() for name in rows[0]], rows[1:], lines[1:]
 
 
 def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: str) -> float | str:
-    """Return the number in one column of a CSV row, or the text of ``recording``; raise ``InvalidInput`` for another.
+    """Return the value in one column of a CSV row: a number, or a text in the column ``recording``.
+
+    Raises ``InvalidInput`` if the row has the wrong length or the value is not a number.
 
     Args:
-        file: the file, for messages.
-        header: names of the columns.
+        file: path of the file, for error messages.
+        header: names of all columns.
         row: texts of the row.
-        line: line on which the row begins, for messages.
+        line: number of the line on which the row begins, for error messages.
         column: name of the column to read.
 
     """
     if len(row) != len(header):
-        raise InvalidInput(f"{file}, line {line}: {len(row)} values, but the header has {len(header)} columns")
+        raise InvalidInput(f"{file}, line {line}: has {len(row)} values, but the header has {len(header)} columns")
     text = row[header.index(column)]
     number = parse_numeral(text.strip()) if column != RECORDING else text.strip()
     if number is None:
@@ -228,18 +236,18 @@ def _cell_at(file: Path, header: list[str], row: list[str], line: int, column: s
 
 
 def table_columns(scenario: ScenarioFields) -> dict[str, Entry]:
-    """Return name -> (quantity, index) of the columns that a table of initial states may have for this scenario.
+    """Return the columns that a table of initial states may have for this scenario: name -> (quantity, index).
 
-    For example ``{"gap_1_m": ("gaps_m", 0), "speed_1_mps": ("speeds_mps", 0)}``.
+    An example is ``{"gap_1_m": ("gaps_m", 0), "speed_1_mps": ("speeds_mps", 0)}``.
     """
     return columns_of_table(_quantities(scenario), scenario.vehicles)
 
 
 def read_worlds(scenario: ScenarioFields, path: str | Path) -> Worlds:
-    """Read worlds from a CSV file with a header line; columns as in ``worlds_from_table``.
+    """Read worlds from a CSV file with a header line and the same columns as in ``worlds_from_table``.
 
     Raises ``InvalidInput`` with file, line and column for an unknown, repeated or missing column, a value that is not a
-    number or out of range, a row of the wrong length, a file without rows, or one larger than ``SIZE_LIMIT``.
+    number or out of range, a row of the wrong length, a file without rows, or a file larger than ``SIZE_LIMIT``.
     """
     file = Path(path)
     header, rows, lines = _read_csv(file)
@@ -254,22 +262,24 @@ def read_worlds(scenario: ScenarioFields, path: str | Path) -> Worlds:
 def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
     """Read the rows of a scenario's table, and their weights, from a CSV file.
 
-    Returns ``{"rows": [[7.0, 8.0], ...]}``, with ``"weights": [1.0, ...]`` if weights are given. Raises
+    Returns ``{"rows": [[7.0, 8.0], ...]}``, and also ``"weights": [1.0, ...]`` unless ``weights`` is None. Raises
     ``InvalidInput`` naming file, line and column.
 
     Args:
-        file: the CSV file, with a header line.
-        columns: names of the columns to read, from the scenario file (unchecked).
-        weights: name of the column with the weight of each row; None: no weights.
+        file: path of the CSV file, which has a header line.
+        columns: names of the columns to read, unchecked, as the scenario file lists them.
+        weights: name of the column with the weight of each row; None: the rows have no weights.
 
     """
     header, rows, lines = _read_csv(file)
     weights_of = [] if weights is None else [weights]
     if not isinstance(columns, list | tuple):
-        raise InvalidInput(f"{file}: columns = {columns!r:.60}: must be a list of columns: {', '.join(header)}")
+        raise InvalidInput(
+            f"{file}: columns = {columns!r:.60}: must be a list of columns of this file, which are {', '.join(header)}"
+        )
     for name in (*columns, *weights_of):
         if header.count(name) != 1:
-            many = "is there twice" if name in header else f"is not there; {suggestion(str(name), header)}"
+            many = "occurs twice" if name in header else f"is missing; {suggestion(str(name), header)}"
             raise InvalidInput(f"{file}, line 1: column {name!r:.60} {many.removesuffix('; ')}")
     cells = [
         [_cell_at(file, header, row, line, str(name)) for name in (*columns, *weights_of)]
@@ -280,7 +290,7 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
 
 
 def rows_text(table: Table) -> str:
-    """Return the rows of a scenario's table as CSV text; the weights of rows are its column ``weight``."""
+    """Return the rows of a scenario's table as CSV text; the column ``weight`` has the weights of the rows."""
     rows, weights = table.rows or (), table.weights
     listed = [[*row, weights[k]] for k, row in enumerate(rows)] if isinstance(weights, tuple) else rows
     text = io.StringIO()
@@ -291,10 +301,10 @@ def rows_text(table: Table) -> str:
 def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]) -> Worlds:
     """Build worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
-    Gaps and speeds are needed. Optional: ``braking_capacity_1_mps2``, ``driving_capacity_1_mps2``, ``latency_1_s``,
-    ``mass_1_t``, ``speed_limit_1_mps`` and so on for each vehicle, ``restitution``, and ``obstacle_gap_m`` if the
-    scenario has an obstacle. A column that is left out is taken from the scenario, where it must be a fixed number.
-    Raises ``InvalidInput`` naming the column and the row (from 0).
+    Columns of gaps and speeds are required. Optional columns are ``braking_capacity_1_mps2``,
+    ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``, ``speed_limit_1_mps`` and the like for each vehicle,
+    ``restitution``, and ``obstacle_gap_m`` if the scenario has an obstacle. Quantities without a column have the
+    scenario's value, which must be a fixed number. Raises ``InvalidInput`` naming the column and the row (from 0).
     """
     entries = _known_columns(list(columns), scenario, "initial states")
     by_entry = {
@@ -304,15 +314,15 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
     shapes = {column.shape for column in by_entry.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         lengths = ", ".join(f"{name} {list(np.shape(column))}" for name, column in columns.items())
-        raise InvalidInput(f"initial states: columns must be lists of one and the same length, not {lengths}")
+        raise InvalidInput(f"initial states: all columns must be lists of the same length; their shapes are {lengths}")
     return _worlds(by_entry, scenario, _Naming("initial states", "table"))
 
 
 def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]) -> Worlds:
     """Build one world (n = 1) from a state ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``.
 
-    Keys are a scenario's quantities. A single number applies to every vehicle. A key that is left out is taken from the
-    scenario, where it must be a fixed number. Raises ``InvalidInput`` naming the key and the entry.
+    The keys are the quantities of a scenario. A single number applies to every vehicle. Quantities without a key have
+    the scenario's value, which must be a fixed number. Raises ``InvalidInput`` naming the key and the entry.
     """
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
@@ -321,13 +331,15 @@ def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]
     for field, value in initial_state.items():
         if field not in known:
             if field in QUANTITY.optional:
-                raise InvalidInput(f"initial_state: {field} is not of this scenario: {scenario.name!r} has no {field}")
+                raise InvalidInput(
+                    f"initial_state: {field} cannot be set, because scenario {scenario.name!r} does not declare it"
+                )
             hint = suggestion(str(field), known) or f"known: {', '.join(known)}"
             raise InvalidInput(f"initial_state: unknown key {field!r}; {hint}")
         count = known[field].count(scenario.vehicles)
         numbers = _numbers(f"initial_state: {field}", value)
         if numbers.shape not in ((), (count,)):
-            several = f"{scenario.vehicles} vehicles need {count} numbers, or one for all"
+            several = f"must be a list of {count} numbers (for {scenario.vehicles} vehicles), or one number for all"
             right = "must be one number" if known[field].per == "world" else several
             raise InvalidInput(f"initial_state: {field} has shape {list(numbers.shape)}; {right}")
         for index, number in enumerate(np.broadcast_to(numbers, (count,))):

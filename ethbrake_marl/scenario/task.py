@@ -11,21 +11,21 @@ from ethbrake_marl.scenario.schema import Scenario
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """The task of controlling some vehicles of a scenario; all others follow the scenario's scripts.
+    """The task of controlling some vehicles of a scenario; all other vehicles follow the scenario's scripts.
 
-    Raises ``InvalidInput`` for an index without a vehicle, a repeated index, or an unknown harm count.
+    Raises ``InvalidInput`` for an index that no vehicle has, a repeated index, or an unknown harm count.
     """
 
     scenario: Scenario  # the scenario that the worlds are drawn from
     vehicles: tuple[int, ...]  # indices of the controlled vehicles (0 = front), in the order of their commands
-    harm_count: HarmCount = "first"  # harm to be minimised: of each pair's ``"first"`` impact, or ``"total"``
+    harm_count: HarmCount = "first"  # harm to be minimised: ``"first"``, first-impact harm; ``"total"``, total harm
 
     def __post_init__(self) -> None:
         check_harm_count(self.harm_count)
         known = set(range(self.scenario.vehicles))
         if len(set(self.vehicles)) != len(self.vehicles) or not set(self.vehicles) <= known:
             raise InvalidInput(
-                f"task: vehicles {self.vehicles}: must be indices from 0 to {self.scenario.vehicles - 1}, each once"
+                f"task: vehicles {self.vehicles}: must be different indices from 0 to {self.scenario.vehicles - 1}"
             )
 
     @property
@@ -33,7 +33,8 @@ class Task:
         """Index of the single controlled vehicle; raises ``InvalidInput`` unless there is exactly one."""
         if len(self.vehicles) != 1:
             raise InvalidInput(
-                f"scenario {self.scenario.name!r}: needs one controlled vehicle; controlled are: {self.names}"
+                f"scenario {self.scenario.name!r}: exactly one vehicle must be controlled here; the controlled vehicles"
+                f" are: {self.names}"
             )
         return self.vehicles[0]
 

@@ -1,7 +1,7 @@
-"""Vehicle types: the quantities of a car, a van or a truck, and which types are possible at each place of a line.
+"""Vehicle types: the quantities of a car, a van or a truck, and the types that are possible at each place of a line.
 
-A vehicle first draws its type, then its quantities as that type declares them. Quantities that depend on the load,
-``{with_load: [empty, full]}``, depend on the same load: a full truck is heavy *and* brakes weakly.
+The type of a vehicle is drawn first, then its quantities are drawn from the declarations of this type. All quantities
+``{with_load: [empty, full]}`` of a vehicle depend on the same load: a full truck is heavy *and* brakes weakly.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from ethbrake_marl.scenario.distributions import (
 )
 from ethbrake_marl.scenario.fields import MEANING, QUANTITY, RECORDING
 
-ANY = "any"  # in ``types``: every type, in proportion to its weight
+ANY = "any"  # entry of ``types`` that allows every type, in proportion to its weight
 
 TypeName = Annotated[str, Field(pattern=NAME_PATTERN)]
 
@@ -64,11 +64,11 @@ TypeQuantity = Annotated[
 
 
 class VehicleType(FileModel):
-    """One type of vehicle: its weight and its quantities; other quantities come from outside ``vehicle_types``."""
+    """A vehicle type: weight and quantities. Quantities that it leaves out are declared outside ``vehicle_types``."""
 
-    weight: Weight = Field(default=1.0, description="how likely it is, relative to the other types")
+    weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
     load: Quantity = Field(
-        default_factory=lambda: Uniform(uniform=(0.0, 1.0)), description="share of the full load, 0 to 1"
+        default_factory=lambda: Uniform(uniform=(0.0, 1.0)), description="load, as a fraction of the full load, 0 to 1"
     )
     braking_capacity_mps2: TypeQuantity | None = Field(default=None, description=MEANING["braking_capacity_mps2"])
     driving_capacity_mps2: TypeQuantity | None = Field(default=None, description=MEANING["driving_capacity_mps2"])
@@ -79,7 +79,9 @@ class VehicleType(FileModel):
     release_rate_mps3: TypeQuantity | None = Field(
         default=None, exclude_if=not_, description=MEANING["release_rate_mps3"]
     )
-    v2x: Equipage | None = Field(default=None, exclude_if=not_, description="what it has of V2X; by default all")
+    v2x: Equipage | None = Field(
+        default=None, exclude_if=not_, description="V2X equipment of this type; by default sending and receiving"
+    )
 
     @field_validator(*QUANTITY.of_a_type)
     @classmethod
@@ -93,18 +95,18 @@ class VehicleType(FileModel):
     @classmethod
     def _share(cls, value: Any) -> Any:
         low, high = support(value)
-        require(low >= 0.0 and high <= 1.0, (), value, "must be in [0, 1]: 0 empty, 1 full")
+        require(low >= 0.0 and high <= 1.0, (), value, "a load must be in [0, 1]: 0 is empty, 1 is full")
         return value
 
 
 def _check_type_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
-    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} stands for every type; give another name")
+    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} means every type, so it cannot be a name; use another name")
     return kinds
 
 
 VehicleTypes = Annotated[dict[TypeName, VehicleType], Field(min_length=1), AfterValidator(_check_type_names)]
 
-TypesHere = str | dict[str, Weight]  # types of one vehicle: a type, ``any``, or a weight per possible type
+TypesHere = str | dict[str, Weight]  # possible types of one vehicle: a type, ``any``, or a weight per type
 
 
 def _one_or_each(value: object) -> str:
@@ -119,11 +121,11 @@ Types = Annotated[
 
 
 class TypesOfLine:
-    """The possible vehicle types at each place of a line, and their probabilities.
+    """The possible vehicle types at each place of a line, and their weights.
 
     Args:
-        kinds: declaration of each type, by name; their order gives the indices of the types.
-        types: types that are possible at each place; None: all, in proportion to their weights.
+        kinds: declaration of each type, by name; the index of a type is its position in this mapping.
+        types: possible types, one entry per place or one for all; None: all types, in proportion to their weights.
         vehicles: number of vehicles in the line.
 
     """
@@ -136,13 +138,13 @@ class TypesOfLine:
         self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in of_vehicle])
 
     def possible(self, vehicle: int) -> list[int]:
-        """Return the indices of the types that are possible for ``vehicle`` (index from 0)."""
+        """Return the indices of the possible types of ``vehicle`` (index from 0)."""
         return np.flatnonzero(self.weights[vehicle] > 0.0).tolist()
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
-        """Return type (index) and load (0 empty to 1 full) of every vehicle, both [n, N].
+        """Return the type (index) and the load (0 empty to 1 full) of every vehicle, both [n, N].
 
-        ``u``: uniform numbers in [0, 1), [n, N, 2 or more]; the first draws the type, the second the load.
+        ``u``: uniform numbers in [0, 1), [n, N, 2 or more]; ``u[..., 0]`` draws the type, ``u[..., 1]`` the load.
         """
         n, vehicles = u.shape[:2]
         types, load = np.zeros((n, vehicles), np.int64), np.zeros((n, vehicles))
@@ -161,7 +163,7 @@ def _weight(kinds: Mapping[str, VehicleType], name: str, here: TypesHere) -> flo
     return here.get(name, 0.0)
 
 
-LEFT_OUT: Any = object()  # default that marks a missing key, which a check then accepts or refuses
+LEFT_OUT: Any = object()  # default value that marks a missing key; a check then accepts or rejects it
 
 PerVehicle = Annotated[
     Annotated[Quantity, Tag("#one")] | Annotated[tuple[Quantity, ...], Field(strict=False, min_length=1), Tag("#each")],
@@ -170,9 +172,9 @@ PerVehicle = Annotated[
 
 
 class _ObjectiveSchema:
-    """Annotation of a text field that holds an objective: its JSON schema lists all objectives.
+    """Pydantic annotation of an objective's name: the field's JSON schema lists all objectives.
 
-    Objectives that are registered before the schema is made are included.
+    The schema includes objectives that are registered before it is generated.
     """
 
     @classmethod
@@ -185,11 +187,11 @@ class _ObjectiveSchema:
 
 ObjectiveName = Annotated[str, _ObjectiveSchema]
 
-MOST_NUMBERS = 100_000  # largest number of values in a table, which every copy of the scenario contains
+MOST_NUMBERS = 100_000  # largest number of values in a table; every copy of the scenario contains the table
 
 MOST_CHARACTERS = 200  # longest name of a recording in a table
 
-_NAME = f"recording must be a text of 1 to {MOST_CHARACTERS} printable characters, as in 'drive_1.csv: 2-3-4'"
+_NAME = f"recording must be a text of 1 to {MOST_CHARACTERS} printable characters, such as 'drive_1.csv: 2-3-4'"
 
 Column = Annotated[str, Field(pattern=r"^[a-z_]+(_[0-9]+)?[a-z0-9_]*$", max_length=64)]
 
@@ -202,50 +204,56 @@ Row = Annotated[tuple[Cell, ...], Field(strict=False, min_length=1)]
 
 
 class Table(FileModel):
-    """Rows of measured values; every world takes one row, by weight.
+    """A table of measured values: every world takes one of its rows, drawn by weight.
 
-    In a scenario file they may come from a CSV file. Rows with the same text in the column ``recording`` are not
-    independent of each other: they come from the same vehicles in the same recording.
+    A scenario file may name a CSV file that contains the rows. Rows with the same text in the column ``recording`` come
+    from the same vehicles in the same recording, so they are not independent of each other.
     """
 
-    file: str = Field(default="", exclude_if=not_, description="CSV file with a header, from the scenario's folder on")
+    file: str = Field(
+        default="", exclude_if=not_, description="path of a CSV file with a header, relative to the scenario's folder"
+    )
     columns: Annotated[tuple[Column, ...], Field(strict=False, min_length=1)] = Field(
-        description="as in a table of initial states: gap_1_m, speed_2_mps, ...; of a file those that are used;"
-        " recording is a text: which recording and vehicles a row comes from"
+        description="names of the columns, or of the columns of the file that are used: gap_1_m, speed_2_mps, ...;"
+        " the column recording has texts that name the recording and the vehicles of a row"
     )
     weights: str | Annotated[Numbers, Field()] | None = Field(
-        default=None, exclude_if=not_, description="how likely each row is; of a file the column that says it"
+        default=None,
+        exclude_if=not_,
+        description="how likely each row is: a list with one number per row, or the name of a column of the file",
     )
     rows: Annotated[tuple[Row, ...], Field(strict=False, min_length=1)] | None = Field(
-        default=None,
-        description="one number for each column, of recording a text; left out with a file, which has them",
+        default=None, description="rows with one number per column (a text for recording); left out if file is given"
     )
 
     @model_validator(mode="after")
     def _complete(self) -> Table:
-        read = "files are read where they stand in a file (load_scenario); give rows"
-        require(not (self.file and self.rows), ("file",), self.file, "give either a file or rows, not both")
+        read = "must be given as lists here; only load_scenario reads the rows from a file"
+        require(
+            not (self.file and self.rows), ("file",), self.file, "cannot be combined with rows; leave one of them out"
+        )
         require(self.rows is not None and not isinstance(self.weights, str), ("rows",), UNSHOWN, read)
         rows = self.rows or ()
         for k, row in enumerate(rows):
-            right = f"has {len(row)} numbers; there are {len(self.columns)} columns"
+            right = f"has {len(row)} values; must have one for each of the {len(self.columns)} columns"
             require(len(row) == len(self.columns), ("rows", k), UNSHOWN, right)
             for c, (name, cell) in enumerate(zip(self.columns, row, strict=True)):
                 good = _names(cell) if name == RECORDING else not isinstance(cell, str)
                 require(good, ("rows", k, c), cell, _NAME if name == RECORDING else f"{name} must be a number")
         numbers = len(rows) * sum(name != RECORDING for name in self.columns)
-        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, f"{numbers:,} numbers; at most {MOST_NUMBERS:,}")
+        most = f"has {numbers:,} numbers; must have at most {MOST_NUMBERS:,}"
+        require(numbers <= MOST_NUMBERS, ("rows",), UNSHOWN, most)
         twice = [name for name in self.columns if self.columns.count(name) > 1]
-        require(not twice, ("columns",), twice[:1], "each column can be given once")
-        require(self.columns != (RECORDING,), ("columns",), self.columns, "a column of numbers is needed beside it")
+        require(not twice, ("columns",), twice[:1], "must not list a column twice")
+        require(self.columns != (RECORDING,), ("columns",), self.columns, "must also have a column of numbers")
         if isinstance(self.weights, tuple):
-            fits = f"must be one for each of {len(rows)} rows, all above 0, and their sum finite"
+            fits = f"must be {len(rows)} numbers, one per row, all above 0 and with a finite sum"
             good = len(self.weights) == len(rows) and min(self.weights) > 0.0 and math.isfinite(sum(self.weights))
             require(good, ("weights",), UNSHOWN, fits)
         return self
 
     def column_values(self) -> dict[str, TableColumn]:
-        """Return the columns of the table by name, ``recording`` too, each with the weights of the rows."""
+        """Return the columns of the table by name, including ``recording``, each with the weights of the rows."""
         rows = self.rows or ()
         weights = self.weights if isinstance(self.weights, tuple) else (1.0,) * len(rows)
         cumulative = np.cumsum(np.asarray(weights))

@@ -1,4 +1,4 @@
-"""Attach a shield to an environment: the same options and checks for every interface."""
+"""Attach a shield to an environment, with the same options and checks for every interface."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ethbrake_marl.shields.options import ShieldOptions
 
 
 def proposing_agent(policy: object, where: str) -> Agent:
-    """Return ``policy`` as an agent that proposes actions: an agent unchanged, a learned policy as a ``LearnedAgent``.
+    """Return ``policy`` as an agent: an agent is returned unchanged, a learned policy becomes a ``LearnedAgent``.
 
-    Anything else raises ``InvalidInput``, whose message begins with ``where``.
+    Raises ``InvalidInput`` for any other object; the message begins with ``where``.
     """
     if not isinstance(policy, type):
         if isinstance(policy, Agent):
@@ -28,8 +28,8 @@ def proposing_agent(policy: object, where: str) -> Agent:
         if callable(policy) and isinstance(getattr(policy, "observation", None), ObservationSpec):
             return LearnedAgent(policy)  # type: ignore[arg-type]  # it is callable, and says what it observes
     raise InvalidInput(
-        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy); wrap a function by"
-        " eb.policy_agent"
+        f"{where}: policy = {policy!r}: must be an agent or a policy (eb.load_policy); eb.policy_agent(function)"
+        " makes an agent of a function"
     )
 
 
@@ -41,9 +41,10 @@ def proposing_agents(
     Args:
         policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
         vehicles: indices of the shielded vehicles.
-        where: name of the interface, for error messages.
+        where: name of the user's interface, with which error messages begin.
 
-    Raises ``InvalidInput`` for anything else, and if the team or mapping does not cover exactly these vehicles.
+    Raises ``InvalidInput`` if ``policy`` is none of these, and if the team or mapping does not cover exactly the
+    shielded vehicles.
 
     """
     if isinstance(policy, Team):
@@ -56,12 +57,12 @@ def proposing_agents(
         return dict.fromkeys(vehicles, agent)
     if set(drivers) != set(vehicles):
         names = ", ".join(f"vehicle_{i + 1}" for i in vehicles)
-        raise InvalidInput(f"{where}: policy: one for each of {names} is needed, and for nobody else")
+        raise InvalidInput(f"{where}: policy: must have one policy for each of {names}, and for no other vehicle")
     return {i: drivers[i] for i in vehicles}
 
 
 Proposing = Agent | LearnedPolicy | Team | Mapping[str, Agent | LearnedPolicy]
-"""Who proposes: one for every shielded vehicle, a team, or one for each by its vehicle's name."""
+"""Proposing policies: one policy for all shielded vehicles, a team, or a mapping from vehicle name to policy."""
 
 
 def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -> ShieldGuard:
@@ -69,25 +70,27 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
 
     Args:
         engine: the engine, which is not changed.
-        policy: proposes the actions that the caller leaves out; None: nobody. Mode ``episode`` needs it.
+        policy: policy that proposes the actions that the caller leaves out. It may be None, except in mode
+            ``episode``.
         options: settings of the shield.
 
-    Raises ``InvalidInput`` if no vehicle learns, if several learn in another mode than ``step``, and if ``policy`` is
-    not a policy.
+    Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn in another mode than ``step``, and if
+    ``policy`` is not a policy.
 
     """
     where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
     if not vehicles:
         raise InvalidInput(
-            f"{where}: no vehicle of scenario {scenario.name!r} learns, so there is nobody to shield; pass"
-            " learners=['vehicle_2'] to the environment"
+            f"{where}: no vehicle of scenario {scenario.name!r} learns, and only learners can be shielded; make the"
+            " environment with learners=['vehicle_2']"
         )
     if mode != "step":
         check_one_learner(
             scenario.name,
             [scenario.vehicle_names[i] for i in vehicles],
-            f"{where} needs exactly one learner in mode {mode}: what it certifies is known only if every other vehicle"
-            " follows a script; mode step shields several together; or pass learners=['vehicle_2'] to the environment",
+            f"{where} needs exactly one learner in mode {mode}: its bound holds only if every other vehicle follows a"
+            " script; use mode='step', which shields several learners together, or make the environment with"
+            " learners=['vehicle_2']",
         )
     if mode == "episode":
         return options.guard(engine, {vehicles[0]: proposing_agent(policy, where)})
@@ -96,18 +99,18 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
 
 
 class Attached:
-    """The link between a wrapper of an environment and the guard that it puts into the environment's engine.
+    """The link between an environment's shield wrapper and the guard in the environment's engine.
 
     Args:
         env: the environment to shield.
         interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
         maker: code that makes such an environment, for error messages.
-        policy: proposes the actions that the caller leaves out; None: nobody.
-        where: name of the wrapper, for error messages.
+        policy: policy that proposes the actions that the caller leaves out; None: no policy.
+        where: name of the wrapper, with which error messages begin.
         options: keywords of ``ShieldOptions``.
 
-    The attributes are ``engine``, ``guard`` and ``options``, besides the properties below. Raises ``InvalidInput`` if
-    ``env`` is not an environment of this package, or is shielded already.
+    It has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env`` is not an
+    environment of this package, or already has a shield.
 
     """
 
@@ -119,19 +122,20 @@ class Attached:
         if isinstance(engine, Engine) and isinstance(engine.guard, ShieldGuard):
             first = engine.guard
             raise InvalidInput(
-                f"{where}: a {first.where} (mode {first.mode.name.lower()}) shields this environment already, and its"
-                " bound holds for one shield alone; give that one other options, or close() it first"
+                f"{where}: this environment already has a shield, a {first.where} (mode {first.mode.name.lower()}),"
+                " and can have only one; give that shield other options, or close() it first"
             )
         if isinstance(getattr(env, "attached", None), Attached):
-            raise InvalidInput(f"{where}: {env} is a shield that was closed; put this one around what that is around")
+            raise InvalidInput(f"{where}: {env} is a shield that was closed; pass the environment inside it instead")
         if not (isinstance(env, interface) and isinstance(engine, Engine)):
             raise InvalidInput(
-                f"{where}: goes around {maker}, not {env}; eb.shield(env) chooses the one for an environment of ours"
+                f"{where}: {env}: must be an environment made by {maker}; eb.shield(env) chooses the right wrapper for"
+                " any environment of this package"
             )
         if engine.components and self.options.intervention_penalty > 0.0:
             raise InvalidInput(
-                f"{where}: intervention_penalty = {self.options.intervention_penalty:g}: is subtracted from a number,"
-                " and rewards are vectors here; leave it out"
+                f"{where}: intervention_penalty = {self.options.intervention_penalty:g}: cannot be subtracted, because"
+                " the rewards of this environment are vectors; leave the penalty out"
             )
         self.engine, self._left = engine, Guarded(None, {})
         self.guard = guard_of(engine, policy, self.options)
@@ -139,7 +143,7 @@ class Attached:
 
     @property
     def memory(self) -> Guarded:
-        """Current memory of the guard; after ``close``, its last memory."""
+        """Current memory of the guard; after ``close``, its memory when the shield was closed."""
         memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
         return Guarded(None, {}) if memory is None else memory
 
@@ -147,24 +151,24 @@ class Attached:
     def shield(self) -> Any:
         """Current state of the shield, for reading only; None before the first reset.
 
-        A ``StepShield`` in mode ``step``, the memory of the ``HybridAgent`` in mode ``episode``, or the shield of
-        another mode.
+        In mode ``step`` it is a ``StepShield``, in mode ``episode`` the memory of the ``HybridAgent``. Modes of
+        extensions have types of their own.
         """
         return self.memory.shield
 
     def _reached(self) -> Any:
-        """Return the engine of the wrapped environment, looked up anew at each call; None if there is none."""
+        """Return the engine that the wrapped environment has now; None if it has no engine."""
         return getattr(getattr(self._env, "unwrapped", self._env), "engine", None)
 
     def check_open(self) -> None:
         """Raise ``InvalidInput`` if this shield was closed, or if the environment inside the wrapper was replaced."""
         if self._reached() is not self.engine:
             raise InvalidInput(
-                f"{self.options.where}: another environment is inside than the one that is shielded; put a shield"
-                " around that one"
+                f"{self.options.where}: the environment inside this wrapper was replaced; put a new shield around the"
+                " new environment"
             )
         if self.engine.guard is not self.guard:
-            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new one around the environment")
+            raise InvalidInput(f"{self.options.where}: this shield was closed; put a new shield around the environment")
 
     def close(self) -> None:
         """Remove this shield from the environment. ``memory`` and ``shield`` keep their last values."""
@@ -173,7 +177,7 @@ class Attached:
             self.engine.protect(None)
 
     def penalty(self) -> Floats:
-        """Return the intervention penalty of the last step, [n, L], for the wrapper to subtract from the rewards."""
+        """Return the intervention penalty of each learner in the last step, [n, L]; the wrapper subtracts it."""
         self.check_open()
         ruling = self.engine.ruling
         if ruling is None:

@@ -1,10 +1,11 @@
-"""``certify``: apply the proposed action if a plan behind it keeps the budget, else apply the backup plan's action.
+"""``certify``: apply the proposed action if some plan after it keeps the budget, else apply the backup plan's action.
 
-A *plan* holds one action for each decision up to the horizon. The *backup* is the plan that the shield currently holds.
-The *budget* is the largest harm that the shield accepts for the whole episode. A *member* is one of the possible worlds
-that a world stands for. Each plan is simulated in every member, with the kernels of ``members``. Two plans are tried
-after a proposal: the rest of the current plan, then the best constant action. ``step`` proves that the harm of the
-episode then never exceeds the first bound.
+A *plan* is a sequence of actions, one for each decision up to the horizon. The *backup* is the present plan of the
+shield. The *budget* is the largest harm that the shield accepts for the whole episode. The shield may consider several
+*possible worlds* (members) for each world; each plan is simulated in all of them, with the kernels of ``members``.
+
+After a proposal two plans are tried: the rest of the backup, and the best constant action. The module ``step`` proves
+that the harm of the episode never exceeds the bound at the alert.
 """
 
 from __future__ import annotations
@@ -43,23 +44,23 @@ from ethbrake_marl.shields.running import Running, put
 
 APPLIED, REASON, BOUND, MARGIN = range(4)  # columns of the decision of one vehicle
 
-# A constant action is first simulated in one segment. If its harm (m2/s2) is above the limit by at most this much, the
-# exact simulation, decision by decision, still gets its chance.
+# A constant action is first simulated in one segment, which may round differently. If its harm exceeds the limit by at
+# most this much (m2/s2), it is still simulated exactly, decision by decision.
 NEARLY = 1e-9
 
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Return the index of the constant action with the least worst-case harm, and that harm (m2/s2).
+    """Return the index of the constant action with the least harm in the worst possible world, and this harm (m2/s2).
 
     Each action is held from now to the horizon, simulated in one segment.
 
     Args:
-        world: the M possible worlds of one world (``Members``); the worst case is over them.
-        states: [M, S] their states now, in the layout of ``Running.states``.
-        ended: [M] whether their episodes have ended.
+        world: parameters of the M possible worlds of one world (``Members``).
+        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
+        ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        constants: [C, K] actions of the K shielded vehicles.
+        constants: C constant actions of the K shielded vehicles, [C, K].
 
     """
     best, least, critical = 0, math.inf, 0
@@ -82,22 +83,20 @@ def better_plan(
     world: Members, states: Floats, ended: Bools, step: int, constants: Floats, value: float, most: float,
     plan: Floats, trial: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Replace the rest of a plan by the best constant action, if this reduces its harm.
-
-    A plan holds one action for each decision. The replacement requires a harm below ``value`` and at most ``most``.
+    """Replace the rest of a plan by the best constant action, if the harm is then below ``value`` and at most ``most``.
 
     Args:
-        world: the M possible worlds of one world (``Members``).
-        states: [M, S] their states now, in the layout of ``Running.states``.
-        ended: [M] whether their episodes have ended.
-        step: number of the present decision, from which on the plan is replaced.
-        constants: [C, K] constant actions.
+        world: parameters of the M possible worlds of one world (``Members``).
+        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
+        ended: whether the episode has ended in each possible world, [M].
+        step: number of the present decision; actions from this decision on are replaced.
+        constants: C constant actions of the K shielded vehicles, [C, K].
         value: harm of the plan in the worst possible world, m2/s2.
-        most: largest accepted harm, m2/s2.
-        plan: [L, K] changed in place.
-        trial: [L, K] workspace.
+        most: largest harm that is accepted, m2/s2.
+        plan: actions of each decision, [L, K]; changed in place.
+        trial: workspace, [L, K].
 
-    Returns the harm of the plan afterwards, and the least harm found, certified or not.
+    Returns the harm of the resulting plan, and the least harm found, which may belong to a plan that was not accepted.
 
     """
     so_far = worst_so_far(world, states)
@@ -118,14 +117,14 @@ def better_plan(
 
 @compiled
 def copy_action(action: Floats, to: Floats) -> None:
-    """Copy the numbers of ``action`` into ``to``, which is as long; usually one action per shielded vehicle."""
+    """Copy every entry of ``action`` into the array ``to`` of the same length."""
     for c in range(to.shape[0]):
         to[c] = action[c]
 
 
 @compiled
 def is_planned(action: Floats, planned: Floats) -> bool:
-    """Return whether ``action`` [K] equals the ``planned`` action [K] for all shielded vehicles."""
+    """Return whether ``action`` [K] equals the ``planned`` action [K] for each of K shielded vehicles."""
     for c in range(planned.shape[0]):  # noqa: SIM110  # all() is not compiled
         if action[c] != planned[c]:
             return False
@@ -137,27 +136,27 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Simulate one step with an action, and search for a plan that continues it within the budget.
+    """Simulate one step with an action, then search for a plan from the next state on that keeps the budget.
 
-    A plan holds one action for each decision. Tried are the rest of the present plan, then the constant actions. An
-    action for which the physics fails is not certified.
+    The rest of the present plan is tried first, then the constant actions. An action for which the physics fails is
+    not certified.
 
     Args:
-        world: the M possible worlds of one world (``Members``).
-        states: [M, S] their states now, in the layout of ``Running.states``.
-        ended: [M] whether their episodes have ended.
+        world: parameters of the M possible worlds of one world (``Members``).
+        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
+        ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        action: [K] action to try.
-        budget: largest accepted harm of the episode, m2/s2.
+        action: action of each shielded vehicle to try, [K].
+        budget: largest harm of the episode that is accepted, m2/s2.
         certified: harm of ``plan``, m2/s2.
-        constants: [C, K] constant actions.
-        plan: [L, K] present plan; on success, replaced by the action and the plan behind it.
-        room: [2, L, K] workspace.
-        after: [M, S] receives the states after the step.
-        over: [M] receives whether the episodes have ended then.
+        constants: C constant actions of the K shielded vehicles, [C, K].
+        plan: present plan, [L, K]; on success it is replaced by the action and the plan found for the later decisions.
+        room: workspace, [2, L, K].
+        after: receives the state of each possible world after the step, [M, S].
+        over: receives whether the episode has ended after the step in each possible world, [M].
 
-    Returns the harm of the plan found, which is a success if it is at most ``budget``; the least harm found; and the
-    code of the reason (``ShieldReason``).
+    Returns the harm of the plan found, the least harm of any plan tried (both m2/s2), and the reason (a code of
+    ``ShieldReason``). The search succeeded if the harm of the plan is at most ``budget``.
 
     """
     going = take_steps(world, states, ended, step, action, after, over)
@@ -181,16 +180,16 @@ def try_action(
 
 @compiled
 def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> None:
-    """Write the applied action, bound and margin of each shielded vehicle into its row of ``out`` [K, 4].
+    """Write the applied action, bound and margin of each shielded vehicle into its row of ``out``.
 
-    ``out`` has the columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN``; its reasons are filled in before. A
-    vehicle whose proposal was rejected keeps the margin that is in ``out`` already.
+    The margin of a vehicle whose proposal was rejected is left unchanged.
 
     Args:
-        out: changed in place.
-        action: [K] applied actions.
-        bound: harm that is guaranteed from now on, m2/s2.
-        margin: budget minus the harm found, m2/s2.
+        out: columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN`` for each vehicle, [K, 4]; changed in place. The
+            reasons must be filled in already.
+        action: applied actions, [K].
+        bound: harm that the episode will not exceed, m2/s2.
+        margin: budget minus the harm of the plan, m2/s2.
 
     """
     for c in range(action.shape[0]):
@@ -204,28 +203,28 @@ def decide_world(
     world: Members, states: Floats, ended: Bools, step: int, proposed: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, tried: Floats, after: Floats, over: Bools, out: Floats,
 ) -> bool:  # fmt: skip
-    """Decide in one world: accept the proposed actions, or replace them by those of the plan.
+    """Decide in one world: accept the proposed actions, or replace them by the actions of the plan.
 
-    All proposals are tried together first. If they have no certificate, the vehicles are tried one by one, front to
-    rear, each beside the actions that the plan holds by then.
+    All proposals are tried together first. If no plan after them keeps the budget, they are tried one by one, front to
+    rear, while the other vehicles act as planned. An accepted proposal becomes part of the plan for the next attempts.
 
     Args:
         world: the M possible worlds of this world (``Members``).
-        states: [M, S] their states now, in the layout of ``Running.states``.
-        ended: [M] whether their episodes have ended.
+        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
+        ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        proposed: [K] proposed actions; NaN: none.
-        budget: largest accepted harm of the episode, m2/s2.
+        proposed: proposed actions, [K]; NaN for a vehicle without a proposal.
+        budget: largest harm of the episode that is accepted, m2/s2.
         certified: harm of ``plan``, m2/s2.
-        constants: [C, K] constant actions that may replace the rest of a plan.
-        plan: [L, K] one action for each decision; changed in place, so that its harm is the bound in ``out``.
-        room: [2, L, K] workspace.
-        tried: [2, K] workspace.
-        after: [M, S] receives the states after the step.
-        over: [M] receives whether the episodes have ended then.
-        out: [K, 4] receives applied action, reason, bound and margin of each vehicle.
+        constants: constant actions that may replace the rest of a plan, [C, K].
+        plan: actions of each decision, [L, K]; changed in place to the plan whose harm is the bound in ``out``.
+        room: workspace, [2, L, K].
+        tried: workspace, [2, K].
+        after: receives the state of each possible world after the step, [M, S].
+        over: receives whether the episode has ended after the step in each possible world, [M].
+        out: receives applied action, reason, bound and margin of each vehicle, [K, 4].
 
-    Returns False if the physics fails with the applied actions.
+    Returns False if the physics fails with the applied actions, otherwise True.
 
     """
     deviating = 0
@@ -270,21 +269,21 @@ def certify_worlds(
     running: Running, proposed: Floats, budget: Floats, certified: Floats, constants: Floats, plans: Floats,
     after: Floats, out: Floats, over: Bools, failed: Bools,
 ) -> None:  # fmt: skip
-    """Decide in each of n worlds whose episode still runs, by ``decide_world``.
+    """Call ``decide_world`` in each of n worlds whose episode has not ended.
 
     A world whose episode has ended keeps its state and its plan.
 
     Args:
         running: the episodes at this decision, n worlds with M possible worlds each.
-        proposed: [n, K] proposed actions; NaN: none.
-        budget: [n] largest accepted harm of each episode, m2/s2.
-        certified: [n] harm of each plan, m2/s2.
-        constants: [C, K] constant actions that may replace the rest of a plan.
-        plans: [n, L, K] one action for each decision; changed in place.
-        after: [n * M, S] receives the states after the step.
-        out: [n, K, 4] receives applied action, reason, bound and margin of each vehicle.
-        over: [n * M] receives whether the episodes have ended then.
-        failed: [n] receives whether the physics failed.
+        proposed: proposed actions, [n, K]; NaN where nothing is proposed.
+        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        certified: harm of each plan, [n] m2/s2.
+        constants: constant actions that may replace the rest of a plan, [C, K].
+        plans: plan of each world, with the actions of each decision, [n, L, K]; changed in place.
+        after: receives the state of each possible world after the step, [n * M, S].
+        out: receives applied action, reason, bound and margin of each vehicle, [n, K, 4].
+        over: receives whether the episode has ended after the step in each possible world, [n * M].
+        failed: receives whether the physics failed in each world, [n].
 
     """
     n, every = running.steps.shape[0], all_members(running)
@@ -310,10 +309,10 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Write the harm of each plan, executed from now on, to ``value`` [n] m2/s2; infinity if the physics fails.
+    """Write to ``value`` [n] the harm of the whole episode if each plan is executed from now on, m2/s2.
 
-    The harm is that of the whole episode in the worst possible world. If one of the ``constants`` [C, K] (constant
-    actions) harms less than a plan, it first replaces the rest of that plan in ``plans`` [n, L, K].
+    The harm is the largest over the possible worlds; infinity if the physics fails. If one of the constant actions
+    ``constants`` [C, K] does less harm than the rest of a plan, it first replaces that rest in ``plans`` [n, L, K].
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -332,9 +331,9 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    A plan holds one action for each decision; ``running`` holds n worlds with M possible worlds each. Writes to
-    ``rests`` [n] whether every possible world of a world comes to rest before the horizon and stays at rest, and to
-    ``borne`` [n * M, N] the harm that each vehicle bears by then, m2/s2 (an obstacle ahead bears none).
+    ``running`` has n worlds with M possible worlds each. ``rests`` [n] receives whether every possible world of a world
+    comes to rest before the horizon and stays at rest. ``borne`` [n * M, N] receives the harm that each vehicle bears
+    in the whole episode, m2/s2; it is 0 for an obstacle ahead.
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -351,13 +350,13 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
     """Improve constant actions by coordinate descent over the vehicles.
 
-    Each vehicle's action is replaced in turn by the action of ``grid`` with the least harm, simulated in one segment.
+    Vehicle by vehicle, the action is replaced by the action of ``grid`` with the least harm, simulated in one segment.
 
     Args:
         running: the episodes, n worlds with exactly one possible world each.
-        grid: [G] actions to try for one vehicle.
-        rounds: how often every vehicle has its turn.
-        action: [n, K] constant actions, changed in place.
+        grid: actions to try for each vehicle, [G].
+        rounds: number of passes over all vehicles.
+        action: constant action of each vehicle, [n, K]; changed in place.
 
     """
     every, states, ended, steps = all_members(running), running.states, running.ended, running.steps
@@ -378,27 +377,27 @@ CONSTANTS = tuple(-k / 10 for k in range(11))  # constant actions that are tried
 
 
 class Backup(NamedTuple):
-    """The plan that the shield executes if it certifies nothing else, for n worlds."""
+    """The plans that the shield executes in n worlds wherever no proposal is accepted."""
 
-    plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions, column j for decision j
+    plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions of each decision; entry j is for decision j
     harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
     constants: Floats = np.array(CONSTANTS)  # [C] or [C, K] constant actions that may replace the rest of a plan
 
 
 class Decision(NamedTuple):
-    """Result of ``certify`` for n worlds, with K shielded vehicles if there are several."""
+    """Result of ``certify`` for n worlds and K shielded vehicles; a single vehicle has no axis K."""
 
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
     intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
     reason: NDArray[np.int64]  # [n] or [n, K] codes of ShieldReason
     bound: Floats  # [n] largest possible harm of the episode from now on (m2/s2)
-    margin: Floats  # [n] or [n, K] accepted harm minus least harm found after the proposal (m2/s2); < 0: rejected
+    margin: Floats  # [n] or [n, K] budget minus least harm found after the proposal (m2/s2); negative: rejected
     after: Running  # the predicted episodes at the next decision
     backup: Backup  # the plan whose harm is the bound
 
     @property
     def reason_names(self) -> NDArray[np.str_]:
-        """Why each proposal was accepted or replaced, in words such as "no certificate", [n] or [n, K]."""
+        """Reason why each proposal was accepted or replaced, in words such as "no certificate", [n] or [n, K]."""
         texts = [ShieldReason(code).text for code in self.reason.ravel().tolist()]
         return np.array(texts).reshape(self.reason.shape)
 
@@ -418,24 +417,24 @@ class Decision(NamedTuple):
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Return the harm of the episodes if the plans are executed from now on, [n] m2/s2.
+    """Return the harm of the whole episodes if the plans are executed from now on, [n] m2/s2.
 
-    A plan holds one action for each decision: ``plan`` is [n, L], or [n, L, K] for K vehicles. The harm is that of the
-    whole episode in the worst possible world, and equals the engine's to the bit. Caps on the harm of single vehicles
-    are ignored.
+    ``plan`` has the actions of each decision, [n, L], or [n, L, K] for K vehicles. The harm is the largest over the
+    possible worlds, and equals the engine's harm to the bit. Caps on the harm of single vehicles are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Return each plan, or the best constant action from now on if that harms less, and the harm of the result.
+    """Return each plan and its harm; if the best constant action from now on does less harm, it replaces the plan.
 
     Args:
         running: n episodes at a decision.
-        plan: [n, L] or [n, L, K] one action for each decision.
-        constants: [C] or [C, K] constant actions to compare with.
+        plan: actions of each decision, [n, L] or [n, L, K].
+        constants: constant actions to compare with, [C] or [C, K].
 
-    Returns plans in the shape of ``plan``, and [n] m2/s2, the harm of the whole episode in the worst possible world.
+    Returns the plans, in the shape of ``plan``, and the harm of the whole episode in the worst possible world, [n]
+    m2/s2.
 
     """
     value = np.empty(running.n)
@@ -449,10 +448,9 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Return plans with the actions of ``past`` before the decision number ``steps`` [n], and of ``later`` from it on.
+    """Return plans that consist of ``past`` before decision number ``steps`` [n], and of ``later`` from there on.
 
-    A plan holds one action for each decision: ``past`` and the result are [n, L] or [n, L, K]; ``later`` has the same
-    shape or is one action.
+    ``past`` and the result are plans, [n, L] or [n, L, K]; ``later`` is a plan of the same shape, or a single action.
     """
     past_steps = np.arange(past.shape[1]) < steps[:, np.newaxis]
     return np.where(past_steps if past.ndim == 2 else past_steps[:, :, np.newaxis], past, later)
@@ -461,14 +459,14 @@ def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
     """Decide in every world: apply the proposed action if it can be certified, else the action of the backup plan.
 
-    A proposal is certified if some plan behind it keeps the harm of the episode within the budget. No argument is
-    changed.
+    A proposal is certified if a plan that begins with it keeps the harm of the episode within the budget. The arguments
+    are not changed.
 
     Args:
         running: the episodes at this decision.
-        proposed: actions [n] or [n, K]; clipped to [-1, 1] first. NaN is replaced by the planned action.
-        backup: the plan to apply if a proposal has no certificate, and its harm.
-        budget: largest accepted harm of each episode, [n] m2/s2; at least the backup's harm.
+        proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. NaN is replaced by the planned action.
+        backup: the plan to follow where a proposal cannot be certified, with its harm.
+        budget: largest harm that is accepted in each episode, [n] m2/s2; at least the harm of ``backup``.
 
     Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, and ``PhysicsError`` naming
     the worlds in which the physics fails with the applied action.
@@ -480,11 +478,11 @@ def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) 
     shape = (n, *backup.plan.shape[2:])
     if not (actions.shape == shape and backup.harm.shape == budget.shape == (n,)):
         raise InvalidInput(
-            f"certify: proposed {actions.shape}, backup's harm {backup.harm.shape}, budget {budget.shape};"
-            f" {shape}, and twice ({n},) needed"
+            f"certify: shape of proposed = {actions.shape}, of backup.harm = {backup.harm.shape}, of budget ="
+            f" {budget.shape}: must be {shape}, ({n},) and ({n},)"
         )
     if not (budget >= backup.harm).all():
-        raise InvalidInput("certify: a budget is below the backup's harm; nothing could be guaranteed")
+        raise InvalidInput("certify: budget: must be at least backup.harm in every world")
     plans, after, out = backup.plan.copy(), np.empty_like(running.states), np.empty((n, vehicles, 4))
     over, failed = np.zeros(problem.n, np.bool_), np.zeros(n, np.bool_)
     certify_worlds(
@@ -510,4 +508,4 @@ def _check_plan(running: Running, plan: Floats) -> None:
     fits = vehicles == 1 if plan.ndim == 2 else plan.shape[2:] == (vehicles,)
     if not fits or plan.shape[0] != running.n or plan.shape[1] < most:
         wanted = f"({running.n}, at least {most}{'' if vehicles == 1 else f', {vehicles}'})"
-        raise InvalidInput(f"shield: plan {plan.shape}; {wanted} is needed")
+        raise InvalidInput(f"shield: shape of plan = {plan.shape}: must be {wanted}")

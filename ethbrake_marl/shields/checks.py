@@ -1,4 +1,4 @@
-"""Checks of a shield's arguments: amounts and the scenario."""
+"""Checks of a shield's arguments: numbers such as the allowance, and the scenario."""
 
 from __future__ import annotations
 
@@ -11,23 +11,20 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def is_amount(value: object, below: float = np.inf) -> bool:
-    """Return whether ``value`` is a number of at least 0 and less than ``below``. True and False are no numbers."""
+    """Return whether ``value`` is a number of at least 0 and less than ``below``. True and False do not count."""
     return isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) < below
 
 
 def check_amount(name: str, value: object, where: str, unit: str = "") -> None:
-    """Raise ``InvalidInput`` unless the setting ``name`` has as ``value`` a finite number of at least 0.
+    """Raise ``InvalidInput`` unless ``value``, the value of the setting ``name``, is a finite number of at least 0.
 
-    ``where`` begins the message; ``unit``, such as " m2/s2", ends it.
+    The message begins with ``where`` and ends with ``unit``, such as " m2/s2".
     """
     if not is_amount(value):
         raise InvalidInput(f"{where}: {name} = {value!r}: must be a number, at least 0{unit}")
 
 
 def check_scenario(scenario: object, where: str) -> None:
-    """Raise ``InvalidInput``, whose message begins with ``where``, unless ``scenario`` is a ``Scenario``.
-
-    The name of a scenario is refused, too.
-    """
+    """Raise ``InvalidInput`` unless ``scenario`` is a ``Scenario`` (not a name). The message begins with ``where``."""
     if not isinstance(scenario, Scenario):
         raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")

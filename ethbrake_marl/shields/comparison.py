@@ -11,17 +11,17 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.shields.certify import ends_of_plans
 from ethbrake_marl.shields.running import Running
 
-SLACK = 1e-9  # tolerance (m, m/s) around the range that several possible worlds predict; one alone must match exactly
+SLACK = 1e-9  # tolerance (m, m/s) around the range of several predicted worlds; a one alone must match exactly
 
-# columns of each pair in a state: name and unit
+# quantities of each pair in a state: name and unit
 GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("total harm", " m2/s2"))
 
 
 def seen_columns(packed: Packed) -> Floats:
-    """Return an engine's running worlds as rows [n, S] in the layout of the shield's predictions.
+    """Return the running worlds of an engine as rows [n, S] in the layout of ``Running.states``.
 
-    This is the layout of ``Running.states``: speeds, gaps, hit flags, first-impact harm and total harm. If some world
-    has an obstacle ahead, its column comes first in each group.
+    A row consists of speeds, gaps, hit flags, first-impact harms and total harms. If any world has an obstacle ahead,
+    each of these five groups begins with a column for the obstacle.
     """
     state, column = packed.state, packed.column
     speeds, first, pairs, at = state[:, column.speed : column.command], column.gap, column.vehicles - 1, column.obstacle
@@ -33,9 +33,9 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """Return ``worlds`` with other speeds, gaps and hit flags, also those of an obstacle.
+    """Return ``worlds`` with the speeds, gaps and hit flags of ``states``.
 
-    These come from ``states`` [n, S], in the layout of the shield's predictions (``Running.states``).
+    ``states`` [n, S] has the layout of ``Running.states``. Gap and hit flag of an obstacle ahead are replaced as well.
     """
     added = (states.shape[1] + 4) // 6 - worlds.N  # 1 if each group starts with the column of an obstacle, else 0
     N = worlds.N + added
@@ -51,9 +51,9 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 
 
 def difference(predicted: Floats, seen: Floats) -> str:
-    """Describe the first number in which an observed world differs from its prediction; "nothing" if none does.
+    """Describe the first number in which an observed world differs from its prediction; "nothing" if they are equal.
 
-    ``predicted`` and ``seen`` are rows [S] as in ``Running.states``; ``seen`` may end earlier.
+    ``predicted`` and ``seen`` are rows [S] as in ``Running.states``; ``seen`` may be shorter.
     """
     vehicles = (len(predicted) + 4) // 6
     for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
@@ -62,19 +62,19 @@ def difference(predicted: Floats, seen: Floats) -> str:
         else:
             group, pair = divmod(column - vehicles, vehicles - 1)
             what, unit = f"{GROUPS[group][0]} of pair {pair + 1}", GROUPS[group][1]
-        return f"{what} is {seen[column]:.17g}{unit}, certified was {predicted[column]:.17g}{unit}"
+        return f"{what} is {seen[column]:.17g}{unit}, but the shield predicted {predicted[column]:.17g}{unit}"
     return "nothing"
 
 
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     """Return how the episodes end if the plans are executed from now on.
 
-    A plan holds one action for each decision; ``plan`` is [n, L], or [n, L, K] for K shielded vehicles. ``running``
-    holds n worlds, each with M possible worlds.
+    ``plan`` has the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` has n worlds
+    with M possible worlds each.
 
-    Returns two arrays: whether all vehicles rest at the horizon in every possible world, [n]; and the harm of the whole
-    episode that each vehicle bears, [n * M, N] m2/s2. Harm is split by mass with the operations of the ledger, so both
-    agree to the bit. With an obstacle ahead, its column comes first and is 0.
+    The first result is whether all vehicles are at rest at the horizon in every possible world, [n]. The second is the
+    harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. It equals the harm in the engine's ledger to
+    the bit. With an obstacle ahead, the first column is the obstacle's and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

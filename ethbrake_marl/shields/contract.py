@@ -1,24 +1,24 @@
 """The contract of every shield: the interface between an engine and its guard.
 
-A *guard* is the object in an engine that decides which actions are applied. The engine calls its guard inside
-``Engine.step``, once for all n worlds and L learners:
+A *guard* is the object in an engine that decides which actions are applied. The engine calls its guard once per
+``Engine.step``, for all n worlds and L learners together:
 
     decide(state, memory, proposed) -> (applied, memory, info)
 
-``state``     the engine with its running episodes; the guard reads it and changes nothing.
-``memory``    what the guard remembers of these episodes: a value, never changed in place.
-``proposed``  actions [n, L] in [-1, 1]; NaN is an invalid action, a column of NaN means that no action was given.
-``applied``   actions [n, L] with which the engine makes its step.
-``memory``    the guard's memory after the step.
-``info``      details of the decision, shown in the infos as ``shield_...``.
+``state``     the engine with its running episodes. The guard reads it and does not change it.
+``memory``    the guard's memory of these episodes. It is never changed in place: ``decide`` returns a new memory.
+``proposed``  proposed actions [n, L] in [-1, 1]. One NaN is an invalid action. A column of NaN means that the caller
+              gave that learner no action.
+``applied``   actions [n, L] that the engine applies in this step.
+``info``      details of the decision, which environments report in their infos as ``shield_...``.
 
-``decide`` returns all three in a ``Ruling`` (``engine.engine``). After the step, ``check`` compares the new state with
-the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and keeps its old memory.
+``decide`` returns the three results in a ``Ruling`` (``engine.engine``). After the step, ``check`` compares the new
+state with the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and keeps its old memory.
 
-``begin`` starts episodes in some rows, and ``report`` returns the infos. ``ShieldGuard`` implements what all modes
-share: it queries the proposing policies, keeps their memories, and arranges the infos by vehicle. Each mode adds its
-own decision: ``paper_hybrid.EpisodeGuard`` and ``guard.StepGuard``. The module ``step`` states and proves the promise
-of step mode.
+``begin`` starts episodes in some rows of the batch, and ``report`` returns the infos. ``ShieldGuard`` implements what
+all modes share: it asks the policies for proposals, stores their memories, and arranges the infos by vehicle. The
+subclasses ``paper_hybrid.EpisodeGuard`` and ``guard.StepGuard`` add the decision of their mode. The module ``step``
+states and proves the guarantee of mode ``step``.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from ethbrake_marl.shields.rollouts import Proposer, proposed_actions
 
 
 class ShieldMode(IntEnum):
-    """Mode of a shield, as the code ``shield_mode`` in the infos. Modes of extensions define codes of their own.
+    """Mode of a shield. The infos report its number as ``shield_mode``; extensions number their own modes.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldMode(1).name
@@ -55,22 +55,22 @@ class ShieldMode(IntEnum):
 
 
 class Guarded(NamedTuple):
-    """Memory of a guard (the part of an engine that certifies or replaces actions) for n episodes."""
+    """Memory of a guard for n episodes. A guard is the part of an engine that certifies or replaces actions."""
 
-    shield: Any  # the mode's shield, a value with ``take(rows)``; in mode ``episode`` the memory of the HybridAgent
+    shield: Any  # the shield of the mode, with a method ``take(rows)``; in mode ``episode`` the HybridAgent's memory
     policies: dict[int, Memory]  # index of a shielded vehicle -> memory of its policy; empty without policies
 
     def take(self, rows: Ints) -> Guarded:
-        """Return the memory of the episodes in the rows with the indices ``rows``, which may be repeated."""
+        """Return the memory of the episodes with the row indices ``rows``; an index may occur several times."""
         is_tree = isinstance(self.shield, Mapping)
         shield = take_memory(self.shield, rows) if is_tree else self.shield.take(rows)
         return Guarded(shield, take_memory(self.policies, rows))
 
     @property
     def told(self) -> dict[str, Any]:
-        """``{"predicted_harm": [n], "chosen_policy": [n]}``: the shield's values, None for a value that it lacks.
+        """The shield's ``predicted_harm`` and ``chosen_policy`` by name, each [n]; None for one that it lacks.
 
-        These are the harm predicted at the alert (m2/s2), and whether the policy drives.
+        ``predicted_harm`` is the harm predicted at the alert (m2/s2), ``chosen_policy`` whether the policy drives.
         """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
@@ -78,16 +78,16 @@ class Guarded(NamedTuple):
 class ShieldGuard(ABC):
     """Base class of the guards of all modes: the part of an engine that certifies or replaces the learners' actions.
 
-    A subclass implements ``decide`` (which actions are applied), ``_started`` (the shield after episodes have begun)
-    and ``tell`` (the infos). It may override ``check``, which compares a step with the prediction, and ``intervened``.
+    A subclass implements ``decide`` (choose the applied actions), ``_started`` (start episodes) and ``tell`` (compute
+    the infos). It may override ``check``, which compares a step with the prediction, and ``intervened``.
 
     Args:
-        engine: the engine that the guard will protect. All its learners are shielded, front to rear.
+        engine: the engine that gets this guard. All its learners are shielded, front to rear.
         policies: vehicle index -> policy that proposes if the caller gives no action. A policy with a memory is called
-            at every decision, so that its memory stays up to date.
-        shield: the shield before any episode has begun, in the mode's own form.
-        mode: code of the mode in the infos.
-        where: name of the interface, for error messages.
+            at every decision, to update its memory.
+        shield: initial state of the shield, before any episode; its type depends on the mode.
+        mode: mode of the shield; the infos report its number.
+        where: name of the user's interface, with which error messages begin.
 
     """
 
@@ -107,34 +107,36 @@ class ShieldGuard(ABC):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
-                proposes. A single NaN: an invalid action, which is never applied.
+            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; its
+                policy then proposes. A single NaN is an invalid action and is never applied.
 
         """
 
     @abstractmethod
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
-        """Return the mode's shield after episodes have started in the rows with the indices ``rows``.
+        """Start episodes in the rows with the indices ``rows``; return the shield's new state.
 
-        ``alert`` holds only the worlds of these rows, at t = 0. ``shield`` is a copy and may be changed.
+        ``alert`` contains the worlds of these rows only, at t = 0. ``shield`` is the shield's old state, a copy that
+        may be changed.
         """
 
     @abstractmethod
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos after a decision: name (without ``shield_``) -> value.
 
-        Each value is a single number, or an array by world [n], by learner [n, L] or by vehicle [n, N].
+        A value is a single number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
 
         Args:
             memory: memory of the guard.
-            ruling: the decision; None before the first one, when the names are the same.
+            ruling: the decision; None before the first decision. The result has the same names in both cases.
 
         """
 
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
-        """Return the guard's memory after episodes have started in the rows with the indices ``rows``.
+        """Start episodes in the rows with the indices ``rows``; return the guard's new memory.
 
-        ``alert`` holds only the worlds of these rows, at t = 0. ``memory`` is None before the first episode.
+        ``alert`` contains the worlds of these rows only, at t = 0. ``memory`` is the guard's old memory, None before
+        the first episode.
         """
         shield, policies = memory or Guarded(self._fresh, {})
         memories = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
@@ -144,22 +146,22 @@ class ShieldGuard(ABC):
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """Return the memory to keep after the step.
 
-        ``ruling`` is the decision before the step, ``after`` the engine after it. This base class accepts every step,
-        and returns the ruling's memory.
+        ``ruling`` is the decision that was applied, ``after`` the engine after the step. This base class accepts every
+        step and returns the memory in ``ruling``.
         """
         memory: Guarded = ruling.memory
         return memory
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Return whether the applied action differs from the proposed one, [n, L], for the decision ``ruling``."""
+        """Return whether the decision ``ruling`` replaced the proposed action, [n, L]."""
         decided: Bools = ruling.decision.intervened
         return decided.reshape(ruling.applied.shape)
 
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
         """Return the infos of every vehicle: name (without ``shield_``) -> values [n, N].
 
-        They describe the last step of the engine ``running``. In a row whose episode has started since, they describe
-        the alert of the new episode.
+        The infos describe the last step of the engine ``running``. Where a new episode has just started, they describe
+        its alert instead.
         """
         memory: Any = running.guarded
         ruling, first = running.ruling, running.steps == 0
@@ -174,8 +176,8 @@ class ShieldGuard(ABC):
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
         """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
 
-        ``running`` is the engine. A vehicle without a shield gets reason ``NO_DECISION``, and 0 in all other entries
-        that have a column per learner.
+        ``running`` is the engine. In values with one column per learner, an unshielded vehicle gets the reason
+        ``NO_DECISION``, and 0 everywhere else.
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -188,9 +190,9 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos that all modes have: mode, proposed and applied action, and whether they differ.
+        """Return the infos that all modes have: mode, proposed action, applied action, and whether it was replaced.
 
-        ``ruling`` is the decision in the last step; None before the first step, when the actions are 0.
+        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None, and both actions are 0.
         """
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
@@ -201,17 +203,17 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """Return the proposals [n, L], completed by the policies, and the policies' new memories.
+        """Let the policies propose the missing actions; return all proposals [n, L] and the policies' new memories.
 
         Args:
-            worlds: the n worlds as the policies see them; None only if no policy is called.
+            worlds: the n worlds that the policies observe; may be None if no policy is called.
             memories: vehicle index -> memory of its policy.
-            proposed: [n, L] the caller's actions; a column of NaN is filled in by that learner's policy.
+            proposed: the caller's actions, [n, L]. A column of NaN is replaced by the actions of that learner's policy.
 
         """
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not self._policies:
-            raise InvalidInput("shield: no action was given, and there is no policy that could propose one")
+            raise InvalidInput("shield: an action is missing, and no policy can propose it; pass an action or policy=")
         remember = (i for i, agent in self._policies.items() if getattr(agent, "remembers", memories[i] is not None))
         if left_out.any() or any(True for _ in remember):
             assert worlds is not None
@@ -220,9 +222,9 @@ class ShieldGuard(ABC):
         return proposed, memories
 
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
-        """Return the policies with their ``memories`` and the current ``worlds``, for rollouts.
+        """Return the policies with their ``memories`` and the current ``worlds``, as a rollout needs them.
 
-        None if there are no policies, or if ``worlds`` is None.
+        Returns None if there are no policies or no worlds.
         """
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
@@ -230,8 +232,9 @@ class ShieldGuard(ABC):
 def why(ruling: Ruling | None) -> dict[str, Any]:
     """Return the infos ``reason`` and ``margin`` of a decision of mode ``step``, each [n, L].
 
-    ``reason`` is a code of ``ShieldReason``; ``margin`` is the accepted harm minus the least harm found after the
-    proposal, m2/s2. Before the first decision (``ruling`` None) they are ``NO_DECISION`` and 0.
+    ``reason`` is a code of ``ShieldReason``. ``margin`` is the budget (the largest harm that is accepted) minus the
+    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None; the results
+    are then ``NO_DECISION`` and 0.
     """
     if ruling is None:
         return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}

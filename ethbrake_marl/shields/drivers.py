@@ -1,4 +1,4 @@
-"""Agents and teams behind a shield, for evaluations: the agent proposes, and a guard in the engine decides."""
+"""Agents and teams behind a shield, for evaluations: the agent proposes actions, a guard in the engine decides."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from ethbrake_marl.shields.paper_hybrid import HybridAgent
 class ShieldedDriver(ByPolicy):
     """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
 
-    At the alert the policy is simulated to the end. Where it harms no more than E-V2X-BM, it drives without
-    interventions and its harm is the bound. Elsewhere each action must be certified by the rest of the plan, by a
-    constant action, or by a rollout: a simulation of the policy from the state after the action. A team's proposals are
-    decided together.
+    At the alert the policy is simulated to the end of the episode. In worlds where it does at most the harm of
+    E-V2X-BM, it drives without interventions, and its harm is the bound. In all other worlds each proposed action must
+    be certified: by the rest of the plan, by a constant action, or by a rollout, which simulates the policy from the
+    state after the action. The proposals of a team are decided together.
 
     Args:
         policy: the agent or team that proposes.
         scenario: the scenario in which actions are certified.
         later_rollouts: whether a rollout of the policy may certify an action.
-        told: worlds at the alert as the shield assumes them; None: the true worlds. The policy always sees the true
-            worlds.
+        told: the shield's assumption about the worlds at the alert; None: the true worlds. The policy always observes
+            the true worlds.
         options: keywords of ``ShieldOptions``.
 
-    Raises ``InvalidInput`` where ``policy`` is not an agent or team, for options that do not fit, and where a team does
-    not drive every learner.
+    Raises ``InvalidInput`` if ``policy`` is not an agent or team, for invalid options, and if a team does not drive
+    every learner.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("coast+step", scenario=eb.load_scenario("paper-random")).on([1]).name
@@ -52,17 +52,17 @@ class ShieldedDriver(ByPolicy):
     ) -> None:
         self.options = ShieldOptions(**options)
         if self.options.mode == "episode":
-            raise InvalidInput("shield: mode = 'episode': HybridAgent is that of mode episode")
+            raise InvalidInput("shield: mode = 'episode': use HybridAgent, the agent of this mode")
         check_agent(policy, str(self.options.mode), alone=not isinstance(policy, Team))
         check_scenario(scenario, str(self.options.mode))
         if not (told is None or isinstance(told, Worlds)):
-            raise InvalidInput(f"step: told = {told!r}: must be worlds at the alert, or None")
+            raise InvalidInput(f"step: told = {told!r}: must be a Worlds object (the worlds at the alert) or None")
         if isinstance(policy, Team) and (
             undriven := [scenario.vehicle_names[i] for i in scenario.learners if i not in policy.drivers]
         ):
             raise InvalidInput(
-                f"team {policy.name!r}: does not drive {', '.join(undriven)}; beside a shielded vehicle every other one"
-                " is shielded too, or follows a script"
+                f"team {policy.name!r}: does not drive {', '.join(undriven)}; behind a shield, a team must drive every"
+                " learner of the scenario"
             )
         self.policy, self.scenario = policy, scenario
         self._how = {"later_rollouts": later_rollouts, "told": told}
@@ -81,9 +81,9 @@ class ShieldedDriver(ByPolicy):
 
     @classmethod
     def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
-        """Return a team that drives the vehicles of ``task`` with copies of ``driver`` behind one shield.
+        """Return a team in which copies of ``driver``, behind one shield, drive the vehicles of ``task``.
 
-        ``settings`` are further keywords of ``ShieldedDriver``; scenario and harm count are the task's.
+        ``task`` gives the scenario and the harm count; ``settings`` are further keywords of ``ShieldedDriver``.
         """
         if isinstance(driver, Team) and len(task.vehicles) == 1:
             driver = Team.of(driver, task.vehicles).drivers[task.vehicle]
@@ -92,14 +92,11 @@ class ShieldedDriver(ByPolicy):
         return cls(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return a team behind one shield, in which each of these vehicles is controlled by its own copy of the policy.
-
-        ``vehicles`` are indices (0 = front).
-        """
+        """Return a team behind one shield, in which a copy of the policy drives each of ``vehicles`` (0 = front)."""
         return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:
-        """Return the guard for ``engine``, in which ``policies`` (vehicle index -> agent) propose."""
+        """Return the guard for ``engine``; the agents in ``policies`` (vehicle index -> agent) propose actions."""
         return self.options.guard(engine, policies, several=isinstance(self.policy, Team), **self._how)
 
 
@@ -107,7 +104,7 @@ def shielded(driver: Driver, scenario: Scenario, mode: str, **options: Any) -> D
     """Return an agent or a team behind a shield.
 
     Args:
-        driver: the agent or team. If the scenario has several learners, a copy of an agent drives each.
+        driver: the agent or team. If the scenario has several learners, a copy of the agent drives each of them.
         scenario: the scenario in which actions are certified.
         mode: ``step``, ``episode`` or a mode of an extension.
         options: further keywords of ``ShieldOptions``.

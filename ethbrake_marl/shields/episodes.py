@@ -1,4 +1,4 @@
-"""Results of whole episodes behind a step shield: harm, bound and replaced decisions of every world."""
+"""Results of whole episodes behind a step shield: harm, bound and number of replaced actions in every world."""
 
 from __future__ import annotations
 
@@ -15,30 +15,27 @@ from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.shields.drivers import ShieldedDriver
 from ethbrake_marl.shields.step import StepShield
 
-CHUNK = 500  # worlds advanced together; limits memory, and does not change results
+CHUNK = 500  # number of worlds simulated together; limits memory, and does not change results
 
 
 class Shielded(NamedTuple):
     """Results of whole episodes behind a step shield: n worlds, N vehicles, K of them shielded.
 
-    The shapes below are for one driver. The result of ``stack``, for several drivers, has one more axis in front:
-    ``harm`` is then [drivers, n].
+    The field comments give the shapes for one driver. ``stack`` adds a first axis for several drivers, so ``harm`` is
+    then [drivers, n].
     """
 
-    harm: Floats  # [n] harm of the episode, first-impact or total as the shield guarantees it (m2/s2)
-    vehicle_harm: Floats  # [n, N] part of that harm that each vehicle bears (m2/s2)
-    bound: Floats  # [n] harm that the shield guaranteed at the alert, allowance included (m2/s2)
+    harm: Floats  # [n] harm of the episode, first-impact or total harm, whichever the shield bounds (m2/s2)
+    vehicle_harm: Floats  # [n, N] harm that each vehicle bears; its sum over the vehicles is ``harm`` (m2/s2)
+    bound: Floats  # [n] bound of the shield at the alert, including the allowance (m2/s2)
     baseline: Floats  # [n, N] harm that each vehicle bears under the constant actions of least harm (m2/s2)
-    replaced: Ints  # [n, K] number of replaced decisions of each shielded vehicle
+    replaced: Ints  # [n, K] number of replaced actions of each shielded vehicle
     decisions: Ints  # [n] number of decisions of each shielded vehicle
     moving: Bools  # [n] whether something still moved at the horizon
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """Return the results of ended episodes that a driver behind a step shield drove.
-
-        ``task`` says which harm is reported.
-        """
+        """Return the results of finished ``episodes`` behind a step shield; ``task`` chooses the harm count."""
         shield: StepShield = episodes.guarded.shield
         assert shield.memory.running is not None
         return Shielded(
@@ -53,7 +50,7 @@ class Shielded(NamedTuple):
 
     @staticmethod
     def join(parts: Sequence[Shielded]) -> Shielded:
-        """Return the results of all parts, one after the other along the axis of worlds."""
+        """Concatenate the results of several groups of worlds along the axis of worlds."""
         return Shielded(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
     @staticmethod
@@ -63,11 +60,11 @@ class Shielded(NamedTuple):
 
 
 def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-    """Drive a copy of ``driver`` behind a step shield through every world, and return the results.
+    """Let a copy of ``driver`` behind a step shield drive in every world, and return the results.
 
     Args:
         driver: an agent or a team.
-        worlds: n worlds at the alert; they are driven in chunks of ``CHUNK``.
+        worlds: n worlds at the alert, simulated in chunks of ``CHUNK``.
         task: scenario, shielded vehicles and harm count.
         settings: further keywords of ``ShieldedDriver``.
 

@@ -1,4 +1,4 @@
-"""Check whether interventions were needed: simulate each episode again without the intervention."""
+"""Review a shield's interventions: simulate each episode again without the intervention, and compare the harm."""
 
 from __future__ import annotations
 
@@ -19,50 +19,50 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.shields.rollouts import proposed_action
 from ethbrake_marl.shields.step import StepShield
 
-SAME_HARM = 1e-9  # harms (m2/s2) that differ by less than this count as equal
+SAME_HARM = 1e-9  # two harms that differ by at most this (m2/s2) count as equal
 
 VERDICTS = ("needed", "harmless", "costly")
 
 
 class Review(NamedTuple):
-    """Effect of each of the m interventions (replaced actions) in the log of the running episodes."""
+    """Effect of each of m interventions (replaced actions) of a shield."""
 
     world: Ints  # [m] row of the world in the batch
     vehicle: Ints  # [m] index of the vehicle whose action was replaced
     step: Ints  # [m] number of the decision
-    harm: Floats  # [m] harm of the episode as it was, with the intervention (m2/s2)
-    unshielded_harm: Floats  # [m] harm if the policy or team had driven unshielded from that decision on (m2/s2)
-    verdict: NDArray[np.str_]  # [m] "needed" (harm is higher without it), "costly" (lower) or "harmless" (the same)
+    harm: Floats  # [m] harm of the actual episode, with the intervention (m2/s2)
+    unshielded_harm: Floats  # [m] harm if the policy or team drives unshielded from that decision on (m2/s2)
+    verdict: NDArray[np.str_]  # [m] "needed", "costly" or "harmless": unshielded harm is higher, lower or the same
     trusted: Bools  # [m] whether the world behaved as the shield predicted
 
     def share(self, verdict: str) -> float:
-        """Return the share (0 to 1) of the interventions with this ``verdict``: ``needed``, ``costly`` or ``harmless``.
-
-        It is 0 if there are no interventions.
-        """
+        """Return the fraction of interventions with ``verdict`` (``needed``, ``costly``, ``harmless``); 0 if none."""
         return float((self.verdict == verdict).mean()) if self.verdict.size else 0.0
 
 
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
-    """Simulate each intervention's episode again without it: from that decision on, ``policy`` drives unshielded.
+    """Compare each intervention with the same episode in which ``policy`` drives unshielded from that decision on.
 
-    The verdict is *needed* if the harm without the intervention is higher, *costly* if it is lower, and *harmless* if
-    it is the same. The actual episode is simulated again as well, so that both harms come from the same engine, even
-    where the shield assumed other worlds.
+    An intervention is *needed* if the unshielded harm is higher, *costly* if it is lower, and *harmless* if it is the
+    same. The actual episode is simulated again as well. Both harms are thus computed in the same worlds, even if the
+    shield assumed other worlds.
 
     Args:
-        shield: a shield with ``logging``, after the last episodes of ``worlds``. Entries of earlier episodes are
+        shield: a shield with ``logging``, after its episodes in ``worlds``. Log entries of earlier episodes are
             ignored.
-        policy: the agent, or the team of all shielded vehicles, that proposed in these episodes.
+        policy: the agent, or the team of all shielded vehicles, that proposed the actions in these episodes.
         worlds: the worlds of these episodes at the alert.
 
-    Raises ``InvalidInput`` without a log, or where the number of worlds differs.
+    Raises ``InvalidInput`` if the shield has no log, or if its batch has another number of worlds.
 
     """
     if shield.log is None or shield.memory.running is None:
-        raise InvalidInput("review: nothing was logged; make the shield with logging=True, and drive behind it")
+        raise InvalidInput("review: the shield has no log; make it with logging=True, and run episodes behind it")
     if worlds.n != shield.memory.running.n:
-        raise InvalidInput(f"review: {count_of(worlds.n, 'world')}, but {shield.memory.running.n} were driven last")
+        raise InvalidInput(
+            f"review: worlds: has {count_of(worlds.n, 'world')}; must be the {shield.memory.running.n} of the shield's"
+            " last episodes"
+        )
     log = [
         entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.memory.episode[entry.world]
     ]
@@ -80,16 +80,16 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 
 
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
-    """Return the harm of m episodes in which ``policy`` drives unshielded from some decision on, [m] m2/s2.
+    """Return the harm of m episodes in which ``policy`` drives unshielded from a given decision on, [m] m2/s2.
 
-    Before that decision, the actions that the shield applied are repeated.
+    Until that decision, the actions that the shield applied are repeated.
 
     Args:
-        shield: the shield after the episodes; its plans hold the applied actions.
+        shield: the shield after the episodes; its plans contain the applied actions.
         policy: the agent or team.
         worlds: the worlds at the alert.
-        world: [m] rows of the worlds to simulate.
-        step: [m] number of the decision from which on the policy drives.
+        world: row of each world to simulate, [m].
+        step: number of the first decision at which the policy drives, [m].
 
     """
     scenario, plan = shield.scenario, shield.memory.backup.plan[world]
@@ -103,13 +103,13 @@ def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: In
 
 
 class _Released(AgentAround):
-    """Agent that repeats recorded actions up to a given decision, and follows a policy from then on.
+    """Agent that repeats recorded actions until a given decision, and follows a policy from that decision on.
 
     Args:
         policy: the policy.
-        actions: [m, L] action of each decision.
-        release: [m] number of the first decision of the policy.
-        deciding: indices of the vehicles that decide at the same moments.
+        actions: recorded action of each decision, [m, L].
+        release: number of the first decision of the policy, [m].
+        deciding: indices of the vehicles that decide at the same times.
         time_step_s: time between two decisions, s.
 
     """
@@ -119,7 +119,7 @@ class _Released(AgentAround):
     ) -> None:
         super().__init__(policy, "released")
         self._actions, self._release, self._time_step_s = actions, release, time_step_s
-        self._deciding = deciding  # indices of the vehicles that decide at the same moments
+        self._deciding = deciding
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         return {"policy": super().begin(alert, vehicle, scripts), "first_s": alert.first_decision_s(self._deciding)}

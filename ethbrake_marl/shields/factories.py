@@ -1,4 +1,4 @@
-"""Registry entries of the core shields: the names behind an agent's ``+``."""
+"""Registry entries of the core shields, ``+episode`` and ``+step``."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ethbrake_marl.shields.paper_hybrid import Bound, HybridAgent
 def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings) -> HybridAgent:
     """Return ``policy`` behind the paper's Algorithm 1 (``+episode``).
 
-    At the alert the better of policy and E-V2X-BM is chosen for the whole episode. ``argument`` is None, or
-    ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must have a scenario.
+    At the alert Algorithm 1 chooses the policy or E-V2X-BM, whichever does less harm, for the whole episode.
+    ``argument`` is None, or ``pairwise`` for the paper's closed form of E-V2X-BM. ``settings`` must have a scenario.
     """
     bound: Bound = "coupled" if argument is None else "pairwise"
     return HybridAgent(policy, settings.needed_scenario(), bound=bound, harm_count=settings.harm_count)
@@ -23,7 +23,7 @@ def shield_episodes(policy: Agent, argument: str | None, settings: AgentSettings
 def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
     """Return the agent or team ``policy`` behind a shield of mode ``step`` (``+step``).
 
-    ``argument`` is ignored; ``settings`` must have a scenario. Each of several learners gets a copy of the agent.
+    ``argument`` is ignored; ``settings`` must have a scenario. With several learners, each gets a copy of the agent.
     """
     return shielded(policy, settings.needed_scenario(), "step", harm_count=settings.harm_count)
 
@@ -31,7 +31,7 @@ def shield_steps(policy: Driver, argument: str | None, settings: AgentSettings) 
 EPISODE = Part(
     shield_episodes,
     form="+episode[:pairwise]",
-    about="behind Algorithm 1: it or E-V2X-BM drives the episode, whichever harms less",
+    about="behind Algorithm 1: the agent or E-V2X-BM, whichever does less harm, drives the whole episode",
     knows=Source.MODEL,
     options=ShieldOptions,
 )
@@ -39,7 +39,7 @@ EPISODE = Part(
 STEP = Part(
     shield_steps,
     form="+step",
-    about="every action certified, or replaced; of a team together",
+    about="behind a shield that certifies or replaces every action; the actions of a team together",
     knows=Source.MODEL,
     teams=True,
     options=ShieldOptions,

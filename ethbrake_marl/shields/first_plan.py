@@ -1,9 +1,11 @@
-"""The plan with which a step shield starts at the alert: the constant actions of least harm.
+"""The first plan of a step shield at the alert: the constant actions of least harm.
 
-A plan holds one action for each decision. For one shielded vehicle, the constant action is E-V2X-BM's (the coupled
-optimum). For several vehicles, the plan is the best of these candidates: all brake fully; one vehicle takes its coupled
-optimum while the others brake fully; and the result of a coordinate descent, vehicle by vehicle, from the best of
-those.
+For one shielded vehicle the constant action is that of E-V2X-BM (the coupled optimum). For several vehicles the plan is
+the best of these candidates:
+
+- All vehicles brake fully.
+- One vehicle brakes with its coupled optimum while the others brake fully.
+- The result of a coordinate descent over the vehicles, which starts from the best of the other candidates.
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ from ethbrake_marl.shields.running import Running
 
 LOOKED_AT = np.linspace(0.0, -1.0, 101)  # constant actions tried at the alert if a world has several possible worlds
 
-GRID = np.linspace(0.0, -1.0, 21)  # constant actions tried in the coordinate descent of several vehicles
+GRID = np.linspace(0.0, -1.0, 21)  # actions that the coordinate descent tries for each vehicle
 
 ROUNDS = 2  # rounds of the coordinate descent
 
-LADDER = np.linspace(0.0, -1.0, 5)  # possible actions of the first and of the last vehicle in ``joint_constants``
+LADDER = np.linspace(0.0, -1.0, 5)  # actions of the first and the last vehicle in ``joint_constants``
 
 
 def best_constants(
@@ -35,11 +37,11 @@ def best_constants(
     scenario: Scenario,
     harm_count: HarmCount,
 ) -> Floats:
-    """Return plans that hold the best constant actions found: [n, width], or [n, width, K] for several vehicles.
+    """Return plans that repeat the best constant actions found: [n, width], or [n, width, K] for several vehicles.
 
     Args:
         worlds: n worlds at the alert.
-        running: the episodes of these worlds, with all their possible worlds.
+        running: the episodes of these worlds, with all possible worlds.
         vehicle: index of the shielded vehicle (0 = front), or indices of several.
         width: number of decisions of a plan.
         scenario: the scenario of these worlds.
@@ -51,13 +53,13 @@ def best_constants(
     others[:, vehicles] = -worlds.vehicles.braking_capacity_mps2[:, vehicles]
 
     def optimum(i: int) -> Floats:
-        """Return E-V2X-BM's deceleration of vehicle ``i`` as an action [n]; other shielded vehicles brake fully."""
+        """Return E-V2X-BM's action for vehicle ``i`` while the other shielded vehicles brake fully, [n]."""
         best = optimise_coupled(worlds, i, harm_count=harm_count, horizon_s=scenario.horizon_s, others_mps2=others)
         return command_to_action(-best.deceleration_mps2, worlds.vehicles, i)
 
     if isinstance(vehicle, int):
         plan = np.repeat(optimum(vehicle)[:, np.newaxis], width, axis=1)
-    elif running.members > 1:  # a team of one vehicle: no other team is shielded in several possible worlds
+    elif running.members > 1:  # a team of one vehicle: larger teams cannot have several possible worlds
         plan = held(optimum(vehicles[0])[:, np.newaxis], width)
     else:
         return held(_best_joint_action(running, [optimum(i) for i in vehicles], width), width)
@@ -69,7 +71,7 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
     Args:
         running: n episodes at the alert.
-        optima: for each of the K vehicles, the action [n] that is best while the others brake fully.
+        optima: best action of each of the K vehicles while the other vehicles brake fully, K arrays [n].
         width: number of decisions of a plan.
 
     """
@@ -88,10 +90,10 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
 
 def joint_constants(vehicles: int) -> Floats:
-    """Return constant actions to try for several vehicles together, [C, K] in [-1, 0], front to rear.
+    """Return C joint constant actions of K vehicles to try, [C, K] in [-1, 0], front to rear.
 
-    ``vehicles`` is their number K. The actions of one row are either all equal, or change linearly from the first to
-    the last vehicle.
+    ``vehicles`` is the number K. In each row the actions of all vehicles are equal, or they change linearly from the
+    first to the last vehicle.
     """
     alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
     share = np.linspace(0.0, 1.0, vehicles)
@@ -100,5 +102,5 @@ def joint_constants(vehicles: int) -> Floats:
 
 
 def held(action: Floats, width: int) -> Floats:
-    """Return plans [n, width, K] that hold the actions ``action`` [n, K] at each of ``width`` decisions."""
+    """Return plans [n, width, K] that repeat the actions ``action`` [n, K] at each of ``width`` decisions."""
     return np.repeat(action[:, np.newaxis], width, axis=1)

@@ -1,4 +1,4 @@
-"""The guard of mode ``step``: a ``StepShield`` decides, and each step is compared with the shield's prediction."""
+"""The guard of mode ``step``: a ``StepShield`` decides, and each step is compared with its prediction."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from ethbrake_marl.shields.step import StepShield
 
 
 class MovingAtHorizon(UserWarning):
-    """Warning: some vehicle may still be moving at the horizon; the shield guarantees nothing after it."""
+    """Warning: a vehicle may still be moving at the horizon; the shield's bound does not cover the time after it."""
 
 
 class StepGuard(ShieldGuard):
     """Guard of mode ``step``: certify every proposed action, or replace it.
 
     Args:
-        engine: the engine that the guard will protect.
+        engine: the engine that gets this guard.
         policies: vehicle index -> policy that is rolled out (simulated) from each alert, and that proposes if the
             caller gives no action.
         shield: the shield of the engine's learners, before any episode.
-        mode: code of the mode in the infos.
-        where: name of the interface, for error messages.
-        shares: add to the infos the harm that each vehicle bears; always added with a cap.
+        mode: mode of the shield; the infos report its number.
+        where: name of the user's interface, with which error messages begin.
+        shares: whether the infos contain the harm that each vehicle bears; with a cap they always do.
         later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
-        told: worlds at the alert as the shield assumes them; None: the true worlds. Policies always see the true
-            worlds.
-        warns: warn with ``MovingAtHorizon``, once, if the first plan leaves something moving at the horizon.
+        told: the shield's assumption about the worlds at the alert; None: the true worlds. Policies always observe the
+            true worlds.
+        warns: whether to warn with ``MovingAtHorizon``, once, if a vehicle still moves at the horizon under the first
+            plan.
 
     """
 
@@ -61,15 +62,18 @@ class StepGuard(ShieldGuard):
 
     def _started(self, shield: StepShield, alert: Worlds, rows: Ints) -> StepShield:
         if self._told is not None and not (rows < self._told.n).all():
-            raise InvalidInput(f"shield: told of {count_of(self._told.n, 'world')}, but row {rows.max()} begins")
+            raise InvalidInput(
+                f"shield: told: has {count_of(self._told.n, 'world')}, but an episode begins in row {rows.max()}; must"
+                " have a world for every row"
+            )
         shield.begin(alert if self._told is None else self._told.take(rows), rows, self._policies or None)
         moving = int((~shield.memory.settles[rows]).sum())
         if moving and self._to_warn:
             self._to_warn = False
             warnings.warn(
-                f"shield: in {moving} of {len(rows)} worlds something still moves at the horizon,"
-                f" {shield.scenario.horizon_s:g} s, under the plan that gives the bound; the bound says nothing of what"
-                " comes after; a longer horizon_s lets them come to rest",
+                f"shield: in {moving} of {len(rows)} worlds a vehicle still moves at the horizon"
+                f" ({shield.scenario.horizon_s:g} s) under the first plan; the bound does not cover the time after the"
+                " horizon; a longer horizon_s gives all vehicles time to come to rest",
                 MovingAtHorizon,
                 stacklevel=2,
             )
@@ -81,8 +85,8 @@ class StepGuard(ShieldGuard):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: [n, L] proposed actions. A column of NaN: the caller gave that learner no action, so its policy
-                proposes. A single NaN: an invalid action, which is never applied.
+            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; its
+                policy then proposes. A single NaN is an invalid action and is never applied.
 
         """
         shield: StepShield = memory.shield
@@ -104,9 +108,9 @@ class StepGuard(ShieldGuard):
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
-        ``ruling`` is the decision before the step, ``after`` the engine after it. Raises ``UncertifiedStep`` if a world
-        differs from the prediction. If the shield assumes other worlds than the true ones (``told``), a differing world
-        becomes distrusted instead. Worlds in which the physics failed are not compared.
+        ``ruling`` is the decision that was applied, ``after`` the engine after the step. Raises ``UncertifiedStep`` if
+        a world differs from the prediction. If the shield assumes other worlds than the true ones (``told``), a
+        differing world becomes distrusted instead. Worlds in which the physics failed are not compared.
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield
@@ -117,7 +121,8 @@ class StepGuard(ShieldGuard):
         if (wrong := np.flatnonzero(wanted & (after.steps != running.steps))).size:
             k = int(wrong[0])
             raise UncertifiedStep(
-                f"shield: world {k} is at step {after.steps[k]} of its episode, certified was step {running.steps[k]}"
+                f"shield: world {k} is at step {after.steps[k]} of its episode, but the shield predicted step"
+                f" {running.steps[k]}"
             )
         seen = shield.as_seen(seen_columns(after.packed))
         surprising = wanted & ~shield.expects(seen)
@@ -133,10 +138,10 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step by name: action, reason, bound, trust in the world, and the harm of each vehicle.
+        """Return the infos of a step by name: actions, reason, margin, bound, whether worlds are trusted, shares.
 
-        ``memory`` is the guard's memory, ``ruling`` the decision in the step, None before the first one. Each value is
-        a number or an array [n], [n, L] or [n, N].
+        ``memory`` is the guard's memory. ``ruling`` is the decision in the step, None before the first decision. Each
+        value is a number, or an array [n], [n, L] or [n, N].
         """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)

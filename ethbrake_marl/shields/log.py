@@ -1,4 +1,4 @@
-"""Log of a step shield: every decision in which it replaced a proposed action."""
+"""Log of a step shield: every proposed action that the shield replaced."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class Intervention(NamedTuple):
     proposed: float  # proposed action, before clipping to [-1, 1]
     applied: float  # applied action, in [-1, 1]
     reason: int  # code of ShieldReason
-    bound: float  # harm of the episode that the shield guarantees from now on (m2/s2)
-    margin: float  # accepted harm minus least harm found after the proposal (m2/s2); negative: the proposal exceeds it
+    bound: float  # harm that the episode will not exceed, after this decision (m2/s2)
+    margin: float  # budget minus least harm of any plan tried after the proposal (m2/s2); negative: rejected
     state: Floats  # [S] speeds, gaps, hit flags and harm at the decision, in the layout of ``Running.states``
-    plan: Floats  # [L], or [L, K] for K vehicles: plan at the decision; entries before ``step`` are the applied actions
+    plan: Floats  # [L], or [L, K] for K vehicles: plan before the decision; entries before ``step``: applied actions
 
 
 def interventions(
@@ -36,11 +36,11 @@ def interventions(
 
     Args:
         now: the n episodes before the decision.
-        episode: [n] number of the episode in each row.
+        episode: number of the episode in each row, [n].
         vehicles: indices of the K shielded vehicles.
-        proposed: [n] or [n, K] proposed actions.
-        decision: the decision.
-        held: the plan that the shield held before the decision.
+        proposed: proposed actions, [n] or [n, K].
+        decision: the decision on ``proposed``.
+        held: the shield's plan before the decision.
 
     """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))

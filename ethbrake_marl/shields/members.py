@@ -1,8 +1,8 @@
-"""Simulation of the possible worlds of a world, decision by decision, with exactly the operations of the engine's step.
+"""Simulate the possible worlds of a world, decision by decision, with exactly the operations of the engine's step.
 
-A world has M *members*: possible worlds that must all keep the bound. Usually the world itself is its only member, and
-then nothing here costs more. K of the vehicles are shielded. An action is a row [K]; a plan [L, K] holds one action for
-each decision.
+The shield's bound must hold in each of the M possible worlds (*members*) of a world. Usually M is 1: the world itself
+is its only member. K of the N vehicles are shielded. An action is a row [K], a plan has one such row for each of L
+decisions, [L, K].
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 from ethbrake_marl.shields.running import Running
 
 # Rows of ``Members.lines``: command of the unshielded vehicles (m/s2), latency (s), mass (t), speed limit (m/s), rates
-# at which brakes build up and are released (m/s3), and the largest harm that each vehicle may bear (m2/s2). The last
-# row is missing if there are no such caps.
+# at which brakes build up and are released (m/s3), and the cap of each vehicle (m2/s2). Without caps the last row is
+# missing.
 OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CAP = range(7)
 
 
 class Members(NamedTuple):
     """Parameters of M possible worlds, and workspace, as input for the compiled functions of this package.
 
-    The possible worlds of a world are the variants of it in all of which the shield's bound must hold; usually there is
-    one, the world itself. ``all_members`` returns those of a whole batch, ``members_from`` those of one world.
+    The shield's bound must hold in every possible world of a world. ``all_members`` returns the possible worlds of a
+    whole batch, ``members_from`` the possible worlds of one world.
     """
 
     table: Floats  # workspace in which one possible world is simulated, see ``physics.rows``
@@ -39,12 +39,12 @@ class Members(NamedTuple):
     lines: Floats  # [M, rows, N] parameters of the vehicles, in the rows ``OF_COMMAND`` to ``OF_CAP``
     pieces: Floats  # [M, N, 2 P] braking profiles with P intervals of constant command, as in ``Vehicles``
     vehicles: Ints  # [K] indices of the shielded vehicles, front to rear
-    critical: Ints  # [1] possible world that last exceeded a limit; it is simulated first, which only saves time
+    critical: Ints  # [1] index of the possible world that last exceeded a limit; simulating it first saves time
 
 
 @compiled
 def all_members(running: Running) -> Members:
-    """Return the possible worlds of every world in ``running``, as input for the compiled functions here."""
+    """Return the possible worlds of every world in ``running``, as input for the compiled functions."""
     problem = running.problem
     rows, N = problem.mass.shape
     lines = np.empty((rows, OF_CAP + 1 if running.caps.shape[1] > 0 else OF_CAP, N))
@@ -64,14 +64,14 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return the possible worlds in rows ``a`` to ``b - 1`` of ``every``, usually those of one world, as views."""
+    """Return rows ``a`` to ``b - 1`` of ``every``, usually the possible worlds of one world, as views."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
 
 @compiled
 def enter(world: Members, m: int, state: Floats) -> None:
-    """Load possible world number ``m`` of ``world``, in the saved ``state`` [S], into ``world.table``."""
+    """Load possible world ``m`` (index) of ``world``, with the saved ``state`` [S], into ``world.table``."""
     table, lines = world.table, world.lines
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
@@ -85,12 +85,12 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
     """Advance one possible world by one decision, and save its new state.
 
     Args:
-        world: the M possible worlds of one world (``Members``).
-        m: number of the possible world to advance.
-        state: [S] its state now.
+        world: parameters of the M possible worlds of one world (``Members``).
+        m: index of the possible world to advance.
+        state: present state of this possible world, [S].
         step: number of the present decision.
-        action: [K] actions of the shielded vehicles.
-        after: [S] array that is filled with the new state.
+        action: actions of the shielded vehicles, [K].
+        after: receives the new state, [S].
 
     Returns ``GOES_ON``, another code for the end of the episode, or a negative code if the physics failed.
 
@@ -110,16 +110,18 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
 def take_steps(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, after: Floats, over: Bools
 ) -> int:
-    """Advance every possible world of one world by one decision with the same action.
+    """Advance every possible world of one world by one decision, with the same action.
+
+    A possible world whose episode has ended keeps its state.
 
     Args:
-        world: the M possible worlds of one world (``Members``).
-        states: [M, S] their states now, in the layout of ``Running.states``.
-        ended: [M] whether their episodes have ended; these keep their states.
+        world: parameters of the M possible worlds of one world (``Members``).
+        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
+        ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        action: [K] actions of the shielded vehicles.
-        after: [M, S] array that is filled with the new states.
-        over: [M] array that is filled with whether the episodes have ended then.
+        action: actions of the shielded vehicles, [K].
+        after: receives the state of each possible world after the step, [M, S].
+        over: receives whether the episode has ended after the step in each possible world, [M].
 
     Returns the number of possible worlds whose episode continues, or -1 if the physics failed.
 
@@ -128,7 +130,7 @@ def take_steps(
     for m in range(ended.shape[0]):
         if ended[m]:
             over[m] = True
-            for c in range(states.shape[1]):  # by element: numba compiles row copies with an error text, which is slow
+            for c in range(states.shape[1]):  # element by element, because a row copy compiles slowly
                 after[m, c] = states[m, c]
             continue
         outcome = take_step(world, m, states[m], step, action, after[m])
@@ -144,8 +146,8 @@ def borne_by(table: Floats, total: float, i: int) -> float:
     """Return the harm that vehicle ``i`` has borne since the episode began, m2/s2.
 
     ``table`` is the table of one world (``physics.rows``). ``total`` is 1 for total harm, 0 for first-impact harm. The
-    result equals the ledger's to the bit. An obstacle ahead (vehicle 0, infinite mass) bears no harm; the vehicle that
-    hits it bears all of it.
+    result equals the value in the engine's ledger to the bit. An obstacle ahead (vehicle 0, infinite mass) bears no
+    harm; the vehicle that hits the obstacle bears all harm of the impact.
     """
     row, value = ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM, 0.0
     if table[ROW.MASS, i] == math.inf:
@@ -160,9 +162,9 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 
 @compiled
 def within_caps(world: Members, m: int) -> bool:
-    """Return whether no vehicle bears more than its cap in the possible world ``m``, which ``world.table`` holds.
+    """Return whether every vehicle bears at most its cap in possible world ``m``; True without caps.
 
-    A cap is the largest harm that a vehicle may bear. Without caps the result is True.
+    A cap is the largest harm that a vehicle may bear. ``world.table`` must contain this possible world.
     """
     if world.lines.shape[1] > OF_CAP:
         for i in range(world.lines.shape[2]):
@@ -173,9 +175,9 @@ def within_caps(world: Members, m: int) -> bool:
 
 @compiled
 def worst_so_far(world: Members, states: Floats) -> float:
-    """Return the largest harm so far over the possible worlds ``world``, whose states are ``states`` [M, S], m2/s2.
+    """Return the largest harm so far over the possible worlds in ``world``, m2/s2; infinity if a cap is exceeded.
 
-    It is infinite if a vehicle bears more than its cap.
+    ``states`` [M, S] contains the present state of each possible world.
     """
     worst = 0.0
     for m in range(states.shape[0]):
@@ -190,16 +192,16 @@ def worst_so_far(world: Members, states: Floats) -> float:
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
     """Return the harm of the whole episode if a plan is executed in one possible world from now on, m2/s2.
 
-    It is computed with the engine's operations, so it equals the engine's harm to the bit.
+    The harm equals the engine's harm to the bit, because it is computed with the same operations.
 
     Args:
-        world: the M possible worlds of one world (``Members``).
-        m: number of the one to simulate.
-        state: [S] its state now.
-        ended: whether its episode has ended.
+        world: parameters of the M possible worlds of one world (``Members``).
+        m: index of the possible world to simulate.
+        state: present state of this possible world, [S].
+        ended: whether the episode has ended in this possible world.
         step: number of the present decision.
-        plan: [L, K] one action for each decision.
-        most: harm beyond which the simulation stops, since harm never falls, m2/s2.
+        plan: actions of each decision, [L, K].
+        most: harm at which the simulation stops once it is exceeded, m2/s2. Harm never falls during an episode.
 
     Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
 
@@ -226,14 +228,14 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
     """Return the largest harm of a plan over the possible worlds of one world, m2/s2.
 
     Args:
-        world: the M possible worlds of one world (``Members``).
-        states: [M, S] their states now, in the layout of ``Running.states``.
-        ended: [M] whether their episodes have ended.
+        world: parameters of the M possible worlds of one world (``Members``).
+        states: present state of each possible world, [M, S], in the layout of ``Running.states``.
+        ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        plan: [L, K] one action for each decision, executed from now on.
-        most: largest harm of interest, m2/s2.
+        plan: actions of each decision, [L, K]; executed from the present decision on.
+        most: largest harm that is of interest, m2/s2.
 
-    Returns infinity if the harm exceeds ``most`` in one of them, if a vehicle bears more than its cap, or if the
+    Returns infinity if the harm exceeds ``most`` in a possible world, if a vehicle bears more than its cap, or if the
     physics fails.
 
     """
@@ -249,18 +251,18 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 
 @compiled
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
-    """Return the harm of one possible world if a constant action is held to the horizon, m2/s2.
+    """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
 
-    It is simulated in one segment. Returns infinity if the physics fails.
+    The time until the horizon is simulated in one segment. Returns infinity if the physics fails.
 
     Args:
-        world: the M possible worlds of one world (``Members``).
-        m: number of the one to simulate.
-        state: [S] its state now.
-        ended: whether its episode has ended.
+        world: parameters of the M possible worlds of one world (``Members``).
+        m: index of the possible world to simulate.
+        state: present state of this possible world, [S].
+        ended: whether the episode has ended in this possible world.
         step: number of the present decision.
-        constants: [C, K] constant actions.
-        c: row of the one to hold.
+        constants: C constant actions of the K shielded vehicles, [C, K].
+        c: row of the constant action to hold.
 
     """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds

@@ -1,8 +1,8 @@
-"""Settings of a shield: their checks, and the guard that they build.
+"""Settings of a shield: the keywords that every interface takes, their checks, and the guard that is made from them.
 
-Every interface takes the same keywords. A shield's mode is a registered name behind an agent's ``+`` (entry-point group
-``ethbrake_marl.shields``). Its registry entry names a class of settings: ``ShieldOptions`` itself for ``step`` and
-``episode``. A mode with settings of its own has a subclass, which adds and checks these fields and builds its guard.
+A mode is a registered name of a shield (entry-point group ``ethbrake_marl.shields``). The registry entry of a mode
+contains its class of settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with further settings
+has a subclass, which adds and checks the further fields and makes the guard of that mode.
 """
 
 from __future__ import annotations
@@ -27,25 +27,26 @@ from ethbrake_marl.shields.step import Cap, StepShield
 
 @dataclass(frozen=True)
 class ShieldOptions:
-    """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. A mode of an extension adds its own.
+    """Keywords of ``eb.shield``, ``HybridShield`` and the other wrappers. The mode of an extension may add keywords.
 
     Args:
-        mode: ``step``: each action is certified (some plan after it keeps the harm within the bound) or replaced.
-            ``episode``: the paper's Algorithm 1, policy or E-V2X-BM for a whole episode. None: ``step``, unless another
-            setting belongs to one mode alone.
-        bound: source of ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled``, the engine's physics, or
-            ``pairwise``, the paper's closed form.
-        harm_count: impacts whose harm is guaranteed: ``first`` (each pair's first) or ``total`` (all).
-        allowance: loosens the bound by that much (m2/s2), for fewer replaced actions; not in mode ``episode``.
-        cap: ``baseline``: no vehicle ever bears more harm than under the constant actions of least harm. None: only the
-            sum over the vehicles is bounded. Mode ``step`` alone.
-        intervention_penalty: subtracted from the reward of a step in which the shield replaced the proposed action.
-        logging: keep every replaced action in ``shield.log``; not in mode ``episode``.
-        shares: add to ``infos`` the harm that each vehicle bears under the current plan and under the constant actions
-            of least harm; always added with a ``cap``. Costs a few percent of a step; not in mode ``episode``.
-        where: name of the interface, for error messages.
+        mode: ``step`` certifies or replaces each action; an action is certified if some plan after it keeps the harm
+            within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM drives the whole episode.
+            None means ``step``, or the mode of an extension if only that mode has the other settings.
+        bound: method to compute ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled`` (the engine's physics)
+            or ``pairwise`` (the paper's closed form).
+        harm_count: impacts whose harm is bounded: ``first`` (each pair's first) or ``total`` (all).
+        allowance: amount by which the bound is loosened, for fewer replaced actions, m2/s2; not in mode ``episode``.
+        cap: ``baseline``: no vehicle bears more harm than under the constant actions of least harm; only in mode
+            ``step``. None: only the sum over the vehicles is bounded.
+        intervention_penalty: amount subtracted from the reward of a step in which the proposed action was replaced.
+        logging: whether ``shield.log`` collects the replaced actions; not in mode ``episode``.
+        shares: whether ``infos`` contains the harm that each vehicle bears under the current plan and under the
+            constant actions of least harm; with a ``cap`` it always does. This slows a step by a few percent; not in
+            mode ``episode``.
+        where: name of the user's interface, with which error messages begin.
 
-    Raises ``InvalidInput`` naming a setting that does not fit, ``UnknownName`` for an unknown mode.
+    Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldOptions(allowance=1.0).mode
@@ -65,10 +66,9 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the class for these settings: the mode's own class, or a subclass of another mode.
+        """Create an instance of the settings class of ``mode``, or of another mode's class that has these settings.
 
-        ``ShieldOptions(mode, setting=...)`` thus also accepts settings that only the subclass of an extension's mode
-        has.
+        ``ShieldOptions(mode, setting=...)`` thus accepts the settings of every installed mode.
         """
         if cls is ShieldOptions:
             cls = _class_with("step" if mode is None else check_mode(mode), settings)
@@ -85,7 +85,7 @@ class ShieldOptions:
             raise misplaced("bound", self.bound, mode, ["episode"], where)
         caps = get_args(Cap)
         if self.cap is not None and (mode != "step" or self.cap not in caps):
-            allowed = "mode step alone takes one" if self.cap in caps else f"must be {', '.join(caps)} or None"
+            allowed = "only mode step has a cap" if self.cap in caps else f"must be {', '.join(caps)} or None"
             raise InvalidInput(f"{where}: cap = {self.cap!r}: {allowed}")
         check_amount("intervention_penalty", self.intervention_penalty, where)
         object.__setattr__(self, "mode", mode)
@@ -98,7 +98,7 @@ class ShieldOptions:
 
     @property
     def written(self) -> str:
-        """The mode as it is written behind an agent's ``+``, such as ``step``."""
+        """The mode as it is written after the ``+`` of an agent's specification, such as ``step``."""
         return str(self.mode)
 
     @property
@@ -109,12 +109,12 @@ class ShieldOptions:
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a shield with these settings, before any episode. Not for mode ``episode``.
+        """Return a shield with these settings, before any episode, for every mode except ``episode``.
 
         Args:
             scenario: the scenario of all episodes.
             vehicle: index of the shielded vehicle (0 = front), or indices of several.
-            others: index of each other vehicle -> its script; None: the scripts of the scenario.
+            others: index of each other vehicle -> its script; None: the scenario's scripts.
 
         """
         return StepShield(
@@ -125,7 +125,7 @@ class ShieldOptions:
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
         """Raise ``InvalidInput`` if a shield with these settings cannot be used in the scenario.
 
-        With ``several`` (a team is shielded) nothing is checked here; that happens when the guard is made.
+        With ``several``, which means that a team is shielded, nothing is checked: making the guard does the checks.
         """
         if not several:
             self.shield(scenario, one_learner(scenario) or 0)
@@ -134,9 +134,10 @@ class ShieldOptions:
         """Return the guard (the part of an engine that certifies or replaces actions) for all learners of an engine.
 
         Args:
-            engine: the engine that the guard will protect.
-            policies: vehicle index -> policy that proposes its actions; may be empty except in mode ``episode``.
-            several: treat a single learner as a team of one.
+            engine: the engine that gets the guard.
+            policies: vehicle index -> policy that proposes the vehicle's actions; may be empty except in mode
+                ``episode``.
+            several: whether a single learner counts as a team of one.
             how: further keywords of ``StepGuard``.
 
         """
@@ -160,21 +161,17 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
 
     Args:
         name: name of the setting.
-        value: its value.
+        value: value of the setting.
         mode: the mode.
         takers: modes that accept the setting.
-        where: name of the interface, with which the message begins.
+        where: name of the user's interface, with which the message begins.
 
     """
-    do = "does" if len(takers) == 1 else "do"
-    return InvalidInput(f"{where}: {name} = {value!r}: mode {mode} takes none; {' and '.join(takers)} {do}")
+    return InvalidInput(f"{where}: {name} = {value!r}: not a setting of mode {mode}; use mode {' or '.join(takers)}")
 
 
 def shielded_vehicle(engine: Engine, several: bool) -> int | tuple[int, ...]:
-    """Return the learners of an engine as ``StepShield`` takes them: one index, or a tuple of indices.
-
-    With ``several``, a single learner is also returned as a tuple.
-    """
+    """Return the index of an engine's learner; a tuple of indices for several learners, or with ``several``."""
     vehicles = tuple(engine.learners)
     return vehicles if several or len(vehicles) > 1 else vehicles[0]
 
@@ -185,7 +182,7 @@ def one_learner(scenario: Scenario) -> int | None:
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """Return the settings class that has all these settings: the mode's own, or else the first of the other modes'.
+    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class of a mode that does.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

@@ -1,12 +1,12 @@
 """The paper's hybrid (Algorithm 1): at the alert, choose policy or baseline for the whole episode.
 
-The policy is rolled out in the engine from the alert on. Its harm is compared with ``H*``, the harm of the baseline
-E-V2X-BM, and whichever harms less drives the episode.
+The policy is rolled out (simulated) in the engine from the alert on. Its harm is compared with ``H*``, the harm of the
+baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole episode.
 
-With the coupled ``H*``, which comes from the same engine, the hybrid is never worse than the baseline in any world, as
-long as the policy repeats its rollout. A policy with random actions does not; it needs the step shield. With the
-paper's pairwise ``H*`` this guarantee does not hold: that value treats the two pairs as independent, and is about half
-of the harm that the same deceleration causes in the engine.
+The coupled ``H*`` is computed in the same engine. With it, the hybrid does at most the harm of the baseline in every
+world, provided that the policy repeats its rollout. A policy with random actions does not repeat its rollout; use the
+step shield for it. With the paper's pairwise ``H*`` there is no such guarantee: it treats the two pairs as independent,
+and is about half of the harm that the same deceleration causes in the engine.
 """
 
 from __future__ import annotations
@@ -30,20 +30,28 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.shields.checks import check_scenario
 from ethbrake_marl.shields.contract import Guarded, ShieldGuard, ShieldMode
 
-Bound = Literal["coupled", "pairwise"]  # source of H* and a*: the engine's physics, or the paper's closed form
+Bound = Literal["coupled", "pairwise"]  # method to compute H* and a*: the engine's physics, or the paper's closed form
 
 
 class HybridAgent(AgentAround):
-    """Agent that drives by ``policy`` in the worlds where its rollout harms at most ``H*``, else by E-V2X-BM.
+    """Agent that drives by ``policy`` in worlds where the policy's rollout does at most ``H*`` harm, else by E-V2X-BM.
 
-    The rollout simulates the episode from the alert; ``H*`` is the harm of E-V2X-BM's constant deceleration. ``bound``
-    chooses how both are computed: in the engine's physics (``coupled``), or in the paper's closed form (``pairwise``).
-    ``harm_count`` chooses the harm that is compared. The memory holds ``chosen_policy`` [n], true where the policy
-    drives; the two compared harms ``policy_harm`` [n] and ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of
-    the two. Raises ``InvalidInput`` for an unknown ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
+    The rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
+
+    Args:
+        policy: the agent to choose or reject in each world.
+        scenario: the scenario in which both are compared.
+        bound: method to compute ``H*`` and the deceleration: ``coupled`` (the engine's physics) or ``pairwise`` (the
+            paper's closed form).
+        harm_count: harm that is compared: ``first`` (each pair's first impact) or ``total`` (all impacts).
+
+    The memory contains ``chosen_policy`` [n], true where the policy drives; the compared harms ``policy_harm`` [n] and
+    ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of the two. Raises ``InvalidInput`` for an unknown
+    ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
+
     """
 
-    adds = Source.MODEL  # both candidates are compared in the true model
+    adds = Source.MODEL  # policy and baseline are compared in the true model
 
     def __init__(
         self, policy: Agent, scenario: Scenario, *, bound: Bound = "coupled", harm_count: HarmCount = "first"
@@ -80,8 +88,11 @@ class HybridAgent(AgentAround):
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
         """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory.
 
-        ``worlds`` are the worlds now; ``memory`` is what ``begin`` or the last call returned; ``vehicle`` is the index
-        of the controlled vehicle.
+        Args:
+            worlds: the n worlds now.
+            memory: memory that ``begin`` or the last call returned.
+            vehicle: index of the controlled vehicle (0 = front).
+
         """
         command, policy = ask_script(self.policy, worlds, memory["policy"], vehicle)
         constant, _ = self.backup.act(worlds, memory["backup"], vehicle)
@@ -108,11 +119,16 @@ ROUNDING = 1e-6  # rounding error of an action in 32 bits
 
 
 class EpisodeGuard(ShieldGuard):
-    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses who drives the whole episode.
+    """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses the driver of the whole episode.
 
-    The choice is the policy inside ``hybrid`` or E-V2X-BM; proposed actions do not change it. A proposal counts as
-    replaced where it differs from the applied action by more than the rounding of 32 bits. ``engine`` is the engine
-    that the guard will protect; ``where`` names the interface in error messages.
+    The driver is the policy inside ``hybrid`` or E-V2X-BM, whatever actions are proposed. A proposal counts as replaced
+    if it differs from the applied action by more than the rounding error of a 32-bit number.
+
+    Args:
+        engine: the engine that gets this guard.
+        hybrid: the agent that chooses and drives.
+        where: name of the user's interface, with which error messages begin.
+
     """
 
     def __init__(self, engine: Engine, hybrid: HybridAgent, *, where: str = "shield") -> None:
@@ -129,7 +145,7 @@ class EpisodeGuard(ShieldGuard):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: [n, 1] proposed actions, which have no effect.
+            proposed: proposed actions, [n, 1]; they have no effect.
 
         """
         worlds = running.worlds
@@ -139,13 +155,14 @@ class EpisodeGuard(ShieldGuard):
         return Ruling(proposed, applied, ~hybrid["chosen_policy"], ~running.ended, None, memory)
 
     def intervened(self, ruling: Ruling) -> Bools:
-        """Return whether the applied action differs from the proposed one, [n, 1], for the decision ``ruling``."""
+        """Return whether the decision ``ruling`` replaced the proposed action, [n, 1]."""
         return np.asarray(abs(ruling.applied - ruling.proposed) > ROUNDING, np.bool_)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos by name: chosen driver and compared harms, each [n], and the actions.
 
-        ``ruling`` is the decision in the last step, or None. ``proposed_action`` is NaN where nothing was proposed.
+        ``memory`` is the guard's memory; ``ruling`` is the decision in the last step, None before the first step.
+        ``proposed_action`` is NaN where nothing was proposed.
         """
         compared = {name: memory.shield[name] for name in ("chosen_policy", "policy_harm", "bound_harm")}
         return self._of_step(ruling) | compared

@@ -6,9 +6,9 @@ from enum import IntEnum
 
 
 class ShieldReason(IntEnum):
-    """Reason why a shield accepted or replaced an action: the code ``shield_reason`` in the infos.
+    """Reason why a shield accepted or replaced an action. The infos report its number as ``shield_reason``.
 
-    The shield holds a plan, one action for each later decision. The budget is the largest harm that it accepts.
+    The shield's plan contains one action for each later decision. The budget is the largest harm that is accepted.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldReason(3).name, eb.ShieldReason.NO_CERTIFICATE.text
@@ -17,18 +17,18 @@ class ShieldReason(IntEnum):
     """
 
     NO_DECISION = -1  # before the first step of an episode, and always for a vehicle that follows a script
-    SAME_AS_PLAN = 0  # accepted: the proposal is the plan's action
-    PLAN_REMAINS = 1  # accepted: the rest of the plan keeps the budget after the proposal
-    CONSTANT = 2  # accepted: a constant action after the proposal keeps the budget
-    NO_CERTIFICATE = 3  # replaced by the plan's action: nothing that was tried after the proposal keeps the budget
-    NOT_A_NUMBER = 4  # replaced by the plan's action: the proposal was not a number
+    SAME_AS_PLAN = 0  # accepted: the proposal equals the planned action
+    PLAN_REMAINS = 1  # accepted: the proposal, followed by the rest of the plan, keeps the budget
+    CONSTANT = 2  # accepted: the proposal, followed by a constant action, keeps the budget
+    NO_CERTIFICATE = 3  # replaced by the planned action: no plan that was tried after the proposal keeps the budget
+    NOT_A_NUMBER = 4  # replaced by the planned action: the proposal was not a number
     ENDED = 5  # the episode is over
-    ASSUMPTION_BROKEN = 6  # replaced by the fallback's action: the world did not behave as predicted
-    POLICY_ROLLOUT = 7  # accepted: only a rollout of the policy after the proposal keeps the budget
+    ASSUMPTION_BROKEN = 6  # replaced by an action chosen anew: the world differed from the prediction
+    POLICY_ROLLOUT = 7  # accepted: the proposal, followed by a rollout of the policy, keeps the budget
 
     @property
     def text(self) -> str:
-        """The reason in words, such as "no certificate"."""
+        """Reason in words, such as "no certificate"."""
         return self.name.lower().replace("_", " ")
 
 

@@ -1,7 +1,7 @@
-"""Rollouts of the proposing policies: simulations in which they drive, whose actions become a plan.
+"""Rollouts of the proposing policies: simulations in which the policies drive. Their actions become a plan.
 
-A plan holds one action for each decision. A rollout starts at the alert or at a later decision, and its plan is
-certified like any other (``plan_harm``). If a policy later deviates from its rollout, this costs interventions, but the
+A plan has one action for each decision. A rollout starts at the alert or at a later decision, and its plan is certified
+like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may have to intervene; the
 bound still holds.
 """
 
@@ -31,10 +31,10 @@ from ethbrake_marl.shields.running import Running
 
 
 class Proposer(NamedTuple):
-    """The proposing policies, with everything that a rollout of them needs."""
+    """The proposing policies, with everything that a rollout needs."""
 
     policies: Mapping[int, Agent]  # index of each shielded vehicle -> its policy, front to rear
-    memories: Mapping[int, Memory]  # index -> memory of its policy after this decision's action
+    memories: Mapping[int, Memory]  # index of each shielded vehicle -> memory of its policy after this decision
     worlds: Worlds  # the n worlds at this decision
 
 
@@ -47,11 +47,11 @@ def rolled_out(
         worlds: n worlds at the alert.
         policies: index of each shielded vehicle -> its policy.
         scenario: the scenario, whose scripts drive the other vehicles.
-        vehicle: index of the only shielded vehicle, or a tuple of K indices. It decides only the shape of the result.
+        vehicle: index of the only shielded vehicle, or a tuple of K indices.
         width: number of decisions to return.
 
-    Returns [n, width] for an index, [n, width, K] for a tuple. After the end of an episode, the action is full
-    braking.
+    Returns actions, [n, width] if ``vehicle`` is an index, [n, width, K] if it is a tuple. After the end of an episode
+    the actions are full braking.
 
     """
     team = Team({i: _Rounded(policy) for i, policy in policies.items()}, next(iter(policies.values())).name)
@@ -64,14 +64,14 @@ def rolled_out(
 def certify_by_policy(
     decision: Decision, running: Running, proposed: Floats, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Return the decision, but accept each rejected proposal that a rollout (simulation) of the policy can certify.
+    """Return ``decision``, changed to accept each rejected proposal that a rollout of the policy can certify.
 
     Args:
         decision: the decision without rollouts.
         running: the n episodes at this decision.
-        proposed: [n] or [n, K] proposed actions.
-        budget: [n] largest accepted harm, m2/s2.
-        held: [n, L] or [n, L, K] plans that the shield had before this decision, with one action for each decision.
+        proposed: proposed actions, [n] or [n, K].
+        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        held: plans of the shield before this decision, [n, L] or [n, L, K].
         proposer: the proposing policies, with their memories and the worlds at this decision.
 
     """
@@ -90,21 +90,21 @@ def certify_by_policy(
 def certify_rollouts(
     running: Running, proposed: Floats, rows: Ints, budget: Floats, held: Floats, proposer: Proposer
 ) -> Decision:
-    """Decide again in worlds whose proposals have no certificate, with rollouts of the policy as plans.
+    """Decide again in worlds whose proposals were rejected, with rollouts of the policy as plans.
 
-    The plan that is tried consists of the clipped proposal and the policy's actions from the state after it. If this
-    plan keeps the budget, it becomes the backup and the proposal is accepted. Otherwise the reason stays
-    ``NO_CERTIFICATE``. With several vehicles, a vehicle whose proposal is NaN keeps its planned action.
+    The plan consists of the clipped proposal, followed by the actions of the policy in a simulation from the next state
+    on. If this plan keeps the budget, it becomes the backup and the proposal is accepted. Otherwise the reason stays
+    ``NO_CERTIFICATE``. With several vehicles, a vehicle whose proposal is NaN takes its planned action.
 
     Args:
         running: the n episodes of the whole batch.
-        proposed: [n] or [n, K] proposed actions of the whole batch.
-        rows: [m] worlds in which to decide again.
-        budget: [n] largest accepted harm, m2/s2.
-        held: [n, L] or [n, L, K] plans that the shield has now, with one action for each decision; whole batch.
+        proposed: proposed actions of the whole batch, [n] or [n, K].
+        rows: indices of the worlds in which to decide again, [m].
+        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        held: present plans of the shield in the whole batch, [n, L] or [n, L, K].
         proposer: the proposing policies, with their memories and the worlds at this decision.
 
-    Returns a decision for the m worlds of ``rows`` only.
+    Returns a decision for the m worlds in ``rows`` only.
 
     """
     part, least, silent = running.take(rows), budget[rows], np.isnan(proposed[rows])
@@ -133,11 +133,11 @@ def _later_plan(
 
     Args:
         running: the n episodes, with one possible world each.
-        first: [m] or [m, K] actions of the present decision.
-        rows: [m] the worlds.
-        budget: [n] largest accepted harm, m2/s2.
-        held: [n, L] or [n, L, K] current plans, which hold the past actions.
-        proposer: the policies.
+        first: actions of the present decision, [m] or [m, K].
+        rows: indices of the m worlds, [m].
+        budget: largest harm that is accepted in each episode, [n] m2/s2.
+        held: present plans, which contain the past actions, [n, L] or [n, L, K].
+        proposer: the proposing policies.
 
     """
     policies, memories, worlds = proposer
@@ -155,7 +155,7 @@ def _later_plan(
         episodes = episodes._replace(ended=episodes.ended | (so_far > most))
         if episodes.ended.all():
             return plan
-        # the worlds as a driver sees them at the next decision, with the last actions in force
+        # the worlds that the policies observe at the next decision, with the last actions in force
         commands = episodes.problem.command[:, -seen.N :].copy()  # without an obstacle ahead
         for c, vehicle in enumerate(policies):
             column = action if action.ndim == 1 else action[:, c]
@@ -178,17 +178,17 @@ def _later_plan(
 
 
 def no_constants(plan: Floats) -> Floats:
-    """Return an empty list of constant actions for plans like ``plan``, so that none can replace the rest of a plan."""
+    """Return an empty array of constant actions for ``Backup``, with the axis K of ``plan`` if it has one."""
     return np.zeros((0, *plan.shape[2:]))
 
 
 def proposed_actions(
     policies: Mapping[int, Agent], memories: Mapping[int, Memory], worlds: Worlds
 ) -> tuple[Floats, dict[int, Memory]]:
-    """Return the actions that the policies propose, [n, K] in [-1, 1], and vehicle index -> new memory.
+    """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` and ``memories`` map the index of each of K vehicles to its policy and the policy's memory; ``worlds``
-    are n worlds at a decision.
+    ``policies`` and ``memories`` map the index of each of K vehicles to its policy and to the policy's memory.
+    ``worlds`` are n worlds at a decision.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
@@ -196,16 +196,16 @@ def proposed_actions(
 
 
 def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-    """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and its new memory.
+    """Return the actions [n] in [-1, 1] that ``policy`` proposes for ``vehicle`` (index), and the policy's new memory.
 
-    A command that is NaN stays NaN.
+    If the policy returns NaN as a command, the action is NaN.
     """
     command, memory = ask_script(policy, worlds, memory, vehicle)
     return np.where(np.isnan(command), np.nan, command_to_action(command, worlds.vehicles, vehicle)), memory
 
 
 class _Rounded(AgentAround):
-    """Policy whose commands are converted to actions and back, as in a plan. Its memory holds the last ``action``."""
+    """Policy whose commands are converted to actions and back, as in a plan. Its memory contains ``action``."""
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         return {"policy": begin_script(self.policy, alert, vehicle, scripts), "action": np.zeros(alert.n)}

@@ -1,4 +1,4 @@
-"""Running episodes at a decision: the state from which a shield certifies."""
+"""Running episodes at a decision: the state from which a shield simulates plans."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 class Running(NamedTuple):
     """Running episodes at a decision: n worlds with M possible worlds (*members*) each. Usually M is 1.
 
-    The possible worlds of world k are the rows k * M to k * M + M - 1; the first is the *nominal* one, the world
-    itself. With several shielded vehicles, actions are [n, K] and plans (one action for each decision) [n, L, K]. With
-    one vehicle, they are [n] and [n, L], or [n, 1] and [n, L, 1].
+    The possible worlds of world k are in rows k * M to k * M + M - 1. The first of these rows is the world itself, the
+    *nominal* world. For K shielded vehicles, actions have the shape [n, K] and plans (one action for each of L
+    decisions) the shape [n, L, K]. For one vehicle, the axis K may be left out.
     """
 
-    problem: ProfileProblem  # parameters, commands of the other vehicles and times of the decisions, in n * M rows
+    problem: ProfileProblem  # parameters, commands of unshielded vehicles and times of the decisions, in n * M rows
     states: Floats  # [n * M, S] speeds, gaps, hit flags, harms, forces; in the layout of ``physics.episode.save``
     steps: Ints  # [n] number of the present decision, from 0
     ended: Bools  # [n * M] whether the episode is over
@@ -28,12 +28,12 @@ class Running(NamedTuple):
 
     @property
     def uncapped(self) -> Running:
-        """The same episodes without limits on the harm of single vehicles (``caps``)."""
+        """The same episodes without ``caps``, the limits on the harm of single vehicles."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
     def n(self) -> int:
-        """Number of worlds, not counting their possible worlds."""
+        """Number n of worlds; several possible worlds of a world count once."""
         return len(self.steps)
 
     @property
@@ -53,15 +53,15 @@ class Running(NamedTuple):
         return Decisions(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP]).at(self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
-        """Return the rows of the possible worlds of the worlds with the indices ``worlds``, [len(worlds) * M]."""
+        """Return the row indices of all possible worlds of ``worlds`` (indices), [len(worlds) * M]."""
         return np.asarray((worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel(), np.int64)
 
     def take(self, worlds: Ints) -> Running:
-        """Return the episodes of the worlds with the indices ``worlds``, with all their possible worlds."""
+        """Return the episodes of ``worlds`` (indices), with all possible worlds of each."""
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return the same episodes with only one possible world each: the world itself."""
+        """Return the same episodes with the world itself as the only possible world."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
@@ -74,8 +74,8 @@ class Running(NamedTuple):
 def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
     """Return the episodes of ``problem`` at their first decision.
 
-    A problem holds the states of the worlds at that decision, and the commands of the unshielded vehicles. ``members``
-    is the number M of possible worlds of each world: each M consecutive rows of ``problem`` are one world.
+    ``problem`` contains the states of the worlds at the first decision, and the commands of the unshielded vehicles.
+    ``members`` is the number M of possible worlds of each world; M consecutive rows of ``problem`` belong to one world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)

@@ -19,11 +19,16 @@ from ethbrake_marl.shields.attach import Attached, Proposing
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):
     """``make_sb3_vec_env`` behind a shield, by default in mode ``step``. The rows of one world are decided together.
 
-    ``options`` are keywords of ``ShieldOptions``. ``policy`` is simulated from each alert: its harm is the bound where
-    it is lower than E-V2X-BM's; None: the bound is always the latter. The intervention penalty does not enter the
-    return in ``infos[row]["episode"]``. Each row's infos contain ``shield_bound_harm`` and the other shield entries at
-    every step; ``reset_infos`` contains them at the alert. Raises ``InvalidInput`` for another environment, or for
-    several learners in another mode than ``step``.
+    The infos of each row contain ``shield_bound_harm`` and the other shield entries at every step; ``reset_infos``
+    contains them at the alert. The return in ``infos[row]["episode"]`` does not include the intervention penalty.
+
+    Args:
+        venv: an environment made by ``make_sb3_vec_env``.
+        policy: policy that is simulated from each alert; where it does less harm than E-V2X-BM, its harm is the bound.
+            None: the bound is the harm of E-V2X-BM.
+        options: keywords of ``ShieldOptions``.
+
+    Raises ``InvalidInput`` for another kind of environment, or for several learners in another mode than ``step``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -46,15 +51,15 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
         return observation
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take the proposed actions [rows, 1] for the next ``step_wait``."""
+        """Pass the proposed actions [rows, 1] to the environment; ``step_wait`` then makes the step."""
         self.attached.check_open()
         self.venv.step_async(actions)
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], Bools, list[dict[str, Any]]]:
-        """Advance every world by one step with the certified or replaced actions.
+        """Advance every world by one step; the shield certifies or replaces the actions.
 
         Returns observations [rows, F], rewards [rows] with the intervention penalty subtracted, whether each episode
-        ended [rows], and the infos, one dictionary per row.
+        ended [rows], and one dictionary of infos per row.
         """
         self.attached.check_open()
         observation, reward, done, infos = self.venv.step_wait()

@@ -1,36 +1,37 @@
-"""Step mode of the shield: a guaranteed harm that holds at every step, whoever proposes the actions.
+"""Step mode of the shield: a bound on the harm of the episode that holds at every step, whatever is proposed.
 
-**Claim.** Let ``B`` be the bound at the first decision: the harm of the backup plan, executed in the engine. If every
-step applies the action that ``certify`` returns, then the harm at the end of the episode is at most ``B``, whatever is
-proposed, and the bound never rises during the episode. An episode ends at rest or at the scenario's horizon. The claim
-does not cover anything that happens after the horizon.
+**Claim.** Let ``B`` be the bound at the first decision, which is the harm of the first plan. If every step applies the
+action that ``certify`` returns, then the harm at the end of the episode is at most ``B`` for any proposals, and the
+bound never rises during the episode. An episode ends at rest or at the scenario's horizon. The claim does not cover
+anything that happens after the horizon.
 
-**Induction.** Between two decisions the shield holds a *plan*, an action for every decision up to the horizon, and its
-harm ``c``: the harm of the whole episode if that plan is executed from the present state, including the harm so far and
-the pairs that were already hit. One function computes it, ``members.follow_plan``. It advances decision by decision
-with the operations of the engine's step in the same order, and adds harm in the same order. So:
+**Induction.** Between two decisions the shield has a *plan* with an action for every decision up to the horizon. Let
+``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. It includes
+the harm so far, and takes into account which pairs were already hit. The function ``members.follow_plan`` computes
+``c``. It advances decision by decision with the same operations as the engine's step, in the same order, and adds harm
+in the same order. Hence:
 
 1. *Start.* ``c = B``.
-2. *The proposal is applied* only with a plan from the next state whose harm, computed by ``follow_plan`` from exactly
-   that state, is at most the budget. The shield then holds that plan, and ``c`` is its harm. If the proposal is the
-   plan's own action, the shield keeps the rest of the plan with the same ``c``, since the same operations act on the
-   same numbers.
-3. *The plan's action is applied* otherwise. ``follow_plan`` passed through the resulting state when it computed ``c``,
-   so the harm of the plan's rest is ``c`` to the last bit. A plan that harms less may replace it.
-4. *End.* When the episode ends, nothing is left to execute, and ``c`` is the harm of the episode.
+2. *A proposal is applied* only if there is a plan from the next state on whose harm is at most the budget. The function
+   ``follow_plan`` computes this harm from exactly the next state. This plan becomes the shield's plan, and its harm
+   becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because the same
+   operations act on the same numbers.
+3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, it passed through the state after
+   this action, so the harm of the rest of the plan is ``c`` to the last bit. A plan with less harm may replace it.
+4. *End.* When the episode ends, no action is left to execute, and ``c`` is the harm of the episode.
 
-The *budget* is the largest harm that a certificate may have: ``c``, or any value between ``c`` and ``B``. Hence
+The *budget* is the largest harm that a new plan may have: ``c``, or any value between ``c`` and ``B``. Hence
 ``c <= B`` always. ∎ The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode
-and the last bound are the same double.
+and the last bound are the same floating-point number.
 
-**Several vehicles.** With several shielded vehicles, an action above is a row of actions, one for each vehicle, and so
-is each entry of the plan; the proof is the same. All proposals together are tried first. If they have no certificate,
-the vehicles are tried one by one, front to rear: the vehicle's proposal replaces its action in the joint plan, and is
-accepted if a plan behind it has a harm within the budget; otherwise the vehicle keeps its planned action. Each attempt
-starts from a certified plan, and ends with one.
+**Several vehicles.** With several shielded vehicles, each action in the proof is a row of actions, one per vehicle. All
+proposals are tried together first. If they cannot be certified together, they are tried one by one, front to rear: the
+proposal of one vehicle replaces its action in the plan. The proposal is accepted if a plan after it keeps the budget;
+otherwise the vehicle's planned action stays. Each attempt begins and ends with a certified plan.
 
-**Several members.** A world may stand for several possible worlds, its *members*. Then every harm above is the largest
-over the members, and all members are advanced by the same actions: the harm of *every* member is at most ``B``.
+**Several members.** The shield may consider several possible worlds, the *members* of a world. Each harm in the proof
+is then the largest over the members, and the same actions advance all members. So the harm of *every* member is at
+most ``B``.
 """
 
 from __future__ import annotations
@@ -61,42 +62,42 @@ from ethbrake_marl.shields.rollouts import Proposer, certify_by_policy, rolled_o
 from ethbrake_marl.shields.running import Running, begin_running
 from ethbrake_marl.shields.step_memory import StepMemory
 
-Cap = Literal["baseline"]  # plan under which a vehicle's harm is its cap, the largest harm that it may bear
+Cap = Literal["baseline"]  # plan that sets the caps: a vehicle may bear at most the harm that it bears under this plan
 
 
 class StepShield:
-    """Guarantee the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` in every step.
+    """Bound the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` in every step.
 
-    Both methods replace the whole state in one assignment and change no array in place. So an error or an interrupt
-    leaves bound, plan and trust as they were, and a ``copy.copy`` is independent.
+    Both methods replace ``memory`` as a whole and change no array in place. After an error the old memory is still
+    there, and a ``copy.copy`` of the shield is independent.
 
-    The bound starts as the harm of the coupled optimum (E-V2X-BM's constant deceleration), executed decision by
-    decision, or as the harm of ``policy``, simulated from the alert, where that is lower. It never rises. It covers the
-    time up to the scenario's horizon. ``memory.settles`` [n] is true where nothing moves any more at the horizon under
-    the first plan.
+    At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. If
+    ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises. It
+    covers the time up to the scenario's horizon. ``memory.settles`` [n] is true where all vehicles are at rest at the
+    horizon under the first plan.
 
-    At each decision the observed worlds are compared with the prediction, bit by bit. Where they differ (a vehicle
-    brakes beyond its capacity, a number is NaN, a message is missing), ``memory.distrusted`` [n] is set and the
-    guarantee is lost. For the rest of the episode the *fallback* drives: the rest of the plan or the best constant
-    action, whichever harms less, chosen again after every surprise. If a world continues (``only``) after its episode
-    should have ended, it brakes fully.
+    At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs (a vehicle
+    brakes beyond its capacity, a number is NaN, a message is missing), ``memory.distrusted`` [n] is set, and the bound
+    no longer holds. The shield then ignores proposals for the rest of the episode. It applies the rest of the plan or
+    the best constant action, whichever does less harm, and chooses again whenever the world differs from the
+    prediction. A world that goes on after the predicted end of its episode brakes fully.
 
-    If each world has several ``possible`` worlds, all of this holds for the worst of them, and the observed world must
-    lie within the range of their predictions.
+    With several ``possible`` worlds, each harm is the largest over them, and the observed world must lie within the
+    range of their predictions.
 
     Args:
         scenario: the scenario of all worlds.
         vehicle: index of the shielded vehicle (0 = front), or indices of several, front to rear.
-        harm_count: impacts whose harm is guaranteed: ``first`` (each pair's first) or ``total`` (all).
-        allowance: loosens the bound by that much (m2/s2), until the episode ends.
+        harm_count: impacts whose harm is bounded: ``first`` (each pair's first) or ``total`` (all).
+        allowance: amount by which the bound is loosened until the episode ends, m2/s2.
         others: index of each other vehicle -> its script, whose command must be fixed at the alert; None: the
             scenario's scripts.
         cap: ``baseline``: no vehicle bears more harm than under the constant actions of least harm; None: only the sum
             over the vehicles is bounded.
-        logging: keep every intervention in ``log``.
+        logging: whether ``log`` collects the interventions.
 
-    Raises ``InvalidInput`` for an unknown count or vehicle, a negative allowance, or others whose commands are not
-    fixed.
+    Raises ``InvalidInput`` for an unknown harm count, an unknown vehicle, a negative allowance, or a script in
+    ``others`` whose command is not fixed at the alert.
 
     """
 
@@ -122,7 +123,7 @@ class StepShield:
         if not each or any(not isinstance(i, int | np.integer) or isinstance(i, bool) or i not in known for i in each):
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
         if list(each) != sorted(set(each)):
-            raise InvalidInput(f"shield: vehicle = {vehicle!r}: several are named front to rear, each once")
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: several indices must be in increasing order, each once")
         if cap not in (None, *get_args(Cap)):
             raise unknown_name("shield cap", cap, get_args(Cap))
         self.vehicles = tuple(map(int, each))
@@ -137,7 +138,7 @@ class StepShield:
 
     @property
     def bound(self) -> Floats:
-        """Harm of each running episode that the shield guarantees not to exceed, [n] m2/s2."""
+        """Bound of each running episode: the harm that the episode will not exceed, [n] m2/s2."""
         return self._bound_of(self.memory)
 
     def _bound_of(self, memory: StepMemory) -> Floats:
@@ -148,7 +149,7 @@ class StepShield:
 
     @property
     def predicted_harm(self) -> Floats:
-        """Harm that the shield guaranteed at the alert, allowance included, [n] m2/s2."""
+        """Bound of each episode at the alert, including the allowance, [n] m2/s2."""
         return self.memory.first_bound + self.allowance
 
     @property
@@ -158,11 +159,11 @@ class StepShield:
 
     @property
     def log(self) -> list[Intervention] | None:
-        """All interventions (replaced actions) since the last ``clear_log``; None without ``logging``."""
+        """Interventions (replaced actions) since the last call of ``clear_log``; None without ``logging``."""
         return self._entries[: self.memory.logged] if self.logging else None
 
     def clear_log(self) -> None:
-        """Delete all log entries. The log grows until this is called."""
+        """Delete all log entries. Without this call the log grows without limit."""
         self._entries, self.memory = [], self.memory._replace(logged=0)
 
     @property
@@ -174,7 +175,7 @@ class StepShield:
         """Return the harm that each vehicle bears if the current plan is executed, [n, N] m2/s2."""
         running, backup = self.memory.running, self.memory.backup
         if running is None:
-            raise InvalidInput("shield: shares, but no episode has begun; call begin first")
+            raise InvalidInput("shield: shares() was called before any episode began; call begin first")
         return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
@@ -193,45 +194,47 @@ class StepShield:
     ) -> None:
         """Start new episodes in some rows of the batch.
 
-        To start a larger batch, pass all of its rows, 0 to k - 1, at once. Raises ``InvalidInput`` for other rows that
-        do not exist, and where messages lack a piece that certificates need.
+        To enlarge the batch to k rows, start all rows 0 to k - 1 in one call.
 
         Args:
-            worlds: the worlds of these rows at the alert, as the shield assumes them.
+            worlds: the shield's assumption about the worlds of these rows at the alert.
             rows: indices of the rows in which the episodes start.
-            policy: the policy that proposes, which is simulated from the alert; for several vehicles, vehicle index ->
-                policy; None: only the constant actions of least harm give the bound.
-            possible: the possible worlds of each world, [len(rows) * M], the world itself first; None:
-                ``members_of(worlds)``.
+            policy: the proposing policy, which is simulated from the alert; for several vehicles, vehicle index ->
+                policy. None: the bound is the harm of the best constant actions.
+            possible: the M possible worlds of each world, [len(rows) * M], each time beginning with the world itself;
+                None: ``members_of(worlds)``.
+
+        Raises ``InvalidInput`` for rows that do not exist in the batch, and if the messages in ``worlds`` lack a
+        quantity that the shield needs.
 
         """
         running_rows = len(self.memory.first_bound)
         if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
             raise InvalidInput(
-                f"shield: begin in row {rows.max()} of a batch of {running_rows}: a larger batch begins with all of its"
-                " rows at once"
+                f"shield: begin in row {rows.max()}, but the batch has {running_rows} rows; to enlarge it, begin in"
+                " all of its rows at once"
             )
         refuse_untold(worlds, self.vehicles, "shield")
         possible = self.members_of(worlds) if possible is None else possible
         self.memory = self.memory.put(rows, self._begun(worlds, rows, policy, possible))
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """Return the possible worlds of worlds at the alert, M for each of n worlds: n * M worlds.
+        """Return the M possible worlds of each of n worlds at the alert, as n * M worlds.
 
-        Here each world is its only possible world; a subclass may return more.
+        In this class M is 1: the only possible world is the world itself. A subclass may return more.
         """
         return worlds
 
     def _begun(
         self, worlds: Worlds, rows: Ints, policy: Agent | Mapping[int, Agent] | None, possible: Worlds
     ) -> StepMemory:
-        """Return the memory of new episodes, with the first plan and its bound in each world.
+        """Return the memory of new episodes, with the first plan and the bound of each world.
 
         Args:
             worlds: n worlds at the alert.
-            rows: [n] rows of the batch in which the episodes start.
-            policy: the policy that proposes; for several vehicles, vehicle index -> policy; None: none.
-            possible: the possible worlds, M for each world, [n * M].
+            rows: rows of the batch in which the episodes start, [n].
+            policy: the proposing policy; for several vehicles, vehicle index -> policy; None: no policy.
+            possible: the M possible worlds of each world, [n * M].
 
         """
         members, vehicles = possible.n // worlds.n, self.vehicles
@@ -245,7 +248,10 @@ class StepShield:
         if policy is not None:
             policies = policy if isinstance(policy, Mapping) else dict.fromkeys(vehicles[:1], policy)
             if set(policies) != set(vehicles):
-                raise InvalidInput(f"shield: policies for vehicles {sorted(policies)}, shielded are {list(vehicles)}")
+                raise InvalidInput(
+                    f"shield: policy: has vehicles {sorted(policies)}; must have exactly the shielded vehicles,"
+                    f" {list(vehicles)}"
+                )
             drivers = {i: policies[i] for i in vehicles}
             actions = rolled_out(worlds, drivers, self.scenario, self.vehicle, self._width)
             alone = plan_harm(running, actions)
@@ -267,12 +273,13 @@ class StepShield:
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
         """Return the possible worlds and the commands of the unshielded vehicles, as a problem of ``engine.profiles``.
 
-        Raises ``InvalidInput`` if these commands are not fixed at the alert. If each world has several possible worlds
-        (``members``), each of them must also leave the shielded vehicles at least one decision before the horizon.
+        ``members`` is the number of possible worlds of each world. Raises ``InvalidInput`` if the commands are not
+        fixed at the alert. With several possible worlds, it is also raised if the first decision in one of them is not
+        before the horizon, and if the shield has a cap.
         """
         vehicles, horizon_s = self.vehicles, self.scenario.horizon_s
         if members > 1 and self.cap is not None:
-            raise InvalidInput(f"shield: cap {self.cap!r} and {members} possible worlds: give one of the two")
+            raise InvalidInput(f"shield: cap = {self.cap!r}: must be None with {members} possible worlds")
         latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
         if members > 1 and not latest < horizon_s:
             raise InvalidInput(
@@ -292,17 +299,16 @@ class StepShield:
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Any]:
-        """Return the bound of the first plans, [n] m2/s2, and the shield's further memory (``StepMemory.enclosure``).
+        """Return the bound of the first plans, [n] m2/s2, and further memory of a subclass (``StepMemory.enclosure``).
 
-        Here the bound is ``harm``, and the further memory is None. A subclass may compute another bound, and use the
-        memory.
+        In this class the bound is ``harm``, and the further memory is None.
 
         Args:
-            possible: the possible worlds at the alert, M for each world.
+            possible: the M possible worlds of each world at the alert.
             problem: the same worlds as a problem of ``engine.profiles``.
             rows: rows of the batch in which the episodes start.
-            plan: [n, L] or [n, L, K] first plans.
-            harm: [n] their harm in the worst possible world, m2/s2.
+            plan: the first plans, [n, L] or [n, L, K].
+            harm: harm of the first plans in the worst possible world, [n] m2/s2.
 
         """
         return harm, None
@@ -318,22 +324,23 @@ class StepShield:
         """Decide on the proposed actions in every running episode.
 
         Args:
-            proposed: [n], or [n, K] for several vehicles: proposed actions; clipped to [-1, 1]. Where it is NaN,
-                nothing is proposed, and the plan's action is applied.
-            seen: [n, columns] the observed worlds, as the first columns of ``Running.states``; None: they are not
-                compared with the prediction.
-            only: [n] worlds in which to decide; the others stay unchanged. None: all whose episode has not ended.
-            proposer: the policies. Where nothing else certifies a proposal, they are simulated from this decision on,
-                and their actions are tried as a plan. None: this is not tried.
+            proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. NaN means that nothing
+                is proposed; the planned action is then applied.
+            seen: the observed worlds, as the first columns of ``Running.states``, [n, columns]. None: no comparison
+                with the prediction.
+            only: whether to decide in each world, [n]; other worlds stay unchanged. None: decide in all worlds whose
+                episode has not ended.
+            proposer: the policies. If no other plan certifies a proposal, they are simulated from this decision on, and
+                their actions are tried as a plan. None: no such simulation.
 
-        Returns the decision, with the actions to apply. Afterwards ``memory`` holds the predicted next state.
+        Returns the decision with the actions to apply. ``memory`` then contains the predicted next state.
 
         """
         memory = self.memory
         if memory.running is None:
-            raise InvalidInput("shield: decide, but no episode has begun; call begin first")
+            raise InvalidInput("shield: decide() was called before any episode began; call begin first")
         if np.shape(proposed) != (shape := (*memory.distrusted.shape, *memory.backup.plan.shape[2:])):
-            raise InvalidInput(f"shield: proposed {np.shape(proposed)}; {shape} is needed")
+            raise InvalidInput(f"shield: shape of proposed = {np.shape(proposed)}: must be {shape}")
         asked = ~memory.running.finished if only is None else only
         if seen is not None:
             memory = self._compared(memory, seen, asked)
@@ -343,9 +350,10 @@ class StepShield:
     def _decided(
         self, memory: StepMemory, proposed: Floats, asked: Bools, proposer: Proposer | None
     ) -> tuple[Decision, StepMemory]:
-        """Return the decision on ``proposed`` [n] or [n, K] in the worlds ``asked`` [n], and the memory after it.
+        """Return the decision on ``proposed`` [n] or [n, K], and the memory after it.
 
-        ``memory`` is the memory before. ``proposer`` holds the policies to simulate, or None.
+        ``memory`` is the memory before the decision, ``asked`` [n] whether to decide in each world, ``proposer`` the
+        policies to simulate, or None.
         """
         before, held, budget = memory.running, memory.backup, self._bound_of(memory)
         assert before is not None
@@ -376,25 +384,25 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the decision to apply, given a decision that keeps the budget in every possible world.
+        """Return the final decision, given a decision that keeps the budget in every possible world.
 
-        Here it is returned unchanged; a subclass may replace more actions.
+        This class returns ``decision`` unchanged; a subclass may replace more actions.
 
         Args:
             now: the episodes before the decision.
-            memory: memory before the decision, with the plan held so far.
-            budget: [n] largest accepted harm, m2/s2.
-            decision: the decision.
-            asked: [n] worlds in which to decide.
+            memory: memory before the decision, with the old plan.
+            budget: largest harm that is accepted in each episode, [n] m2/s2.
+            decision: the decision that keeps the budget.
+            asked: whether to decide in each world, [n].
 
         """
         return decision
 
     def as_seen(self, seen: Floats) -> Floats:
-        """Return ``seen`` [n, columns], the observed worlds, in a form that can be compared with the prediction.
+        """Return the observed worlds ``seen`` [n, columns] in a form that can be compared with the prediction.
 
-        If the prediction has a column for the gap to an obstacle ahead, worlds without obstacle (an infinite gap) get
-        the predicted gap there. Otherwise ``seen`` is returned unchanged.
+        The prediction may have a column for the gap to an obstacle ahead. In worlds without an obstacle this gap is
+        infinite; it is replaced by the predicted gap. Nothing else is changed.
         """
         running = self.memory.running
         assert running is not None
@@ -408,8 +416,9 @@ class StepShield:
     def expects(self, seen: Floats) -> Bools:
         """Return whether each observed world in ``seen`` [n, columns] agrees with the prediction, [n].
 
-        With one possible world, both must be equal to the bit. With several, each column must lie within the range of
-        their predictions, or, after an impact in one of them, be a finite number.
+        With one possible world, the observed and the predicted world must be equal to the bit. With several, each
+        observed number must lie within the range of the predictions. After an impact in any possible world, every
+        finite number is accepted.
         """
         running = self.memory.running
         assert running is not None
@@ -423,20 +432,21 @@ class StepShield:
         return np.asarray(within | (self._leaves_range(running) & np.isfinite(seen).all(axis=1)), np.bool_)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return whether an impact has happened in one of a world's possible worlds, [n].
+        """Return whether an impact has happened in any possible world of each world, [n].
 
-        From then on the world itself may lie outside their range. ``running`` are the predicted episodes.
+        After such an impact, the true world may lie outside the range of the possible worlds. ``running`` contains the
+        predicted episodes.
         """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
         return np.asarray((predicted[:, :, 2 * N - 1 : 3 * N - 2] == 1.0).any(axis=(1, 2)), np.bool_)
 
     def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
-        """Return the shield's memory after it has compared the observed worlds with the prediction in ``memory``.
+        """Compare the observed worlds with the prediction in ``memory``; return the new memory.
 
-        ``seen`` [n, columns] holds the observed worlds, as the first columns of ``Running.states``. Only the worlds
-        ``asked`` [n] are compared. Worlds that contradict the prediction are distrusted, and get a new plan from the
-        observed state.
+        ``seen`` [n, columns] contains the observed worlds, as the first columns of ``Running.states``; ``asked`` [n]
+        says which worlds are compared. A world that differs from the prediction becomes distrusted, and gets a new plan
+        from the observed state on.
         """
         running, backup, seen = memory.running, memory.backup, self.as_seen(seen)
         assert running is not None

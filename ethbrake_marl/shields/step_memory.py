@@ -1,4 +1,4 @@
-"""``StepMemory``: everything that a step shield remembers of its running episodes, as one value."""
+"""``StepMemory``: all memory of a step shield about its running episodes, as one value."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from ethbrake_marl.shields.running import Running, put
 class StepMemory(NamedTuple):
     """Memory of a step shield for n episodes. No array is ever changed in place."""
 
-    running: Running | None = None  # the episodes as the shield predicts them; None before the first one
+    running: Running | None = None  # the episodes that the shield predicts; None before the first episode
     backup: Backup = Backup(np.zeros((0, 0)), np.zeros(0))  # the certified plan and its harm
     first_bound: Floats = np.zeros(0)  # [n] harm of the plan at the first decision (m2/s2)
     alone_harm: Floats = np.zeros(0)  # [n] harm if the policy drove unshielded (m2/s2); infinity without a policy
     settles: Bools = np.zeros(0, np.bool_)  # [n] whether all vehicles rest at the horizon under the first plan
     replaced: Ints = np.zeros(0, np.int64)  # [n] or [n, K] number of actions replaced so far in the episode
-    distrusted: Bools = np.zeros(0, np.bool_)  # [n] whether the world contradicted the prediction
+    distrusted: Bools = np.zeros(0, np.bool_)  # [n] whether the world differed from the prediction
     baseline_shares: Floats = np.zeros((0, 0))  # [n, N] harm of each vehicle under the best constant actions (m2/s2)
     episode: Ints = np.zeros(0, np.int64)  # [n] number of each row's running episode, from 0
-    enclosure: Any = None  # further memory of a kind of shield, an object with ``take(rows)``; None: nothing
+    enclosure: Any = None  # further memory of a subclass of shield, an object with ``take(rows)``; None: no memory
     logged: int = 0  # number of interventions in the log
 
     def take(self, rows: Ints) -> StepMemory:
@@ -37,11 +37,11 @@ class StepMemory(NamedTuple):
         )
 
     def put(self, rows: Ints, begun: StepMemory) -> StepMemory:
-        """Return this memory with newly begun episodes in the rows with the indices ``rows``.
+        """Return this memory with new episodes in the rows with the indices ``rows``.
 
-        ``begun`` is the memory of the new episodes, in the order of ``rows``, except that ``begun.enclosure`` covers
-        the whole batch already. If the new episodes are at least as many as the present ones, they replace the whole
-        batch. The numbers of episodes count on.
+        ``begun`` is the memory of the new episodes, in the order of ``rows``; only ``begun.enclosure`` is for the whole
+        batch. If there are at least as many new as present episodes, they replace the whole batch. Episode numbers
+        continue.
         """
         old, new = self.running, begun.running
         assert new is not None

@@ -1,4 +1,4 @@
-"""The shield as a wrapper for each interface: it puts a guard into the engine, which reports in the infos."""
+"""Shield wrappers for every kind of environment: each puts a guard into the engine, which reports in the infos."""
 
 from __future__ import annotations
 
@@ -25,36 +25,37 @@ from ethbrake_marl.shields.attach import Attached, Proposing
 from ethbrake_marl.shields.drivers import ShieldedDriver, shielded
 from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
-Told = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rewards, terminated, truncated, infos
+Step = tuple[Any, Any, Any, Any, dict[str, dict[str, Any]]]  # observations, rewards, terminated, truncated, infos
 
 
 class _Closing:
-    """Mixin for wrappers, with a ``close`` that removes the guard from the engine and then closes the environment."""
+    """Mixin for wrappers whose ``close`` removes the guard from the engine, then closes the environment."""
 
     attached: Attached  # the link to the engine and its guard
 
     def close(self, **settings: Any) -> None:
-        """Remove the shield from the environment, then close the environment with its keywords ``settings``."""
+        """Remove the shield from the environment, then call ``close(**settings)`` of the environment."""
         self.attached.close()
         super().close(**settings)  # type: ignore[misc]  # of the wrapper's own library
 
 
 class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
-    """Shield the learners of a parallel environment; the caller's actions or a policy propose.
+    """Shield all learners of a parallel environment.
 
-    Mode ``step``, the default, certifies every action of all learners together, or replaces it. Mode ``episode`` is the
-    paper's Algorithm 1: policy or E-V2X-BM drives the whole episode, whatever is proposed. Bounds hold where the other
-    vehicles follow their scripts. ``infos[agent]`` reports each decision under ``shield_reason`` and other
-    ``shield_...`` keys. See docs/shield.md.
+    Mode ``step``, the default, certifies or replaces the actions of all learners together. In mode ``episode``, the
+    paper's Algorithm 1, the policy or E-V2X-BM drives the whole episode, whatever actions are proposed. The bounds hold
+    as long as the other vehicles follow their scripts. ``infos[agent]`` reports each decision under ``shield_reason``
+    and other ``shield_...`` keys. See docs/shield.md.
 
     Args:
-        env: ``eb.parallel_env(...)`` with one learner (mode ``step``: one or more), or a wrapper around it.
-        policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. Mode ``episode`` needs one.
-            In the other modes, its harm is the bound (the guaranteed harm) where it is lower than that of E-V2X-BM.
-        agents: names of the shielded learners; must be all learners, which is also the meaning of None.
+        env: ``eb.parallel_env(...)`` with one learner (in mode ``step`` one or more), or a wrapper around it.
+        policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. It proposes actions that the
+            caller leaves out. Where it does less harm than E-V2X-BM, its harm is the bound (the harm that the episode
+            will not exceed). Mode ``episode`` needs a policy.
+        agents: names of the shielded learners, which must be all learners; None: all learners.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
-    Raises ``InvalidInput`` for arguments that do not fit.
+    Raises ``InvalidInput`` for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.HybridShield(eb.parallel_env(scenario="paper-random"))
@@ -75,7 +76,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     ) -> None:
         if isinstance(agents, str) or not (agents is None or isinstance(agents, Iterable)):
             raise InvalidInput(
-                f"HybridShield: agents = {agents!r}: must be a list of names, for instance ['vehicle_2']"
+                f"HybridShield: agents = {agents!r}: must be a list of vehicle names, for instance ['vehicle_2']"
             )
         self.attached = Attached(env, ParallelEnv, "eb.parallel_env", policy, "HybridShield", options)
         super().__init__(env)
@@ -85,9 +86,9 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
         if set(asked) != set(self.shielded):
             self.attached.close()
             raise InvalidInput(
-                f"HybridShield: shields every learner, {self.shielded}, and nobody else; got {asked}. What an"
-                " unshielded one does is an assumption that nothing checks: give it a script (learners=[...] of the"
-                " environment)"
+                f"HybridShield: agents = {asked}: must be all learners, {self.shielded}, since the bound holds only if"
+                " every other vehicle follows a script; leave a vehicle out of learners=[...] of the environment to"
+                " give it a script"
             )
 
     def reset(
@@ -95,22 +96,22 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
         """Start an episode; return the observations and infos of the agents.
 
-        ``seed`` and ``options`` are the environment's. ``infos[agent]["shield_bound_harm"]`` already holds the bound.
+        ``seed`` and ``options`` are passed to the environment. ``infos[agent]["shield_bound_harm"]`` is the bound.
         """
         self.attached.check_open()
         result: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
         self.attached.check_open()
         return result
 
-    def step(self, actions: Mapping[str, Any]) -> Told:
-        """Advance by one step with the learners' actions certified or replaced.
+    def step(self, actions: Mapping[str, Any]) -> Step:
+        """Advance by one step; the shield certifies or replaces the learners' actions.
 
-        ``actions`` maps agent names to actions [1]; the policy proposes for agents that are left out. Returns
-        observations, rewards (with the intervention penalty subtracted), terminations, truncations and infos, each by
-        agent name.
+        ``actions`` maps agent names to actions [1]; the policy proposes the actions of agents that are left out.
+        Returns five dictionaries by agent name: observations, rewards (with the intervention penalty subtracted),
+        terminations, truncations and infos.
         """
         self.attached.check_open()
-        result: Told = super().step(actions)
+        result: Step = super().step(actions)
         if not self.attached.engine.components:
             for agent, penalty in zip(self.shielded, self.attached.penalty()[0].tolist(), strict=True):
                 result[1][agent] -= penalty
@@ -118,10 +119,10 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
-    """Return a shielded environment with agents acting in turn (AEC), front to rear.
+    """Return a shielded environment in which the agents act in turn (AEC), front to rear.
 
-    ``env`` is the parallel environment: in AEC, the actions of a step are complete only after the last agent has acted.
-    ``args`` and ``settings`` are the further arguments of ``HybridShield``.
+    ``env`` is a parallel environment, because the shield needs the actions of all agents at once. ``args`` and
+    ``settings`` are further arguments of ``HybridShield``.
     """
     return InTurns.around(HybridShield(env, *args, **settings))
 
@@ -129,11 +130,17 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
 class ShieldedEnv(
     _Closing, gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]], RecordConstructorArgs
 ):
-    """``EthBrake-v0`` behind a shield, by default in mode ``step``: each action is certified, or replaced.
+    """``EthBrake-v0`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
-    ``options`` are keywords of ``ShieldOptions``. The info reports each decision under ``shield_reason`` and other
-    ``shield_...`` keys. ``policy``, required only in mode ``episode``, is simulated from each alert: where it harms no
-    more than E-V2X-BM, its harm is the bound.
+    The info reports each decision under ``shield_reason`` and other ``shield_...`` keys.
+
+    Args:
+        env: an ``EthBrake-v0`` environment, or a wrapper around it.
+        policy: policy that is simulated from each alert; where it does less harm than E-V2X-BM, its harm is the bound.
+            It may be None, except in mode ``episode``.
+        options: keywords of ``ShieldOptions``, including ``mode``.
+
+    Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.ShieldedEnv(eb.EthBrakeEnv("paper-random"))
@@ -159,7 +166,7 @@ class ShieldedEnv(
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; return observation and info.
 
-        ``seed`` and ``options`` are the environment's. ``info["shield_bound_harm"]`` already holds the bound.
+        ``seed`` and ``options`` are passed to the environment. ``info["shield_bound_harm"]`` is the bound.
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
@@ -167,10 +174,10 @@ class ShieldedEnv(
         return result
 
     def step(self, action: NDArray[Any]) -> Any:
-        """Advance by one time step with the action [1] certified or replaced.
+        """Advance by one time step; the shield certifies or replaces the action [1].
 
-        Returns what the wrapped environment returns, with the intervention penalty subtracted from the reward; around
-        ``CostEnv`` that includes the cost.
+        Returns the values that the wrapped environment returns, with the intervention penalty subtracted from the
+        reward. If ``CostEnv`` is wrapped, they include its cost.
         """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
@@ -180,12 +187,18 @@ class ShieldedEnv(
 
 
 class ShieldedVectorEnv(_Closing, VectorWrapper):
-    """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``: each row's action is certified, or replaced.
+    """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
-    ``options`` are keywords of ``ShieldOptions``. ``policy``, required only in mode ``episode``, is simulated from each
-    alert: where it harms no more than E-V2X-BM, its harm is the bound. ``infos["shield_bound_harm"]`` and the other
-    shield entries describe the same moment as the other infos: in a restarted row the new alert, while
-    ``infos["final_info"]`` describes the last step. Raises ``InvalidInput`` for another environment.
+    In a row whose episode has just restarted, ``infos["shield_bound_harm"]`` and the other infos describe the new
+    alert, and ``infos["final_info"]`` describes the last step of the old episode.
+
+    Args:
+        env: an ``EthBrakeVectorEnv``, or a wrapper around it.
+        policy: policy that is simulated from each alert; where it does less harm than E-V2X-BM, its harm is the bound.
+            It may be None, except in mode ``episode``.
+        options: keywords of ``ShieldOptions``, including ``mode``.
+
+    Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -209,7 +222,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every row; return observations [rows, F] and infos.
 
-        ``seed`` and ``options`` are the environment's. ``infos["shield_bound_harm"]`` already holds the bounds.
+        ``seed`` and ``options`` are passed to the environment. ``infos["shield_bound_harm"]`` is the bound of each row.
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
@@ -217,10 +230,10 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
         return result
 
     def step(self, actions: NDArray[Any]) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
-        """Advance every world by one time step with the actions [rows, 1] certified or replaced.
+        """Advance every world by one time step; the shield certifies or replaces the actions [rows, 1].
 
-        Returns observations, rewards with the intervention penalty subtracted, terminated, truncated (each [rows]) and
-        infos.
+        Returns observations [rows, F], rewards [rows] with the intervention penalty subtracted, terminated [rows],
+        truncated [rows], and infos.
         """
         self.attached.check_open()
         observation, reward, terminated, truncated, infos = self.env.step(actions)
@@ -230,22 +243,22 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
 
 
 def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, **options: Any) -> Any:
-    """Put a shield around an environment, with the wrapper for its interface, or around an agent.
+    """Put a shield around an environment, an agent or a team.
 
     Args:
-        env: an environment of this package, possibly wrapped: PettingZoo parallel or AEC, Gymnasium, its vector
-            interface, or Stable-Baselines3's ``VecEnv``. Inner wrappers may change actions: the action that reaches the
-            engine is certified. Or an agent or a team, which needs ``scenario``, the scenario in which actions are
-            certified.
-        policy: proposes where the caller gives no action, and lowers the bound (the harm that the shield guarantees) to
-            its own harm where that is lower. Mode ``episode`` needs it. None: nobody.
-        mode: ``step``, ``episode``, or a mode of an extension. None: ``step``, unless the options belong to another
-            mode.
+        env: an environment of this package, possibly wrapped: PettingZoo parallel or AEC, a Gymnasium or Gymnasium
+            vector environment, or a Stable-Baselines3 ``VecEnv``. If inner wrappers change actions, the shield
+            certifies the changed action. ``env`` may also be an agent or a team; ``options`` must then contain
+            ``scenario``, the scenario in which actions are certified.
+        policy: policy that proposes the actions that the caller leaves out. Where it does less harm than E-V2X-BM, its
+            harm is the bound (the harm that the episode will not exceed). It may be None, except in mode ``episode``.
+        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``, or the mode of an extension if
+            only that mode has the ``options``.
         options: further keywords of ``ShieldOptions``.
 
-    Returns ``HybridShield``, the same with agents acting in turn, ``ShieldedEnv``, ``ShieldedVectorEnv`` or
-    ``ShieldedVecEnv``; an agent or a team for an agent or a team. Raises ``InvalidInput`` for anything else, and for
-    arguments that these refuse.
+    Returns a ``HybridShield`` (for AEC, an environment with agents in turn around it), a ``ShieldedEnv``, a
+    ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. For an agent or a team, returns the shielded agent or team. Raises
+    ``InvalidInput`` for any other object, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
@@ -257,17 +270,20 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
     settings = {"mode": mode, **options}
     if isinstance(env, Agent | Team | ShieldedDriver):
         if isinstance(env, HybridAgent | ShieldedDriver) or (isinstance(env, Team) and env.shield is not None):
-            raise InvalidInput(f"shield: agent {env.name!r} is behind a shield already")
+            raise InvalidInput(f"shield: agent {env.name!r} already has a shield")
         if policy is not None or "scenario" not in options:
-            raise InvalidInput(f"shield: agent {env.name!r} needs scenario=, in which to certify, and takes no policy")
+            raise InvalidInput(
+                f"shield: agent {env.name!r}: pass scenario= (the scenario for certification) and no policy="
+            )
         return shielded(env, load_scenario(settings.pop("scenario")), **settings)
     if isinstance(env, AECEnv):
         inside: Any = env
-        while type(inside) in (InTurns, Ordered, OrderEnforcingWrapper):  # as in eb.env; others may change actions
+        while type(inside) in (InTurns, Ordered, OrderEnforcingWrapper):  # of eb.env; other wrappers may change actions
             inside = inside.env
         if not isinstance(inside, ParallelEnv):
             raise InvalidInput(
-                f"shield: {inside} acts in turns: put the shield inside it, as eb.shielded_aec(parallel)"
+                f"shield: in {inside} the agents act in turn; shield the parallel environment inside it:"
+                " eb.shielded_aec(parallel)"
             )
         return shielded_aec(inside, policy, **settings)
     if isinstance(env, VectorEnv):
@@ -276,12 +292,12 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
         return ShieldedEnv(env, policy, **settings)  # type: ignore[arg-type]
     vec_env = getattr(sys.modules.get("stable_baselines3.common.vec_env"), "VecEnv", None)
     if vec_env is not None and isinstance(env, vec_env):
-        from ethbrake_marl.shields.sb3 import ShieldedVecEnv  # torch: only where there is such an environment
+        from ethbrake_marl.shields.sb3 import ShieldedVecEnv  # imports torch
 
         return ShieldedVecEnv(env, policy, **settings)
     if isinstance(env, ParallelEnv):
         return HybridShield(env, policy, **settings)
     raise InvalidInput(
-        f"shield: {env!r:.200} has none of the interfaces: parallel_env, env (agents in turn), EthBrakeEnv,"
-        " EthBrakeVectorEnv, make_sb3_vec_env, or an agent"
+        f"shield: {env!r:.200}: must be an agent, a team, or an environment made by eb.parallel_env, eb.env,"
+        " eb.EthBrakeEnv, eb.EthBrakeVectorEnv or eb.make_sb3_vec_env"
     )

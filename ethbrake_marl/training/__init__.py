@@ -1,4 +1,4 @@
-"""Training of policies, and the loading of trained ones. Only the modules that train import torch."""
+"""Train policies, and load trained policies. Loading does not import torch; training does."""
 
 from typing import TYPE_CHECKING
 

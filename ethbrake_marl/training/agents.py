@@ -1,7 +1,4 @@
-"""Trained policies as agents: ``ppo``, ``universal`` and other shipped ones, ``policy@PATH`` and ``team@RUN``.
-
-This module needs no torch.
-"""
+"""Agents that drive with trained policies: shipped policies such as ``universal``, ``policy@PATH`` and ``team@RUN``."""
 
 from __future__ import annotations
 
@@ -22,18 +19,22 @@ from ethbrake_marl.training.team import has_policy_each, load_team
 
 
 def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
-    """Return the agent of a trained policy: of a shipped one by its name, or of a run or a bundle, as ``ppo@PATH``.
+    """Return the agent that drives with a trained policy, or a team if each learner of the run has its own policy.
 
-    It is a team if each learner of the run has its own policy. ``argument`` is unused; ``settings`` holds the spec with
-    the path, and the scenario. Raises ``InvalidInput`` for a policy of another algorithm, and whatever loading the
-    policy raises.
+    Args:
+        argument: not used.
+        settings: settings with the agent's spec and the scenario. The spec is the name of a shipped policy
+            (``universal``), or names a run or a policy bundle (``ppo@PATH``).
+
+    Raises ``InvalidInput`` if another algorithm trained the policy, and the errors of loading the policy.
+
     """
     spec, path = settings.spec, settings.policy
     name = spec.partition("@")[0]
     if path is None and name not in shipped_policies():
         raise InvalidInput(
-            f"agent {spec!r}: a policy is needed: {name}@PATH, where PATH is a run or a policy bundle, for instance"
-            f" {name}@runs/my-run"
+            f"agent {spec!r} needs a policy: write {name}@PATH, where PATH is the folder of a run or a policy bundle,"
+            f" for instance {name}@runs/my-run"
         )
     agent: LearnedAgent | Team
     if path is None:
@@ -48,7 +49,7 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
         agent = LearnedAgent(policy, name=spec)
     trained_by = policy.manifest.algorithm
     if name in ALGORITHMS and name != trained_by:
-        raise InvalidInput(f"agent {spec!r}: that policy was trained by {trained_by}; write {trained_by}@{path}")
+        raise InvalidInput(f"agent {spec!r}: the policy was trained by {trained_by}; write {trained_by}@{path}")
     return agent
 
 
@@ -56,7 +57,7 @@ PPO_AGENT, SAC_AGENT = (
     Part(
         make_policy_agent,
         form=f"{name}[@PATH]",
-        about=f"a policy trained by {name.upper()}: the shipped one, or a run or a bundle",
+        about=f"a policy trained by {name.upper()}: the shipped policy, or the policy of a run or bundle",
         knows=Source.MESSAGES,
     )
     for name in ("ppo", "sac")
@@ -65,12 +66,12 @@ PPO_AGENT, SAC_AGENT = (
 POLICY = Part(
     make_policy_agent,
     form="policy@PATH",
-    about="a policy, whatever trained it: a run or a bundle",
+    about="the policy of a run or bundle, trained by any algorithm",
     knows=Source.MESSAGES,
 )
 
 TEAM = Part(
-    make_policy_agent, form="team@RUN", about="the learners of a run, each as it was trained", knows=Source.MESSAGES
+    make_policy_agent, form="team@RUN", about="the learners of a run, each with its policy", knows=Source.MESSAGES
 )
 
 UNIVERSAL, PPO_OBSTACLE, ROLLOUT_OBSTACLE, VINE_PREFERENCE, VINE_FRONT, VINE_PAIR, VINE_ALL = (

@@ -1,4 +1,4 @@
-"""Interface of a learning algorithm: how it builds its model, and which parts of that model a checkpoint saves."""
+"""Interface of a learning algorithm: how it builds a model, and what a checkpoint saves of the model."""
 
 from __future__ import annotations
 
@@ -19,17 +19,15 @@ from ethbrake_marl.training.training import Training
 class Algorithm(ABC):
     """Base class of a learning algorithm whose model is a ``BaseAlgorithm`` of Stable-Baselines3.
 
-    A subclass must implement ``build``, which returns the model. It may override ``actors`` and ``tensors`` (the
-    policies inside the model, and their weights), ``optimizers`` and ``learned_beside`` (what a checkpoint saves
-    besides ``model.policy``), and ``log_noise`` (which must stay finite). The defaults fit a model whose ``policy`` has
-    one ``optimizer``, as in PPO and A2C.
+    A subclass must implement ``build``, which returns the model. It may override ``actors`` (the policies inside the
+    model), ``tensors`` (the weights of a policy), ``optimizers`` and ``learned_beside`` (what a checkpoint saves in
+    addition to ``model.policy``), and ``log_noise`` (the exploration noise). The default methods fit a model whose
+    ``policy`` has one ``optimizer``, such as PPO and A2C.
     """
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """Return a new model on the CPU, seeded by the recipe.
-
-        The model must depend on the two arguments only.
+        """Return a new model on the CPU, whose random numbers depend on the recipe's seed only.
 
         Args:
             training: recipe and scenario.
@@ -38,31 +36,37 @@ class Algorithm(ABC):
         """
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
-        """Return the policies of Stable-Baselines3 inside the model that choose actions.
+        """Return the policies inside the model that choose actions.
 
-        This is one policy for all learners, or, in the scheme ``independent``, one for each learner, front to rear.
+        There is one policy for all learners or, in the scheme ``independent``, one for each learner, front to rear.
         """
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of the weights of one of ``actors``, by their names in a policy bundle with this network."""
+        """Return a copy of the weights of a policy, by their names in a policy bundle.
+
+        Args:
+            actor: one of the policies that ``actors`` returns.
+            network: description of the bundle's network.
+
+        """
         return tensors_of(actor, network)
 
     def optimizers(self, model: BaseAlgorithm) -> Mapping[str, Optimizer]:
-        """Return every optimiser of the model by a unique name, always in the same order."""
+        """Return all optimisers of the model by name. Their order must always be the same."""
         return {"policy": model.policy.optimizer}
 
     def learned_beside(self, model: BaseAlgorithm) -> Mapping[str, Tensor]:
-        """Return learned tensors outside ``model.policy``, by name, which a checkpoint saves too; by default none.
+        """Return the learned tensors outside ``model.policy``, by name, which a checkpoint must save; by default none.
 
-        SAC returns ``{"log_ent_coef": ...}``, the entropy coefficient that it learns.
+        For instance, SAC returns ``{"log_ent_coef": ...}``, because it learns its entropy coefficient.
         """
         return {}
 
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
-        """Return the logarithm of the model's exploration noise, which is checked to stay finite during the training.
+        """Return the logarithm of the model's exploration noise, or None if there is none.
 
-        None if there is nothing to check.
+        The training stops with an error if the noise is not finite and positive.
         """
         log_std: Tensor | None = getattr(model.policy, "log_std", None)
         return None if log_std is None else log_std.detach()

@@ -1,4 +1,4 @@
-"""Callback of a training: between two updates it measures the policies, logs, writes checkpoints, and may stop."""
+"""Callback of a training: between updates it measures policies, logs, writes checkpoints, and may stop the training."""
 
 from __future__ import annotations
 
@@ -25,42 +25,43 @@ from ethbrake_marl.training.models import Learner, Model, make_policies
 from ethbrake_marl.training.progress import RETURN, Course, objective_in_words
 from ethbrake_marl.training.run_folder import RunDirectory
 
-# Column of the log -> key of the info at the end of an episode. A row holds the mean over episodes since the last row.
+# Column of the log -> key of ``info`` at the end of an episode. The log has means over the episodes since its last row.
 EPISODE_COLUMNS = {
     "rollout/first_impact_harm": "world_first_impact_harm",
     "rollout/total_harm": "world_total_harm",
     "rollout/collision_rate": "collided",
 }
 
-StopAt = Callable[[Mapping[str, float]], str | None]  # takes the metrics of an evaluation; returns why to stop, or None
+# Function of the metrics of an evaluation that returns a reason to stop the training, or None to continue.
+StopAt = Callable[[Mapping[str, float]], str | None]
 
 
 class StopRequested(Exception):
     """Internal exception that leaves the training loop between two updates.
 
-    Its argument is the reason that ``StopAt`` returned, or None after Ctrl-C.
+    The argument of the exception is the reason that ``StopAt`` returned, or None after Ctrl-C.
     """
 
 
 class Watchers(NamedTuple):
-    """Functions that follow a training: they measure its policies, may stop it, and receive its progress."""
+    """Functions that a training calls: to measure its policies, to ask whether to stop, and to report progress."""
 
     evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
-    stop_at: StopAt | None  # takes the metrics of an evaluation and returns a reason to stop, or None to go on
-    on_progress: OnProgress | None  # takes a ``Progress``; None: nobody is informed
-    stop: Callable[[], bool]  # called before every rollout; returns True to stop the training (Ctrl-C)
+    stop_at: StopAt | None  # takes the metrics of an evaluation; returns a reason to stop, or None to continue
+    on_progress: OnProgress | None  # takes a ``Progress``; None: progress is not reported
+    stop: Callable[[], bool]  # called before every rollout; returns True if Ctrl-C was pressed
 
 
 class RunCallback(BaseCallback):
     """Callback that measures, logs and writes checkpoints between two updates, and stops the training on request.
 
-    ``_between_updates`` lists what happens and when. It runs before the first rollout, after each update, and at the
-    end. To stop, the callback writes a checkpoint and raises ``StopRequested``.
+    Its work (``_between_updates``) is done before the first rollout, after each update, and at the end of the training.
+    To stop the training, it writes a checkpoint and raises ``StopRequested``.
 
     Args:
         run: folder of the run.
         learner: the model that learns, with its algorithm and training.
-        watchers: functions that measure, stop and report.
+        watchers: functions to measure the policies, to ask whether to stop, and to report progress.
 
     """
 
@@ -77,7 +78,7 @@ class RunCallback(BaseCallback):
         self._stop_reason: str | None = None
         self._objective = objective_in_words(learner.training)
         self._ended: dict[str, list[float]] = {column: [] for column in EPISODE_COLUMNS}
-        self._is_done_here = False  # True after ``restore``: this update was handled before the checkpoint was written
+        self._is_done_here = False  # True after ``restore``: the work after this update was done before the checkpoint
 
     def _on_rollout_start(self) -> None:
         while self.notes:
@@ -116,14 +117,16 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights as policies into ``course``, at most once per update.
+        """Copy the current weights into ``course`` as policies, unless this was already done after this update.
 
         Raises ``TrainingDiverged`` if a weight is not finite.
         """
         course, steps = self.course, self.model.num_timesteps
         if course.policy is None or (course.steps, course.updates) != (steps, self.updates):
             if not weights_are_finite(self.model, self.learner.algorithm):
-                raise TrainingDiverged(f"training: a weight is not finite after step {steps}")
+                raise TrainingDiverged(
+                    f"training: a weight is not finite after step {steps}; try a smaller learning_rate"
+                )
             course.policy, course.steps, course.updates = self.learner.policies(), steps, self.updates
 
     def _measure(self) -> None:
@@ -155,12 +158,12 @@ class RunCallback(BaseCallback):
         return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
 
     def tell(self, note: str = "") -> None:
-        """Report the progress of the training to ``on_progress``, with ``note`` as a message to print once."""
+        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, printed once."""
         if self._watchers.on_progress is None:
             return
         course = self.course
         metrics = dict(course.evaluations[-1]) if course.evaluations else {}
-        if metrics and self.recipe.reward.harm_count == "total":  # the harm of the training's reward comes first
+        if metrics and self.recipe.reward.harm_count == "total":  # the harm that the reward counts comes first
             metrics = {"total_harm": metrics["total_harm"], **metrics}
         recent = self._recent_return()
         if recent is not None:
@@ -172,13 +175,13 @@ class RunCallback(BaseCallback):
         )
 
     def _write_checkpoint(self) -> None:
-        """Write a checkpoint of the current state, unless it exists already."""
+        """Write a checkpoint of the current state, unless there already is one."""
         folder = self.run.checkpoint(self.course.steps)
         if not folder.exists():
             write_checkpoint(folder, self._state())
 
     def _state(self) -> TrainingState:
-        """Return the state of model, environment, random generators and logs, from which ``restore`` continues."""
+        """Return the state of model, environment, random generators and logs, for ``restore``."""
         course = self.course
         numbers, arrays = capture_model(self.model, self.learner.algorithm)
         best: tuple[Policy, ...] = ()
@@ -198,9 +201,9 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Restore model and progress from the checkpoint ``state``, so that the training continues there.
+        """Restore model and progress from a checkpoint, so that the training continues from it.
 
-        Raises ``CorruptBundle`` if the state belongs to another model.
+        Raises ``CorruptBundle`` if the checkpoint belongs to another model.
         """
         numbers, course = state.numbers, self.course
         try:
@@ -218,7 +221,7 @@ class RunCallback(BaseCallback):
                 )
         except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise CorruptBundle(
-                f"{self.run.checkpoints}: the checkpoint of step {state.steps} is not of this training:"
-                f" {' '.join(str(error).split())}; delete it to resume from the one before"
+                f"{self.run.checkpoints}: the checkpoint of step {state.steps} does not belong to this training:"
+                f" {' '.join(str(error).split())}; delete this checkpoint to resume from an earlier one"
             ) from None
         self._is_done_here = True

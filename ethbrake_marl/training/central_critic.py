@@ -1,4 +1,4 @@
-"""PPO policy with a central critic: the actor sees its own observation, the critic sees the whole line."""
+"""PPO policy with a central critic: the actor sees one vehicle's observation, the critic sees the whole line."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torch import Tensor
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO policy whose actor sees only the beginning of an observation row, and whose critic sees the whole row.
+    """PPO policy whose actor sees the first entries of an observation row, and whose critic sees the whole row.
 
     Args:
         arguments: positional arguments of Stable-Baselines3's ``ActorCriticPolicy``.
-        own: number of entries at the beginning of a row that the actor sees: the vehicle's own observation.
+        own: number of entries at the beginning of a row that the actor sees (the vehicle's observation).
         settings: keyword arguments of ``ActorCriticPolicy``.
 
     """
 
     def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
-        self._own = own  # set first, because the base class builds the networks
+        self._own = own  # set before ``super().__init__``, which builds the networks
         super().__init__(*arguments, **settings)
 
     def _build_mlp_extractor(self) -> None:
@@ -28,10 +28,14 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of actor and critic: the actor's take the first ``own`` entries of a row, the critic's all.
+    """Hidden layers of an actor, which takes the first ``own`` entries of a row, and a critic, which takes all entries.
 
-    ``whole`` is the length of a row; ``net_arch`` and ``activation_fn`` are those of Stable-Baselines3's
-    ``ActorCriticPolicy``.
+    Args:
+        own: number of entries that the actor takes.
+        whole: number of entries of a row.
+        net_arch: sizes of the layers, as in Stable-Baselines3's ``ActorCriticPolicy``.
+        activation_fn: activation, as in Stable-Baselines3's ``ActorCriticPolicy``.
+
     """
 
     def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
@@ -40,5 +44,5 @@ class _OwnPartForTheActor(MlpExtractor):
         self._own = own
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the output of the actor's last hidden layer for rows ``features`` [n, F]."""
+        """Return the output of the actor's last hidden layer for observation rows ``features`` [n, F]."""
         return super().forward_actor(features[:, : self._own])

@@ -1,4 +1,4 @@
-"""Checkpoint of a training between two updates: a folder with arrays and plain numbers, written atomically."""
+"""Checkpoint of a training between two updates: a folder with arrays and JSON, written atomically."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _KINDS = {
     "progress": str,
 }
 
-MOST_CHECKPOINTS = 2  # number of checkpoints during a training, so that an older one remains if the last is damaged
+MOST_CHECKPOINTS = 2  # number of checkpoints to keep; if the newest is damaged, training resumes from the older one
 
 
 class TrainingState(NamedTuple):
-    """State of a training between two updates, from which it can continue as if it had not stopped."""
+    """State of a training between two updates, from which the training continues as if it had not stopped."""
 
-    numbers: dict[str, Any]  # counters, settings and log as plain data for JSON
+    numbers: dict[str, Any]  # counters, settings and log, as plain data for JSON
     arrays: Arrays  # weights, optimiser states, environment and random generators, by name
 
     @property
@@ -47,9 +47,9 @@ class TrainingState(NamedTuple):
 
 
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
-    """Write ``state`` as a checkpoint in a new ``folder``, and delete all but the two newest checkpoints beside it.
+    """Write ``state`` as a checkpoint to a new ``folder``, and delete all but the two newest checkpoints.
 
-    It is written completely or not at all: all bytes are on the disk before the folder gets its name.
+    If the write fails, no incomplete checkpoint is left: all bytes are on the disk before the folder gets its name.
     """
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in state.arrays.items()}
     with new_folder(folder) as partial:
@@ -65,12 +65,12 @@ def write_checkpoint(folder: Path, state: TrainingState) -> None:
 def read_checkpoint(folder: Path) -> TrainingState:
     """Read and check the checkpoint in ``folder``, and return its state.
 
-    Raises ``CorruptBundle`` if it is damaged, ``InvalidInput`` if it has another format.
+    Raises ``CorruptBundle`` if the checkpoint is damaged, ``InvalidInput`` if it has another format.
     """
     if not os.path.lexists(folder / NUMBERS):
         raise InvalidInput(
-            f"{folder}: has no {NUMBERS}, so another version of this package wrote it; use that version, or"
-            " delete the checkpoint to resume from the one before"
+            f"{folder}: the checkpoint has no {NUMBERS}, so another version of this package wrote it; install that"
+            " version, or delete this checkpoint to resume from an earlier one"
         )
     data = read_plain(folder / NUMBERS, 256 << 20, refusal=CorruptBundle, follow_links=False)
     with open_plain(folder / ARRAYS, 1 << 36, refusal=CorruptBundle, follow_links=False) as stream:
@@ -80,38 +80,40 @@ def read_checkpoint(folder: Path) -> TrainingState:
         except ValueError:
             whole = False
     if not whole:
-        raise CorruptBundle(f"{folder}: its files are not those that were written (the SHA-256 differs)")
+        raise CorruptBundle(f"{folder}: the files of the checkpoint are damaged (their SHA-256 differs)")
     try:
         state = TrainingState(numbers, safetensors.numpy.load_file(folder / ARRAYS))
     except SafetensorError as error:
-        raise InvalidInput(f"{folder / ARRAYS}: {error}; delete the checkpoint to resume from the one before") from None
+        raise InvalidInput(
+            f"{folder / ARRAYS}: {error}; delete this checkpoint to resume from an earlier one"
+        ) from None
     for name, kind in _KINDS.items():
         if type(numbers.get(name)) is not kind:
             raise InvalidInput(
-                f"{folder / NUMBERS}: {name} = {numbers.get(name)!r:.60}: must be of type {kind.__name__}; delete the"
-                " checkpoint to resume from the one before"
+                f"{folder / NUMBERS}: {name} = {numbers.get(name)!r:.60}: must be of type {kind.__name__}; delete this"
+                " checkpoint to resume from an earlier one"
             )
     return state
 
 
 def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
-    """Return the SHA-256 over the open file of arrays and the numbers of a checkpoint, in hexadecimal digits."""
+    """Return the SHA-256 (hexadecimal) of a checkpoint: its open file of arrays, followed by its numbers as JSON."""
     digest = hashlib.file_digest(arrays, "sha256")
     digest.update(json.dumps(numbers, sort_keys=True).encode())
     return digest.hexdigest()
 
 
 def checkpoint_folders(folder: Path) -> list[Path]:
-    """Return the folders of all checkpoints inside ``folder``, newest first, without checking their content."""
+    """Return the folders of all checkpoints inside ``folder``, newest first. Their content is not checked."""
     folders = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
     return sorted(folders, reverse=True)
 
 
 def newest_usable(folder: Path) -> tuple[TrainingState | None, list[str]]:
-    """Read the newest undamaged checkpoint inside ``folder``, and delete damaged newer ones.
+    """Read the newest undamaged checkpoint inside ``folder``, and delete newer checkpoints, which are damaged.
 
-    Returns its state (None if there is none), and for each damaged checkpoint a message that says what is wrong. Raises
-    ``InvalidInput`` for a checkpoint of another format, which is not deleted.
+    Returns the state (None if there is no undamaged checkpoint), and an error message for each damaged checkpoint.
+    Raises ``InvalidInput`` for a checkpoint of another format, which is not deleted.
     """
     reasons: list[str] = []
     for path in checkpoint_folders(folder):

@@ -1,4 +1,4 @@
-"""The main experiment: train a policy or a team, and evaluate it, alone and behind its shield, beside the baselines."""
+"""The main experiment: train a policy or team, and compare it, with and without a shield, with the baselines."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from ethbrake_marl.training.session import TrainResult, train
 
 BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
 
-TEAM_BASELINES = ("full_brake", "e_v2x_bm")  # each drives every learner; the closed form is for one
+TEAM_BASELINES = ("full_brake", "e_v2x_bm")  # baselines that can drive several learners
 
-SHIELDED = "hybrid"  # the policy, or the team, behind its shield
+SHIELDED = "hybrid"  # name of the trained policy or team with a shield
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,44 +47,48 @@ class Experiment:
     """A trained policy or team and its evaluation: the input of the functions that write reports about a run."""
 
     trained: TrainResult  # result of the training, which may have been interrupted
-    agents: Mapping[str, Driver]  # by name, see ``compared_agents``
+    agents: Mapping[str, Driver]  # compared agents by name (``compared_agents``)
     evaluation: Evaluation  # outcomes of these agents on the evaluation list
     rows: SummaryTable  # results table of the evaluation, one row per agent
-    list_seed: int  # seed of the evaluation's worlds
-    harm_count: HarmCount  # harm that all agents minimise
-    started: float  # start of the experiment by ``time.monotonic`` (s)
+    list_seed: int  # seed of the evaluation list
+    harm_count: HarmCount  # count of harm that all agents minimise
+    started: float  # ``time.monotonic`` at the start of the experiment (s)
 
     @property
     def learned(self) -> str:
-        """Name of the trained policy or team among the agents."""
+        """Name of the trained policy or team in ``agents``."""
         return TRAINED_POLICY if TRAINED_POLICY in self.agents else TRAINED_TEAM
 
     @property
     def run(self) -> RunDirectory:
-        """Folder of the run, as an object that names its files."""
+        """Folder of the run."""
         return RunDirectory(self.trained.directory)
 
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """What ``ethbrake run`` prints about a report that was written."""
+    """Texts that ``ethbrake run`` prints about a report that it has written."""
 
-    tables: tuple[Any, ...]  # tables to print instead of the usual ones
+    tables: tuple[Any, ...]  # tables to print instead of the results table
     note: str  # text that says where the report is
-    interrupted: str = (
-        ""  # what Ctrl-C stopped, so that the report lacks it: "the training alone/vehicle_2"; "": nothing
-    )
+    # What the report lacks because of Ctrl-C, such as "the training alone/vehicle_2"; "": the report is complete.
+    interrupted: str = ""
 
 
-MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report; the second argument takes its progress
+MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report, and calls the second argument meanwhile
 
 
 def register_run_report(name: str, make: MakeReport) -> None:
-    """Register a function that writes a report into the folder of every ``ethbrake run``, after its results.
+    """Register a function that writes a report into the folder of every later ``ethbrake run``.
 
-    ``name`` is the name of the report, which no other report may have; ``make`` writes it from an ``Experiment``.
+    A package can instead declare an entry point of the group ``ethbrake_marl.run_reports``.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.run_reports``.
+    Args:
+        name: name of the report, which must differ from the names of other reports.
+        make: function that writes the report about an ``Experiment``.
+
+    Raises ``AlreadyExists`` if another report has the name.
+
     """
     RUN_REPORTS.add(name, make, lambda other: other is make)
 
@@ -94,13 +98,13 @@ RUN_REPORTS: Registry[MakeReport] = Registry("report of a run", "run_reports", r
 
 @dataclass(frozen=True, slots=True)
 class ExperimentResult:
-    """What ``run_experiment`` returns: the training, the results, and the tables and notes to print."""
+    """Result of ``run_experiment``: the training, the results, and the tables and notes to print."""
 
     trained: TrainResult  # result of the training, which may have been interrupted
     results: list[dict[str, Any]]  # content of results.json: one object per agent
-    tables: tuple[Any, ...]  # tables of the evaluation for a terminal
+    tables: tuple[Any, ...]  # tables of the evaluation, for a terminal
     notes: tuple[str, ...]  # texts that say where results and reports are
-    interrupted: str = ""  # what Ctrl-C stopped after the training (``RunReport.interrupted``); "": nothing
+    interrupted: str = ""  # what the reports lack because Ctrl-C stopped them (``RunReport.interrupted``); "": nothing
 
 
 def run_experiment(
@@ -116,34 +120,34 @@ def run_experiment(
     settings: Sequence[str] = (),
     on_progress: OnProgress | None = None,
 ) -> ExperimentResult:
-    """Train the learners, evaluate them alone and behind their shield beside the baselines, and write the results.
+    """Train the learners, compare them, with and without a shield, with the baselines, and write results and reports.
 
-    All agents minimise the harm that the learners are trained for (``reward.harm_count`` of the recipe). Installed
-    extensions then write their reports.
+    All agents minimise the count of harm that the learners are trained for (``reward.harm_count`` of the recipe).
+    Installed extensions write reports about the results.
 
-    Ctrl-C during the training ends it after the current update, and the policy so far is evaluated. A second Ctrl-C, or
-    one during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the policy. Ctrl-C during a
-    further training of a report ends that training, and the report is written without it
+    Ctrl-C during the training stops it after the current update, and the policy so far is evaluated. A second Ctrl-C,
+    or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the policy. A report may
+    train further policies. Ctrl-C during such a training stops it, and the report is written without its result
     (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
 
     Args:
-        scenario: scenario with at least one learner. Several are trained as a team, by the recipe's scheme.
+        scenario: scenario with at least one learner. Several learners are trained as a team, with the recipe's scheme.
         directory: the new folder of the run.
         recipe: recipe of the training.
-        steps: overrides the recipe's number of decisions.
-        seed: overrides the recipe's seed of the training.
+        steps: number of decisions of all learners; None: the recipe's number.
+        seed: seed of the training; None: the recipe's seed.
         episodes: number of worlds of the evaluation list.
         list_seed: seed of the evaluation list.
         force: replace an earlier run.
-        settings: how recipe and scenario differ from their files, ``KEY=VALUE`` each; recorded in ``config.json``.
-        on_progress: called with the progress of training, evaluation and reports.
+        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files, for ``config.json``.
+        on_progress: function that is called with the progress of training, evaluation and reports.
 
-    Raises what ``train`` and ``evaluate`` raise; ``AlreadyExists`` for an existing run, before any work.
+    Raises the errors of ``train`` and ``evaluate``, and ``AlreadyExists``, before the training, for an existing run.
 
     """
     started = time.monotonic()
     tell = on_progress or (lambda progress: None)
-    reports = [RUN_REPORTS[name] for name in RUN_REPORTS]  # one that cannot be loaded ends the run before it begins
+    reports = [RUN_REPORTS[name] for name in RUN_REPORTS]  # raises before the training if a report cannot be loaded
     sample = scenario.sample(episodes, list_seed)
     refuse_untold(sample.worlds, scenario.learners, "run, with the baseline e_v2x_bm and a shield")
     trained = train(
@@ -156,7 +160,8 @@ def run_experiment(
         total = n * len(order)
         if trained.status == "interrupted":
             note = (
-                f"interrupted after {trained.steps:,} steps: evaluating the policy so far; Ctrl-C again stops at once"
+                f"training interrupted after {trained.steps:,} steps; now evaluating the policy so far (press Ctrl-C"
+                " again to stop immediately)"
             )
             tell(Progress("evaluation", 0, total, note=note))
         evaluation = evaluate(
@@ -190,16 +195,17 @@ def run_experiment(
 def compared_agents(
     trained: Trained, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] | None = None
 ) -> dict[str, Driver]:
-    """Return the agents to compare, by name: the baselines, what was trained, and ``hybrid``, the same behind a shield.
+    """Return the agents to compare, by name: baselines, the trained policy or team, and the same with a shield.
 
-    One policy is ``trained policy``, its shield the paper's. Several learners are ``trained team``, shielded together
-    by the step shield; for each learner there is also the team in which that vehicle brakes fully.
+    With one learner, the trained agent is ``trained policy``, and ``hybrid`` is this policy with the paper's shield.
+    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a step shield. There
+    is then also a team ``all but vehicle_i`` for each learner i, in which this vehicle brakes fully.
 
     Args:
         trained: the trained policy or policies.
-        scenario: scenario whose learners they drive.
-        harm_count: harm that baselines minimise and the shield bounds: ``first`` or ``total``.
-        baselines: specs of the baselines; None: ``BASELINES``, or ``TEAM_BASELINES`` for several learners.
+        scenario: scenario whose learners the agents drive.
+        harm_count: count of harm that baselines minimise and shields bound, ``first`` or ``total``.
+        baselines: specs of the baselines; None means ``BASELINES``, or ``TEAM_BASELINES`` for several learners.
 
     """
     several = len(scenario.learners) > 1
@@ -221,21 +227,21 @@ def compared_agents(
 
 
 def without(vehicle: str) -> str:
-    """Return the name of the trained team in which this vehicle brakes fully instead."""
+    """Return the name of the trained team in which ``vehicle`` brakes fully."""
     return f"all but {vehicle}"
 
 
 def write_results(
     folder: Path, name: str, rows: Sequence[SummaryRow], harm_count: HarmCount, per_world: Path | None = None
 ) -> list[dict[str, Any]]:
-    """Write a results table as ``NAME.json`` and ``NAME.csv`` into ``folder``; return the content of the JSON file.
+    """Write a results table as ``NAME.json`` and ``NAME.csv`` into ``folder``, and return the content of the JSON file.
 
     Args:
         folder: existing folder.
         name: name of the files, without their endings.
         rows: rows of the table, one per agent.
-        harm_count: harm that the agents minimise, which is recorded.
-        per_world: existing file with one row per world, to which the JSON file refers.
+        harm_count: count of harm that the agents minimise, which the JSON file records.
+        per_world: existing file with one row per world, to which the JSON file refers; None: there is no such file.
 
     """
     results = results_to_json(rows, per_world=per_world, settings={"harm_count": harm_count})
@@ -248,7 +254,7 @@ def write_results(
 def results_csv(rows: Sequence[SummaryRow]) -> str:
     """Return a results table as CSV text, with one line per agent.
 
-    ``rows`` is the table. The interval of column ``x`` is in ``x_low`` and ``x_high``; missing values are empty.
+    The columns ``x_low`` and ``x_high`` are the ends of the interval of column ``x``. Missing values are empty.
     """
     lines = []
     for entry in (row.to_json() for row in rows):
@@ -262,10 +268,10 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory) -> Iterator[None]:
-    """Context manager around the evaluation of a run: record in ``run.json`` that it is running, and if it fails.
+    """Context manager around the evaluation of a run, which records its status in ``run.json``.
 
-    For an exception inside, ``interrupted`` (Ctrl-C) or ``failed`` is recorded with the error, which is raised again.
-    The new files are recorded too (``RunDirectory.WRITTEN``), so that ``resume`` can delete them.
+    The status is ``running`` and, after an exception, ``interrupted`` (Ctrl-C) or ``failed``, with the error. The names
+    of the new files are also recorded (``RunDirectory.WRITTEN``), so that ``resume`` can delete these files.
     """
     _note(run, "running", "evaluation", None)
     before = {path.name for path in run.path.iterdir()}
@@ -280,7 +286,7 @@ def _status(run: RunDirectory) -> Iterator[None]:
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Update status, stage and reason in ``run.json``. Its steps and ``wall_s`` remain those of the training."""
+    """Update status, stage, reason and end time in ``run.json``. Other entries, such as ``wall_s``, do not change."""
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

@@ -1,4 +1,4 @@
-"""Checks that stop a training when an observation, a reward, a loss, a gradient or a weight is not finite."""
+"""Checks that stop a training if an observation, a reward, a loss, a gradient or a weight is not finite."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ LOSSES = ("loss", "policy_loss", "value_loss", "policy_gradient_loss", "actor_lo
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """A reward, a loss, a gradient or a weight is no longer finite; the last good policy was saved."""
+    """An observation, reward, loss, gradient or weight is not finite. The last policy with finite weights was saved."""
 
 
 def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
     """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite.
 
-    ``algorithm`` is the algorithm of the model, which knows its optimisers.
+    Args:
+        model: the model; its optimisers are changed.
+        algorithm: the algorithm of the model, which lists its optimisers.
+
     """
     hint = "learning_rate or max_grad_norm" if hasattr(model, "max_grad_norm") else "learning_rate"
 
@@ -38,9 +41,12 @@ def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
 
 
 def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
-    """Return whether every weight of the model is finite, and the exploration noise finite and positive.
+    """Return whether every weight of the model is finite, and its exploration noise is finite and positive.
 
-    ``algorithm`` is the algorithm of the model, which knows its exploration noise.
+    Args:
+        model: the model.
+        algorithm: the algorithm of the model, which returns its exploration noise (``log_noise``).
+
     """
     logarithm = algorithm.log_noise(model)
     noise = torch.ones(1) if logarithm is None else torch.exp(logarithm)
@@ -58,7 +64,7 @@ class FiniteNumbers(BaseCallback):
                 row = np.argwhere(~good)[0][0]
                 raise TrainingDiverged(
                     f"training: {name}[row {row}] = {entries[~good][0]} at step {self.model.num_timesteps}: must be"
-                    " finite; the environment or its reward is at fault"
+                    " finite; correct the observations or the reward of the environment"
                 )
         return True
 
@@ -69,9 +75,9 @@ class FiniteNumbers(BaseCallback):
         self._check_losses()
 
     def _check_losses(self) -> None:
-        logged = self.logger.name_to_value  # train/loss, or vehicle_2/loss if learners are independent
+        logged = self.logger.name_to_value  # names such as train/loss, or vehicle_2/loss for independent learners
         for name in (name for loss in LOSSES for name in logged if name.rpartition("/")[2] == loss):
-            if not np.isfinite(logged[name]):  # the weights may still be finite
+            if not np.isfinite(logged[name]):
                 raise TrainingDiverged(
                     f"training: {name} = {float(logged[name])} after step {self.model.num_timesteps}: must be finite;"
                     " try a smaller learning_rate, or smaller weights of the reward"

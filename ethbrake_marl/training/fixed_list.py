@@ -1,4 +1,4 @@
-"""Measurement of policies during training, on the fixed list of worlds that the recipe names (``evaluation``)."""
+"""Measurement of policies during training, on the fixed list of worlds that the recipe's key ``evaluation`` defines."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.training import Training
 
-AT_HORIZON = "horizon_rate"  # share of the fixed list's episodes in which something still moves at the horizon
+AT_HORIZON = "horizon_rate"  # fraction of the fixed list's worlds in which a vehicle still moves at the horizon
 
-CHUNK = 2_500  # worlds driven together; limits memory, and does not change results
+CHUNK = 2_500  # number of worlds simulated together, to limit memory; does not change results
 
-Evaluate = Callable[[Any], Mapping[str, float]]  # takes a ``Policy`` or a ``PolicyTeam``; returns its metrics
+Evaluate = Callable[[Any], Mapping[str, float]]  # function that returns the metrics of a ``Policy`` or ``PolicyTeam``
 
-Measure = Callable[[Training], Evaluate]  # takes a training; returns the function that measures its policies
+Measure = Callable[[Training], Evaluate]  # function that returns the ``Evaluate`` function of a training
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Draw the fixed list of worlds that the recipe names, and return the function that measures policies on it.
+    """Draw the fixed list of worlds, and return a function that measures policies on this list.
 
-    That function takes a ``Policy`` or ``PolicyTeam``, and returns the metrics of ``measure_team``.
+    The function takes a ``Policy`` or ``PolicyTeam``, and returns the metrics of ``measure_team``.
     """
     names, worlds = training.scenario.vehicle_names, fixed_list(training)
 
@@ -46,23 +46,24 @@ def measure_on_list(training: Training) -> Evaluate:
 
 
 def measure_full_braking(training: Training) -> dict[str, float]:
-    """Return the metrics of ``measure_team`` if every learner brakes fully, on the fixed list of the recipe."""
+    """Return the metrics of ``measure_team`` on the fixed list of worlds if every learner brakes fully."""
     scenario = training.scenario
     braking: Any = make_agents(["full_brake"], scenario)["full_brake"]
     return measure_team(training, fixed_list(training), Team(dict.fromkeys(scenario.learners, braking), "full_brake"))
 
 
 def fixed_list(training: Training) -> Worlds:
-    """Return the fixed list of worlds that the recipe names."""
+    """Return the worlds of the fixed list, at the alert."""
     plan = training.recipe.evaluation
     return training.scenario.sample(plan.worlds, plan.seed).worlds
 
 
 def measure_team(training: Training, worlds: Worlds, team: Team) -> dict[str, float]:
-    """Return the means of a team over worlds by name, equal to the results of ``evaluate``.
+    """Let a team drive worlds, and return its metrics, each a mean over the worlds.
 
-    They are ``first_impact_harm``, ``total_harm``, ``collision_rate`` and ``horizon_rate``. If a learner has another
-    objective than the line's harm, ``objective_vehicle_2`` and so on, and their mean ``objective``, are added.
+    The metrics are ``first_impact_harm``, ``total_harm``, ``collision_rate`` and ``horizon_rate``, with the same values
+    as in ``evaluate``. If a learner has another objective than the harm of the line, the result also has the objective
+    of each learner (``objective_vehicle_2`` and so on) and the mean of these objectives (``objective``).
     """
     recipe, scenario = training.recipe, training.scenario
     names, harm_count = scenario.vehicle_names, recipe.reward.harm_count
@@ -89,7 +90,7 @@ def measure_team(training: Training, worlds: Worlds, team: Team) -> dict[str, fl
 def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:
     """Let a team drive worlds from the alert, and yield the results of each chunk of 2,500 worlds.
 
-    Worlds that cannot be advanced are left out. Raises ``PhysicsError`` if every world is left out.
+    Worlds in which the physics fails are left out. Raises ``PhysicsError`` if every world is left out.
     """
     scripts = [script.name for script in script_agents(scenario, except_for=team.drivers).values()]
     failed: dict[int, str] = {}

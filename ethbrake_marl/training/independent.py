@@ -1,7 +1,7 @@
-"""Independent learners: one PPO each, with its own network, optimiser and buffer, in the same worlds.
+"""Independent learners: one PPO per learner, with its own network and optimiser; all learners share the worlds.
 
-A row of the environment ends with the number of its learner (``make_sb3_vec_env(..., appended="number")``). Rollouts
-are collected for all learners together; then each learner learns from its own part, with Stable-Baselines3's
+The last entry of an observation row is the number of its learner (``make_sb3_vec_env(..., appended="number")``).
+Rollouts are collected for all learners together. Each learner then learns from its own rows, with Stable-Baselines3's
 ``PPO.train``.
 """
 
@@ -23,17 +23,17 @@ from torch import Tensor, nn
 
 
 class SeparatePolicies(BasePolicy):
-    """One actor-critic policy for each learner, with its own optimiser, behind the interface of a single policy.
+    """One actor-critic policy for each learner, each with its own optimiser, behind the interface of a single policy.
 
-    The last entry of an observation row is the number of the learner that it belongs to (0 = foremost). Learners whose
-    numbers are in ``resting`` do not explore: they act by their mean.
+    The last entry of an observation row is the number of its learner (0 = foremost). Learners whose numbers are in
+    ``resting`` do not explore: they take the mean action.
 
     Args:
-        observation_space: space of a row, whose last entry is the number of the learner.
+        observation_space: space of an observation row.
         action_space: space of one learner's action.
-        lr_schedule: learning rate as a function of the remaining share of the training.
+        lr_schedule: learning rate as a function of the fraction of the training that remains.
         use_sde: whether to use state-dependent exploration.
-        columns: for each learner, front to rear, the columns of a row that it observes.
+        columns: for each learner, front to rear, the columns of a row that the learner observes.
         network: other keyword arguments of ``ActorCriticPolicy``.
 
     """
@@ -60,18 +60,21 @@ class SeparatePolicies(BasePolicy):
 
     @property
     def log_std(self) -> Tensor:
-        """Logarithm of the exploration noise of all learners, front to rear, concatenated to [L]."""
+        """Logarithm of the exploration noise of each learner, front to rear, [number of learners]."""
         return torch.cat([member.log_std for member in self.policies])
 
     @property
     def policies(self) -> list[ActorCriticPolicy]:
-        """Policy of each learner, front to rear, as a list; the same objects as ``members``."""
+        """Policies of the learners, front to rear."""
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observation rows [n, F + 1].
+        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for n observation rows.
 
-        ``deterministic``: all learners act by their means, without exploration.
+        Args:
+            observation: F features and the number of the learner in each row, [n, F + 1].
+            deterministic: whether all learners take the mean action, without exploration.
+
         """
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
@@ -81,7 +84,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Return the critics' values [n, 1] of observation rows [n, F + 1]."""
+        """Return the critics' values [n, 1] for observation rows [n, F + 1]."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
@@ -101,15 +104,15 @@ class SeparatePolicies(BasePolicy):
 class IndependentPPO(PPO):
     """One PPO for each learner, all in the same worlds.
 
-    They learn all at once or, with ``turns``, one after the other. While one learner learns, the others drive by their
-    means; the turns divide the updates of the training evenly. The log of a learner's training is named
-    ``vehicle_2/loss`` and so on.
+    Without ``turns``, all learners learn in every update. With ``turns``, one learner learns at a time, and the others
+    take their mean actions; all turns have about the same number of updates. The columns of the log have names such as
+    ``vehicle_2/loss``.
 
     Args:
-        env: vectorised environment whose rows end with the number of their learner.
+        env: vectorised environment in which the last entry of a row is the number of its learner.
         names: names of the learners, front to rear.
-        turns: how often each learner has its turn to learn; None: all learn at once.
-        columns: for each learner, the columns of a row that it observes.
+        turns: number of turns of each learner during the training; None: all learners learn in every update.
+        columns: for each learner, front to rear, the columns of a row that the learner observes.
         settings: other keyword arguments of ``PPO``.
 
     """
@@ -127,9 +130,9 @@ class IndependentPPO(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        """Collect rollouts as PPO does, but let only those learners explore whose turn it is to learn.
+        """Collect rollouts as PPO does; only learners that learn in this update explore.
 
-        The arguments are those of Stable-Baselines3. Returns False if the callback stopped the training.
+        The arguments are the same as in Stable-Baselines3. Returns False if the callback stopped the training.
         """
         everyone = range(len(self.names))
         self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
@@ -137,7 +140,7 @@ class IndependentPPO(PPO):
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def train(self) -> None:
-        """Update each learner whose turn it is, by ``PPO.train`` on its own rows and with its own optimiser."""
+        """Update each learner that learns now with ``PPO.train``, from its own rows and with its own optimiser."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
         parts = {number: self._part(buffer, number) for number in self._learning}
         try:
@@ -154,8 +157,7 @@ class IndependentPPO(PPO):
     def _whose_turn(self, turns: int) -> int:
         """Return the number of the learner (0 = foremost) that learns in the next update.
 
-        Each learner has ``turns`` turns in a training. The result follows from the number of steps so far, so a resumed
-        training agrees.
+        The result depends only on the number of steps so far, so a resumed training has the same turns.
         """
         rollout = self.n_envs * self.n_steps
         planned = -(-self._total_timesteps // rollout)
@@ -163,7 +165,7 @@ class IndependentPPO(PPO):
         return stretch % len(self.names)
 
     def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
-        """Return a new buffer with the experience of learner ``number`` (0 = foremost) only."""
+        """Return a new buffer with the rows of learner ``number`` (0 = foremost)."""
         own = self.policy.policies[number].observation_space
         count = len(self.names)
         part = RolloutBuffer(

@@ -1,4 +1,4 @@
-"""Logs of a training: ``progress.csv`` and TensorBoard events."""
+"""Logs of a training, which are ``progress.csv`` and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
 
     Args:
         run: folder of the run.
-        state: checkpoint after whose rows to continue; rows after it are dropped. None: begin with empty logs.
+        state: checkpoint from which the training continues. Rows of the logs after this checkpoint are dropped. None:
+            begin with empty logs.
 
     Returns the two writers, for ``output_formats`` of Stable-Baselines3's logger.
 
     """
-    run.progress.unlink(missing_ok=True)  # it may be a link
+    run.progress.unlink(missing_ok=True)  # the path may be a link, whose target must not be overwritten
     if state is None:
         for left in run.tensorboard.glob("events.out.tfevents.*"):
             left.unlink()
     table = CSVOutputFormat(str(run.progress))
-    events: Any = TensorBoardOutputFormat(str(run.tensorboard))  # whose writer torch declares as None
+    events: Any = TensorBoardOutputFormat(str(run.tensorboard))  # torch declares its attribute ``writer`` as None
     if state is not None:
         table.file.write(state.numbers["progress"])
         table.file.flush()
         table.keys = [name for name in state.numbers["progress"].partition("\n")[0].split(",") if name]
         restart = Event(step=state.steps + 1, session_log=SessionLog(status=SessionLog.START))
-        events.writer.file_writer.add_event(restart)  # makes TensorBoard drop all events from this step on
+        events.writer.file_writer.add_event(restart)  # TensorBoard then drops all events from this step on
     return [table, events]

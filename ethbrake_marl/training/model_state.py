@@ -1,7 +1,4 @@
-"""Capture the state of a model during training as plain numbers and arrays, and restore it.
-
-Each part is captured by one function and restored by the function below it.
-"""
+"""Capture the state of a model during training as plain data and arrays, and restore the model from them."""
 
 from __future__ import annotations
 
@@ -30,14 +27,14 @@ def capture_model(model: Model, algorithm: Algorithm) -> tuple[dict[str, Any], A
 
     Args:
         model: the model of Stable-Baselines3, with its environment.
-        algorithm: the algorithm of the model, which knows its optimisers and other learned tensors.
+        algorithm: the algorithm of the model, which lists its optimisers and other learned tensors.
 
-    Returns counters and settings as plain data for JSON, and arrays by name.
+    Returns two dictionaries: counters and settings as plain data for JSON, and arrays by name.
 
     """
     environment: Any = model.env
     generators, random_arrays = capture_generators()
-    memory: Any = getattr(model, "replay_buffer", None)  # none in PPO
+    memory: Any = getattr(model, "replay_buffer", None)  # PPO has no replay buffer
     numbers = {
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "learning_rates": {
@@ -59,14 +56,14 @@ def capture_model(model: Model, algorithm: Algorithm) -> tuple[dict[str, Any], A
 
 
 def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> None:
-    """Put the state that ``capture_model`` returned into a new model of the same recipe.
+    """Put a state that ``capture_model`` returned into a new model of the same recipe.
 
     Args:
-        model: the new model, whose logger is set. It is changed.
+        model: the new model, which must have a logger. The model is changed.
         algorithm: the algorithm of the model.
         state: the captured numbers and arrays.
 
-    Raises whatever Python, NumPy or torch raise if the state belongs to another model.
+    Raises various errors of Python, NumPy and torch if the state belongs to another model.
 
     """
     numbers, arrays = state
@@ -86,10 +83,7 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
 
 
 def _captured_weights(model: Model, algorithm: Algorithm) -> Arrays:
-    """Return the numbers that the model has learned, as arrays by name.
-
-    These are the weights of its policy, its other learned tensors, and the states of its optimisers.
-    """
+    """Return the weights of the model's policy, its other learned tensors, and its optimisers' states, by name."""
     arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
     arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     for name, optimizer in algorithm.optimizers(model).items():
@@ -115,9 +109,9 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 
 
 def _captured_rows(model: Model) -> Arrays:
-    """Return as arrays by name: the last observation of each row of the model's environment, and finished episodes.
+    """Return the last observation of each row of the environment, and returns and lengths of the latest episodes.
 
-    Returns and lengths of the latest finished episodes are what Stable-Baselines3 logs.
+    Stable-Baselines3 needs these arrays to continue the rollouts and to log mean returns.
     """
     observations: Any = model._last_obs
     episodes = list(model.ep_info_buffer or ())
@@ -141,10 +135,7 @@ def _restore_rows(model: Model, arrays: Arrays) -> None:
 
 
 def _captured_log(model: Model) -> dict[str, list[Any]]:
-    """Return the values that the model has recorded for the next row of its log.
-
-    The result maps the name of a column to [value, count, excluded formats].
-    """
+    """Return the values recorded for the next row of the log: name of a column -> [value, count, excluded formats]."""
     log, pending = model.logger, {}
     for name, value in log.name_to_value.items():
         number = value.item() if isinstance(value, np.generic | torch.Tensor) else value
@@ -160,14 +151,21 @@ def _restore_log(model: Model, pending: Mapping[str, Any]) -> None:
 
 
 def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
-    """Restore the content of a replay buffer; raise ``ValueError`` for a position outside it.
+    """Restore the content of a replay buffer.
 
-    ``memory`` is the buffer of Stable-Baselines3, which is changed; ``place`` is its (position, whether it is full),
-    and ``arrays`` hold its content.
+    Args:
+        memory: the buffer of Stable-Baselines3, which is changed.
+        place: pair (position of the next entry, whether the buffer is full).
+        arrays: content of the buffer, by name.
+
+    Raises ``ValueError`` for an invalid position.
+
     """
     position, full = place
     if (type(position), type(full)) != (int, bool) or not 0 <= position < memory.buffer_size:
-        raise ValueError(f"replay = {place!r:.60}: is no place in its memory")
+        raise ValueError(
+            f"replay = {place!r:.60}: must be [position, full], with a position below {memory.buffer_size}"
+        )
     memory.pos, memory.full = position, full
     for name in REPLAY:
         filled = getattr(memory, name)[: memory.size()]
@@ -175,7 +173,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of ``optimizer``, so that torch raises if its state belongs to other weights."""
+    """Take a step with a copy of ``optimizer``; torch raises an error if its state does not fit its weights."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:
@@ -184,9 +182,13 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 
 
 def check_counter(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError`` unless ``value`` has the type ``kind`` and, for ``int``, is from 0 to 2^53 - 1.
+    """Raise ``ValueError`` unless a counter has the right type and range.
 
-    ``name`` begins the message.
+    Args:
+        name: name of the counter, for the message.
+        value: the counter's value.
+        kind: required type. If it is ``int``, the value must be from 0 to 2^53 - 1.
+
     """
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int
         right = "a whole number, at least 0" if kind is int else f"of type {kind.__name__}"
@@ -194,15 +196,15 @@ def check_counter(name: str, value: object, kind: type) -> None:
 
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
-    """Return ``arrays[name]``; raise ``ValueError`` unless it is finite, and shaped and typed as ``model``."""
+    """Return ``arrays[name]``; raise ``ValueError`` unless it is finite and has the shape and type of ``model``."""
     array = arrays[name]
     if (array.shape, array.dtype) != (model.shape, model.dtype) or not np.isfinite(array).all():
-        raise ValueError(f"{name}: {model.shape} finite {model.dtype} are needed")
+        raise ValueError(f"{name}: must be finite numbers of type {model.dtype} and shape {model.shape}")
     return array
 
 
 def group_of(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
-    """Return those of ``arrays`` whose names begin with ``prefix``, by names without it."""
+    """Return the arrays whose names begin with ``prefix``, by their names without the prefix."""
     return {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
 
 

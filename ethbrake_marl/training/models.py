@@ -1,4 +1,4 @@
-"""Build the environment and the model of a training, and turn the model's weights into policies."""
+"""Build the environment and the model of a training, and create policies from the model's weights."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ Model = BaseAlgorithm  # a model of Stable-Baselines3
 
 
 class Learner(NamedTuple):
-    """A model that learns, with its algorithm and the training that it is for."""
+    """A model that learns, together with its algorithm and its training."""
 
     training: Training  # recipe and scenario
-    algorithm: Algorithm  # how to read the model's policies, optimisers and other learned tensors
+    algorithm: Algorithm  # algorithm of the model, which reads its policies, optimisers and other learned tensors
     model: Model  # the model of Stable-Baselines3
 
     def policies(self) -> Trained:
@@ -52,21 +52,21 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
-    """Build the model of a training, with optimisers that refuse gradients which are not finite.
+    """Build the model of a training. Its optimisers raise ``TrainingDiverged`` for gradients that are not finite.
 
     Args:
         algorithm: the algorithm of the training's recipe.
         training: recipe and scenario.
         environment: the environment to learn in, from ``make_environment``.
 
-    Raises ``InvalidInput`` for a model that normalises observations by ``VecNormalize``.
+    Raises ``InvalidInput`` if the model normalises observations with ``VecNormalize``.
 
     """
     model = algorithm.build(training, environment)
     if getattr(model, "get_vec_normalize_env", lambda: None)() is not None:
         raise InvalidInput(
-            f"algorithm {training.recipe.algorithm!r}: its model is trained under VecNormalize, whose statistics are no"
-            " part of a policy bundle; observations here are scaled already"
+            f"algorithm {training.recipe.algorithm!r}: its model uses VecNormalize, whose statistics a policy bundle"
+            " does not contain; build the model without VecNormalize, since observations are already scaled"
         )
     refuse_gradients(model, algorithm)
     return model
@@ -79,8 +79,9 @@ def make_policies(
 
     Args:
         training: recipe and scenario.
-        steps: number of decisions after which these weights were learned, which is recorded.
-        tensors: function that returns the weights of the k-th policy (0 = foremost learner), by name, for a network.
+        steps: number of decisions from which the weights were learned, which the policy records.
+        tensors: function that takes the number k of a policy (0 = foremost learner) and its network, and returns the
+            weights of the policy by name.
 
     """
     recipe, scenario = training.recipe, training.scenario
@@ -91,7 +92,7 @@ def make_policies(
         observation = training.observations[learners[0]]
         network = recipe.network_spec(observation.size)
         if training.scheme == "centralised":
-            network = network.model_copy(update={"value_hidden": ()})  # a vehicle cannot use the central critic
+            network = network.model_copy(update={"value_hidden": ()})  # a vehicle cannot use the critic
         policy = Policy.make(
             tensors(k, network),
             algorithm=recipe.algorithm,

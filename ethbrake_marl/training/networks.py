@@ -15,19 +15,22 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 
 
 def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
-    """Return a copy of the weights of Stable-Baselines3's PPO or SAC policy, by their names in a policy bundle.
+    """Return a copy of the weights of a policy, by their names in a policy bundle.
 
-    ``spec`` is the bundle's network, which has the same layers as ``policy``.
+    Args:
+        policy: policy of Stable-Baselines3's PPO or SAC.
+        spec: description of the bundle's network, which must have the same layers as ``policy``.
+
     """
     state = policy.state_dict()
     return {name: copy_of(state[theirs]) for name, theirs in sb3_names(spec).items()}
 
 
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
-    """Return name of a tensor in a policy bundle -> its name in Stable-Baselines3's policy.
+    """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` is the bundle's network: of PPO if its ``output`` is ``clip``, else of SAC. Stable-Baselines3 also numbers
-    the activations, so a hidden layer's number there is twice ours.
+    ``spec`` is the description of the network. It belongs to PPO if its ``output`` is ``clip``, else to SAC.
+    Stable-Baselines3 also numbers the activations, so its number of a hidden layer is twice the number in a bundle.
     """
     if spec.output == "clip":
         ours = {"policy": ("mlp_extractor.policy_net", "action_net"), "value": ("mlp_extractor.value_net", "value_net")}
@@ -48,8 +51,8 @@ def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
     """Return a copy of the weights of a perceptron, by their names in a policy bundle.
 
     Args:
-        name: name of this network in the bundle, with which the tensors' names begin: ``policy``, ``gate``.
-        layers: linear layers, possibly with activations between them; the last linear layer is the output.
+        name: name of the network in the bundle, such as ``policy`` or ``gate``. The tensors' names begin with it.
+        layers: linear layers, possibly with activations between them. The last linear layer is the output.
 
     """
     linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
@@ -67,9 +70,9 @@ def copy_of(tensor: Tensor) -> Float32s:
 
 
 def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:
-    """Return ``policy_kwargs`` of Stable-Baselines3's PPO for a recipe's key ``network``.
+    """Return ``policy_kwargs`` of Stable-Baselines3's PPO for the key ``network`` of a recipe.
 
-    Actor and critic are separate, with orthogonal initial weights.
+    Actor and critic are separate networks with orthogonal initial weights.
     """
     return {
         "net_arch": {"pi": list(shape.policy), "vf": list(shape.value)},

@@ -1,4 +1,4 @@
-"""Write the actors of your own training loop as a team, which the agent ``team@FOLDER`` then loads."""
+"""Save the actors of your own training loop as a team, which the agent ``team@FOLDER`` loads."""
 
 from __future__ import annotations
 
@@ -21,10 +21,13 @@ from ethbrake_marl.training.team import TeamFile, bundle_of
 
 
 class GaussianActor(Protocol):
-    """A perceptron gives the mean of the action; the environment gets it clipped to [-1, 1]."""
+    """Actor with a normally distributed action, whose mean a perceptron computes.
 
-    mean: nn.Sequential  # linear layers with ReLU or Tanh between them, one output
-    log_std: nn.Parameter  # [1] logarithm of the standard deviation that it explored with
+    The environment receives the action clipped to [-1, 1].
+    """
+
+    mean: nn.Sequential  # linear layers with ReLU or Tanh between them; the last layer has one output
+    log_std: nn.Parameter  # [1] logarithm of the standard deviation of the action
 
 
 def save_team(
@@ -35,11 +38,20 @@ def save_team(
     seed: int,
     steps: int,
 ) -> None:
-    """Write the actor of each learner, by the vehicle's name, into ``folder``.
+    """Save the actors of several learners as a team. The agent ``team@FOLDER`` loads it.
 
-    ``env`` says what they were trained on: scenario, observations, reward. One and the same actor for several learners
-    is written once, as a shared policy. Raises ``InvalidInput`` for layers that a bundle cannot hold, or for learners
-    that share an actor and observe different features.
+    If all learners have the same actor object, it is saved once, as a shared policy.
+
+    Args:
+        folder: folder to write into.
+        actors: actor of each learner, by the vehicle's name.
+        env: environment in which the actors were trained. The team records its scenario, observations and reward.
+        seed: seed of the training, which is recorded.
+        steps: number of decisions of the training, which is recorded.
+
+    Raises ``InvalidInput`` if an actor is not a perceptron with ReLU or Tanh, or if learners that share an actor
+    observe different features.
+
     """
     engine, names = env.unwrapped.engine, list(actors)
     scenario = engine.scenario
@@ -66,12 +78,12 @@ def save_team(
 
 
 def network_of(layers: nn.Sequential) -> NetworkSpec:
-    """Return the shape of an actor's layers; raise ``InvalidInput`` naming the layers of anything but a perceptron."""
+    """Return the description of an actor's network; raise ``InvalidInput`` if ``layers`` are not a perceptron."""
     linear, between = list(layers)[::2], list(layers)[1::2]
     known = {kind: name for name, kind in ACTIVATIONS.items()}
     kinds = {type(layer) for layer in between}
     if not all(isinstance(layer, nn.Linear) for layer in linear) or len(kinds) != 1 or not kinds <= known.keys():
-        raise InvalidInput(f"actor {layers}: must be linear layers, with ReLU or with Tanh between them")
+        raise InvalidInput(f"actor {layers}: must be linear layers with ReLU between them, or with Tanh between them")
     sizes: list[Tensor] = [layer.weight for layer in linear if isinstance(layer, nn.Linear)]
     return NetworkSpec(
         observation_size=sizes[0].shape[1],

@@ -1,4 +1,4 @@
-"""PPO of Stable-Baselines3: one policy for all learners, optionally with a central critic, or one policy for each."""
+"""Algorithm PPO, with the models of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ethbrake_marl.training.training import Training
 
 
 class Ppo(Algorithm):
-    """Stable-Baselines3's PPO with one policy for all learners, optionally a central critic, or one policy for each."""
+    """Algorithm PPO: one policy for all learners (optionally with a central critic), or one policy per learner."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
         """Return a new PPO model for a training, which learns in ``environment``.
 
-        The training's scheme decides whether it has one policy, a central critic, or independent learners.
+        The training's scheme decides between a shared policy, a central critic, and independent learners.
         """
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)
@@ -57,7 +57,7 @@ class Ppo(Algorithm):
         return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the model's optimiser as ``policy``, or that of each independent learner by the vehicle's name."""
+        """Return the optimiser as ``policy``, or the optimisers of independent learners by the vehicle's name."""
         if isinstance(model, IndependentPPO):
             return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
         return {"policy": model.policy.optimizer}

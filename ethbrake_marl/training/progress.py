@@ -1,4 +1,4 @@
-"""The course of a training so far: its last and best policy, and its evaluations."""
+"""``Course``: last policy, best policy and evaluations of a training so far."""
 
 from __future__ import annotations
 
@@ -18,32 +18,33 @@ RETURN = "episode_return"
 
 @dataclass
 class Course:
-    """The last good policy, the best policy, and the evaluations of a running training.
+    """Last policy, best policy and evaluations of a running training.
 
-    The best policy is not the one of highest return, but the one of least harm on the fixed list, by the learners'
-    objectives and in the ``harm_count`` of the reward. Without evaluations there is no best policy.
+    The best policy is the policy with the smallest mean of the learners' objectives on the fixed list of worlds. If all
+    learners have the harm of the line as objective, it is the policy with the least harm in ``harm_count``. Without
+    evaluations there is no best policy.
     """
 
-    harm_count: HarmCount = "first"  # harm by which the best policy is chosen
-    policy: Trained | None = None  # last policy with finite weights; None until the first weights were checked
-    best: Trained | None = None  # policy with the least harm on the fixed list; None before the first evaluation
-    best_harm: float = math.inf  # harm, or objective, of ``best``
-    steps: int = 0  # decisions of all learners at ``policy``
-    updates: int = 0  # updates at ``policy``
-    evaluations: list[dict[str, float]] = field(default_factory=list)  # one entry each: steps, updates and metrics
-    wall_before_s: float = 0.0  # time that earlier processes spent on this training (s)
-    started: float = field(default_factory=time.monotonic)  # start of this process's part, by ``time.monotonic`` (s)
+    harm_count: HarmCount = "first"  # count of harm by which the best policy is chosen
+    policy: Trained | None = None  # last policy with finite weights; None before the first check
+    best: Trained | None = None  # best policy on the fixed list; None before the first evaluation
+    best_harm: float = math.inf  # harm (or mean objective) of ``best`` on the fixed list
+    steps: int = 0  # number of decisions of all learners up to ``policy``
+    updates: int = 0  # number of updates up to ``policy``
+    evaluations: list[dict[str, float]] = field(default_factory=list)  # steps, updates and metrics of each evaluation
+    wall_before_s: float = 0.0  # wall time that earlier processes spent on this training (s)
+    started: float = field(default_factory=time.monotonic)  # ``time.monotonic`` when this process started to train (s)
     cpu_s: dict[int, float] = field(default_factory=dict)  # steps at an evaluation -> processor time of learning (s)
     cpu_started: float = field(default_factory=time.process_time)  # ``time.process_time`` at which ``cpu_s`` is 0
 
     @property
     def wall_s(self) -> float:
-        """Time spent on this training so far (s), without the time between a stop and the resume."""
+        """Wall time spent on this training so far (s), without the time between a stop and the resume."""
         return self.wall_before_s + time.monotonic() - self.started
 
     @property
     def chosen(self) -> Trained | None:
-        """The policy to save as the result: the best one, or the last one if there was no evaluation yet."""
+        """Policy to save as the result: the best policy, or the last policy if there was no evaluation yet."""
         return self.best or self.policy
 
     def add_evaluation(self, policy: Trained, metrics: Mapping[str, float], episode_return: float | None) -> None:
@@ -51,7 +52,7 @@ class Course:
 
         Args:
             policy: the evaluated policy, at the current ``steps`` and ``updates``.
-            metrics: its results by name, such as ``total_harm``.
+            metrics: metrics of the policy by name, such as ``total_harm``.
             episode_return: mean return of the latest training episodes; None if no episode has ended yet.
 
         """
@@ -63,7 +64,7 @@ class Course:
             self.best, self.best_harm = policy, metrics[name]
 
     def to_json(self) -> dict[str, Any]:
-        """Return evaluations, least harm and times as plain data for JSON, which ``restore`` takes; no policies."""
+        """Return everything but the policies as plain data for JSON, for ``restore``."""
         return {
             "evaluations": self.evaluations,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
@@ -73,7 +74,7 @@ class Course:
         }
 
     def restore(self, content: Mapping[str, Any]) -> None:
-        """Set all values but the policies from ``content``, which ``to_json`` returned."""
+        """Set everything but the policies from ``content``, a result of ``to_json``."""
         self.evaluations = [dict(entry) for entry in content["evaluations"]]
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])
@@ -82,10 +83,10 @@ class Course:
 
 
 def objective_in_words(training: Training) -> str:
-    """Return the name of the quantity that the learners minimise on average, for users: ``total harm (own)``.
+    """Return the name of the quantity that the learners minimise, such as ``total harm (own)``.
 
-    It is empty if all learners minimise the harm of the whole line. Only harm that vehicles bear is called harm; a
-    weighted sum of harms is called an objective.
+    The name is empty if all learners minimise the harm of the whole line. A weighted sum of harms is called an
+    objective, not a harm.
     """
     scenario, learners = training.scenario, training.scenario.learners
     reward, objectives = training.recipe.reward.settled(scenario.objective, scenario.vehicles)

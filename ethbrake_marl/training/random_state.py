@@ -1,4 +1,4 @@
-"""The global random generators that Stable-Baselines3 uses: isolated from the caller's, captured and restored."""
+"""Global random generators, which Stable-Baselines3 uses: isolate the caller's generators, capture and restore them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 @contextmanager
 def own_random_state() -> Iterator[None]:
-    """Context manager that restores the global random generators at its end, also after an error.
+    """Context manager that restores the global random generators of Python, NumPy and torch at its end.
 
-    These are the generators of Python, NumPy and torch. Inside, torch uses one thread: with a network this small, a
-    second thread makes training 3 to 15 times slower as soon as another process needs a core.
+    Inside, torch uses one thread. With such small networks, a second thread makes training 3 to 15 times slower if
+    another process uses the cores.
     """
     states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
     torch.set_num_threads(1)
@@ -31,9 +31,9 @@ def own_random_state() -> Iterator[None]:
 
 
 def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the states of the global random generators of Python, NumPy and torch.
+    """Return the states of the global random generators of Python, NumPy and torch, for ``restore_generators``.
 
-    The first result holds numbers (plain data for JSON), the second arrays by name; ``restore_generators`` takes both.
+    The first result is plain data for JSON, the second a dictionary of arrays by name.
     """
     state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     version, python_state, gauss = random.getstate()
@@ -50,7 +50,13 @@ def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 
 def restore_generators(numbers: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Set the global random generators to the states that ``capture_generators`` returned."""
+    """Set the global random generators to the states that ``capture_generators`` returned.
+
+    Args:
+        numbers: first result of ``capture_generators``.
+        arrays: second result of ``capture_generators``; other arrays are ignored.
+
+    """
     position, has_gauss, cached = numbers["numpy"]
     np.random.set_state(("MT19937", arrays["random.numpy"], position, has_gauss, cached))  # noqa: NPY002
     version, gauss = numbers["python"]

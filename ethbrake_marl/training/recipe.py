@@ -1,4 +1,4 @@
-"""``TrainingRecipe``: the settings of a training as one YAML file, for any algorithm."""
+"""``TrainingRecipe``: the settings of a training, read from a YAML file."""
 
 from __future__ import annotations
 
@@ -48,23 +48,23 @@ class LearningRate(FileModel):
     start: Rate  # learning rate at the beginning
     end: Rate  # learning rate at the end
     schedule: Literal["cosine"] = Field(
-        "cosine", description="end + (start - end) (1 + cos(pi p)) / 2, where p is the share of steps done"
+        "cosine", description="end + (start - end) (1 + cos(pi p)) / 2, where p is the fraction of steps done"
     )
 
     def at(self, remaining: float) -> float:
-        """Return the learning rate when the share ``remaining`` (1 to 0) of the training's steps is still to be done.
+        """Return the learning rate ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
 
-        It is ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+        ``remaining`` is the fraction (1 to 0) of the training's steps that is not yet done.
         """
         done = min(max(1.0 - remaining, 0.0), 1.0)
         return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
 class Shape(FileModel):
-    """Base class of the value of the key ``network`` in a recipe: the sizes of the networks.
+    """Base class for the value of a recipe's key ``network``, which describes the networks.
 
-    A subclass declares the keys as fields. It needs ``policy`` (sizes of the actor's hidden layers, ``[64, 64]``) and
-    ``activation``, or its own ``spec``.
+    A subclass declares the keys as fields. It needs the fields ``policy`` (sizes of the actor's hidden layers, such as
+    ``[64, 64]``) and ``activation``, unless it overrides ``spec``.
     """
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
@@ -72,7 +72,7 @@ class Shape(FileModel):
 
         Args:
             observation_size: number of features of an observation.
-            more: fields of ``NetworkSpec`` that differ from those of a plain actor.
+            more: fields of ``NetworkSpec`` that replace the values for a plain actor.
 
         """
         shape: Any = self  # subclasses declare the fields
@@ -87,30 +87,33 @@ class NetworkShape(Shape):
     value: Layers = Field(description="hidden layers of the critic")
     activation: Activation = "relu"
     initial_log_std: Annotated[float, Field(ge=-10.0, le=2.0)] = Field(
-        0.0, description="logarithm of the exploration noise at the start"
+        0.0, description="logarithm of the standard deviation of the exploration noise at the start"
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
         """Return the description of the network in a policy bundle: an actor and a critic.
 
-        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        Args:
+            observation_size: number of features of an observation.
+            more: further fields of ``NetworkSpec``.
+
         """
         return super().spec(observation_size, value_hidden=self.value, **more)
 
 
 class EvaluationPlan(FileModel):
-    """The fixed list of worlds on which the policy is measured during training, and how often."""
+    """Measurements of the policy during training, on a fixed list of worlds."""
 
     every_updates: Annotated[int, Field(ge=1)]  # number of updates between two measurements
-    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # number of worlds of the list
+    worlds: Annotated[int, Field(ge=1, le=1_000_000)]  # number of worlds in the fixed list
     seed: Annotated[int, Field(ge=0)]  # seed from which the worlds are drawn
 
 
 class TrainingRecipe(FileModel):
-    """How to train, with any algorithm: algorithm, reward, seed, checkpoints and measurements.
+    """Settings of a training that all algorithms have: algorithm, reward, seed, checkpoints and measurements.
 
-    An update is one round of collecting and learning. The recipes of an algorithm are a subclass. Each key is explained
-    in ``Field(description=...)``: new files, the JSON Schema and the documentation show this text.
+    An *update* is one round of collecting decisions and learning from them. Each algorithm has a subclass with its own
+    keys. ``Field(description=...)`` explains a key; new files, the JSON Schema and the documentation show this text.
 
     >>> import ethbrake_marl as eb
     >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
@@ -120,36 +123,42 @@ class TrainingRecipe(FileModel):
     """
 
     schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # schemes that the algorithm supports
-    most_decisions: ClassVar[float] = math.inf  # largest number of decisions held in memory between two updates
+    most_decisions: ClassVar[float] = math.inf  # largest number of decisions per update that fits into memory
 
     name: str = Field(pattern=NAME_PATTERN, description="equal to the file's name without .yaml")
-    title: str = Field("", description="one line for lists")
+    title: str = Field("", description="title in one line")
     description: str = Field("", description="what the recipe is for")
     source: str = Field("", description="where the values come from")
-    algorithm: str = Field(description="a registered name: ppo, sac, or another one (ethbrake scenario parts)")
+    algorithm: str = Field(
+        description="name of the learning algorithm: ppo, sac, or another registered one (ethbrake scenario parts)"
+    )
     scheme: Scheme | None = Field(  # None: single for one learner, shared for several
         None, description="how several learners train together: single, shared, independent, centralised"
     )
-    total_steps: int = Field(ge=1, description="decisions of all learners")
-    n_envs: int = Field(ge=1, description="worlds that are advanced together")
-    learning_rate: LearningRate = Field(description="learning rate of the optimiser, from its start to its end")
+    total_steps: int = Field(ge=1, description="number of decisions of all learners together")
+    n_envs: int = Field(ge=1, description="number of worlds that are simulated together")
+    learning_rate: LearningRate = Field(description="learning rate of the optimiser, which falls from start to end")
     gamma: Fraction = Field(description="discount factor per time step; equal to reward.shaping_discount")
     reward: RewardParams = Field(description="weights and constants of the reward's terms (docs/reference/rewards.md)")
     observation: Annotated[ListedFeatures | None, Field(exclude_if=not_)] = Field(
-        None, description="groups and features that learners observe, [own, front_1, rear_1]; left out: the scenario's"
+        None,
+        description="groups and features that learners observe, such as [own, front_1, rear_1]; if missing, the"
+        " observation of the scenario is used",
     )
-    horizon_is_end: bool = Field(True, description="true: nothing is expected beyond the horizon")
+    horizon_is_end: bool = Field(
+        True, description="whether the return ends at the horizon, instead of continuing with the critic's estimate"
+    )
     seed: int = Field(0, ge=0, lt=2**32, description="seed of worlds, networks and exploration")
     evaluation: EvaluationPlan = Field(
-        description="the fixed list on which the policy is measured while it learns, and how often"
+        description="measurements of the policy during training: how often, and on which fixed list of worlds"
     )
-    checkpoint_every_updates: int = Field(ge=1, description="updates between two checkpoints")
+    checkpoint_every_updates: int = Field(ge=1, description="number of updates between two checkpoints")
 
     @field_validator("reward")
     @classmethod
     def _some_reward(cls, value: RewardParams) -> RewardParams:
         if not any(weight for name, weight in value.weights.items() if name != "shaping"):
-            raise ValueError("every weight is 0; nothing could be learned")
+            raise ValueError("all weights are 0, so there is nothing to learn; set at least one weight")
         return value
 
     @field_validator("observation", mode="before")
@@ -165,12 +174,12 @@ class TrainingRecipe(FileModel):
     @model_validator(mode="after")
     def _room_for_an_update(self) -> Self:
         if self.most_decisions < math.inf and not (rollout := self.n_envs * self.rounds) <= self.most_decisions:
-            right = f"n_envs x n_steps = {rollout} decisions per update; at most {self.most_decisions}"
+            right = f"n_envs x n_steps = {rollout} decisions per update are too many (at most {self.most_decisions})"
             refuse(("n_envs",), self.n_envs, right)
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network in the policy's bundle, from the recipe's key ``network``.
+        """Return the description of the network in the policy bundle, from the recipe's key ``network``.
 
         ``observation_size`` is the number of features of an observation.
         """
@@ -179,7 +188,7 @@ class TrainingRecipe(FileModel):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner in each world between two updates: the recipe's ``n_steps``."""
+        """Number of decisions of each learner in each world between two updates: the recipe's ``n_steps``."""
         return int(vars(self)["n_steps"])
 
     @property
@@ -188,58 +197,58 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit this number of learners; a subclass may override it."""
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. By default every number fits."""
 
     def begins(self, scenario: Scenario) -> str | None:
-        """Return a description of the initial weights for a scenario; None if the algorithm has random ones."""
+        """Return a description of the initial weights for a scenario, or None if the initial weights are random."""
         return None
 
     def derived(self) -> dict[str, float]:
-        """Return numbers that follow from the keys, by name, to be recorded in ``config.json``."""
+        """Return numbers computed from the keys, by name, which ``config.json`` records; by default none."""
         return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
-        """Return the scheme in which the scenario's learners train: ``single``, ``shared``, ``independent``, ...
+        """Return the scheme in which the scenario's learners train, such as ``single`` or ``shared``.
 
-        This is the recipe's scheme; if it names none, ``single`` for one learner and ``shared`` for several. Raises
-        ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the learners.
+        If the recipe does not set a scheme, it is ``single`` for one learner and ``shared`` for several. Raises
+        ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the number of learners.
         """
         learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
         if not learners:
-            raise InvalidInput(f"{where}: no vehicle learns; give at least one the role learner")
+            raise InvalidInput(f"{where} has no learner; give at least one vehicle the role learner")
         scheme = self.scheme or ("single" if learners == 1 else "shared")
         if scheme == "single" and learners > 1:
             raise InvalidInput(
-                f"scheme single: {where} has {learners} learners; use shared, independent or centralised, or let one"
-                " learn"
+                f"scheme single: {where} has {learners} learners; use the scheme shared, independent or centralised,"
+                " or a scenario with one learner"
             )
         if scheme == "independent" and learners == 1:
-            raise InvalidInput(f"scheme independent: {where} has one learner; use single")
+            raise InvalidInput(f"scheme independent: {where} has one learner; use the scheme single")
         if scheme not in self.schemes:
             raise InvalidInput(
-                f"scheme {scheme}: recipe {self.name!r} is for {self.algorithm}, which cannot train so; use a recipe"
-                " for PPO, for instance cooperation-ppo"
+                f"scheme {scheme}: the algorithm {self.algorithm} of recipe {self.name!r} does not support this scheme;"
+                " use a recipe for PPO, for instance cooperation-ppo"
             )
         self.check_learners(learners)
         return scheme
 
     def make_algorithm(self) -> Any:
-        """Return a new instance of the class of the recipe's algorithm, a ``training.algorithm.Algorithm``."""
+        """Return a new object of the recipe's algorithm, a ``training.algorithm.Algorithm``."""
         algorithm = ALGORITHMS[self.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
 
     @staticmethod
     def shipped() -> dict[str, Path]:
-        """Return the file of every recipe that comes with the package, by name.
+        """Return the files of all recipes that come with the package, by the recipe's name.
 
-        A recipe for an algorithm of an extension is in a folder with the name of the extension.
+        Recipes for an extension's algorithm are in a folder that has the extension's name.
         """
         files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
         return {file.stem: file for file in files}
 
     @staticmethod
     def usable() -> dict[str, Path]:
-        """Return the file of every shipped recipe whose algorithm is installed, by name; others need an extension."""
+        """Return the files of all shipped recipes whose algorithm is installed, by the recipe's name."""
         return {
             name: file
             for name, file in TrainingRecipe.shipped().items()
@@ -248,10 +257,10 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def file(name_or_path: str | Path) -> Path:
-        """Return the path of a recipe's file, from a shipped recipe's name or a path.
+        """Return the path of a recipe's file.
 
-        A text with a separator or the ending ``.yaml`` is a path; the file need not exist. Raises ``UnknownName`` for
-        another text that is no shipped recipe.
+        A text with a path separator or the ending ``.yaml`` is a path, and the file need not exist. Any other text must
+        be the name of a shipped recipe; otherwise ``UnknownName`` is raised.
         """
         text = str(name_or_path)
         if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
@@ -263,31 +272,30 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def of(content: Any) -> TrainingRecipe:
-        """Return the recipe with this content, a mapping from keys to values as in a YAML file.
+        """Return the recipe whose keys and values are ``content``, a mapping as in a YAML file.
 
-        Raises ``InvalidInput``, naming the key, if the content is invalid.
+        Raises ``InvalidInput`` if the content is invalid; the message names the key.
         """
         return _checked(Document("recipe", content, {}))
 
     def new_text(self, name: str) -> str:
-        """Return the text of a commented YAML file for a new recipe ``name`` that starts from this recipe.
+        """Return the text of a commented YAML file for a new recipe that has the values of this recipe.
 
-        All keys are written; a key without a value stands in a comment. Save the text as ``<name>.yaml``. Raises
-        ``InvalidInput`` for an invalid name.
+        Save the text as ``<name>.yaml``. Raises ``InvalidInput`` for an invalid name.
         """
         check_file_name("recipe", name)
         words = {
-            "title": "One line for lists",
+            "title": "Title in one line",
             "description": "What this recipe is for.",
             "source": f"Values of {self.name}, to be changed.",
         }
-        head = f"# Recipe {name}, started from {self.name}. Train with it: ethbrake train --recipe {name}.yaml\n"
+        head = f"# Recipe {name}, a copy of {self.name}. Train with it: ethbrake train --recipe {name}.yaml\n"
         return self.replace(name=name, **words).text(head)
 
     def text(self, head: str) -> str:
         """Return the text of a commented YAML file with all keys of this recipe, below the comment ``head``.
 
-        A key without a value stands in a comment.
+        Keys without a value are commented out.
         """
         lines = [head, schema_lines("recipe", "train --schema")]
         values, meanings = self.model_dump(mode="json"), key_meanings(type(self))
@@ -304,7 +312,10 @@ class TrainingRecipe(FileModel):
         return "".join(lines)
 
     def replace(self, **changes: Any) -> Self:
-        """Return the recipe with other values for some keys, ``seed=3``; raise ``InvalidInput`` if one is invalid."""
+        """Return a copy of the recipe with other values for some keys (``seed=3``).
+
+        Raises ``InvalidInput`` for an unknown key or an invalid value.
+        """
         content = {**self.model_dump(mode="json"), **changes}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         assert isinstance(changed, type(self)) or "algorithm" in changes
@@ -312,9 +323,9 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """Return the JSON Schema of a recipe file, for editors that complete and check YAML.
+        """Return the JSON Schema of recipe files, with which editors complete and check YAML.
 
-        The allowed keys depend on ``algorithm``. Registered algorithms and measures are included.
+        The schema includes registered algorithms and measures. The allowed keys depend on ``algorithm``.
         """
         classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
@@ -337,11 +348,11 @@ class TrainingRecipe(FileModel):
         return FileSchema.publish(
             {
                 "title": "Recipe",
-                "description": "A training set-up: everything that shapes a policy.",
+                "description": "Settings of a training.",
                 "type": "object",
                 "required": ["algorithm"],
                 "properties": {
-                    "algorithm": {"enum": [*classes], "description": "how it learns; decides which keys there are"}
+                    "algorithm": {"enum": [*classes], "description": "learning algorithm; decides which keys exist"}
                 },
                 "allOf": ways,
                 "$defs": parts,
@@ -350,9 +361,9 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return key -> meaning of the key in recipes of this class.
+    """Return the descriptions of all keys in recipes of a class, by key.
 
-    A key that the class declares without a description has the description of its base class.
+    If a class declares a key without a description, the description of its base class is used.
     """
     meanings: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
@@ -365,27 +376,38 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
-    """Register an algorithm, so that recipes with ``algorithm: name`` can be read, trained, stopped and resumed.
+    """Register an algorithm, for recipes with ``algorithm: name``.
 
-    An installed package does the same with an entry point of the group ``ethbrake_marl.algorithms``: a ``Part`` of
-    recipe and algorithm.
+    A package can instead declare an entry point of the group ``ethbrake_marl.algorithms``: a ``Part`` with the recipe
+    class and the algorithm.
 
     Args:
-        name: 1 to 64 of ``a-z``, digits, ``-`` and ``_``.
-        recipe: the class of its recipes, a subclass of ``TrainingRecipe``; it checks the YAML file.
-        algorithm: the class of the algorithm, a subclass of ``training.algorithm.Algorithm``; or ``"module:class"``, so
-            that recipes can be read without importing it, since torch takes seconds.
+        name: name of the algorithm, with 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
+        recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which checks YAML files.
+        algorithm: class of the algorithm, a subclass of ``training.algorithm.Algorithm``, or the text
+            ``"module:class"``. With a text, the module (and torch, which takes seconds) is not imported before a
+            training.
 
-    Raises ``InvalidInput`` for an invalid or taken name, or a class that lacks a required method.
+    Raises ``InvalidInput`` for an invalid name or a class that lacks a required method, and ``AlreadyExists`` if
+    another algorithm has the name.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
-        raise InvalidInput(f"algorithm {name!r:.80}: must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _")
+        raise InvalidInput(
+            f"algorithm {name!r:.80}: the name must have 1 to 64 characters (a-z, 0-9, - and _), and must not begin"
+            " with - or _"
+        )
     if not (isinstance(recipe, type) and hasattr(recipe, "network_spec")):
-        raise InvalidInput(f"algorithm {name!r}: recipe = {recipe!r:.80}: must be a class with network_spec")
+        raise InvalidInput(
+            f"algorithm {name!r}: recipe = {recipe!r:.80}: must be a class with the method network_spec, a subclass of"
+            " TrainingRecipe"
+        )
     is_place = isinstance(algorithm, str) and ":" in algorithm
     if not (is_place or (isinstance(algorithm, type) and hasattr(algorithm, "build"))):
-        raise InvalidInput(f"algorithm {name!r}: algorithm = {algorithm!r:.80}: must be a class with build")
+        raise InvalidInput(
+            f"algorithm {name!r}: algorithm = {algorithm!r:.80}: must be a class with the method build, or its place"
+            " as 'module:class'"
+        )
     ALGORITHMS.add(name, (recipe, algorithm), lambda entry: entry == (recipe, algorithm))
 
 
@@ -395,15 +417,16 @@ ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
 
 
 def algorithm_names() -> tuple[str, ...]:
-    """Return the names of all algorithms, the package's own first."""
+    """Return the names of all registered algorithms, beginning with the algorithms of this package."""
     return tuple(ALGORITHMS)
 
 
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
-    """Read and check a recipe: a shipped one by name (``ppo``), or a file by path.
+    """Read and check a recipe.
 
-    A text with a separator or the ending ``.yaml`` is a path. Raises ``UnknownName`` with a suggestion, or
-    ``InvalidInput`` with file, line, key, value and what would be right.
+    ``name_or_path`` is the name of a shipped recipe (``ppo``), or the path of a file. A text with a path separator or
+    the ending ``.yaml`` is a path. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for invalid
+    content; the message contains file, line, key, value and what would be right.
     """
     return _checked(TrainingRecipe.file(name_or_path))
 
@@ -420,20 +443,19 @@ def _checked(source: Path | Document) -> TrainingRecipe:
         new, absent = new_name(name, ALGORITHMS), ""
         right = f"is now called {new}" if new else f"must be one of {', '.join(ALGORITHMS)}"
         if isinstance(source, Path) and source in TrainingRecipe.shipped().values():
-            absent = f"; the extension {source.parent.name}, which gives it, is not installed"
+            absent = f"; this algorithm belongs to the extension {source.parent.name}, which is not installed"
         where = document.where(("algorithm",))
         raise InvalidInput(f"{where}: algorithm = {flow_text(name, 60)}: {right}{absent}")
-    shipped = f"; every key is in the shipped recipe {name}" if name in TrainingRecipe.shipped() else ""
+    shipped = f"; the shipped recipe {name} has all keys" if name in TrainingRecipe.shipped() else ""
     model = ALGORITHMS[name][0]
-    wording = _RecipeWording(model, f"it is needed{shipped}")
+    wording = _RecipeWording(model, f"this key is required{shipped}")
     return read_model(document, model, wording, "of keys to values, for instance algorithm: ppo")
 
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the keys that are allowed beside a key, from which an error message suggests one.
+        """Return the allowed keys at the place of an unknown key, one of which an error message suggests.
 
-        ``path`` holds the keys that lead to it in the file, such as ``("reward", "harm")``. Below ``reward``, the
-        weights of registered measures are included.
+        ``path`` contains the keys that lead to the unknown key, such as ``("reward", "harm")``.
         """
         return setting_names() if path[:-1] == ("reward",) else super().known(path)

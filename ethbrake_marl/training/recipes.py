@@ -1,4 +1,4 @@
-"""The recipes of PPO and SAC."""
+"""Recipes of the algorithms PPO and SAC."""
 
 from __future__ import annotations
 
@@ -24,84 +24,94 @@ from ethbrake_marl.training.recipe import (
     TrainingRecipe,
 )
 
-BATCH_SIZE = "decisions in one step of the optimiser"
+BATCH_SIZE = "number of decisions in one step of the optimiser"
 
-NETWORK = "hidden layers of the actor, and of the critic if there is one, and their activation"
+NETWORK = "hidden layers of actor and critic, and their activation"
 
 
 class PpoRecipe(TrainingRecipe):
-    """PPO recipe: collect ``n_steps`` decisions of every learner, then learn from them in ``n_epochs`` passes."""
+    """Recipe of PPO: an update collects ``n_steps`` decisions of every learner, and learns from them."""
 
     schemes = get_args(Scheme)
     most_decisions = 2**24
 
     algorithm: Literal["ppo"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
-    n_steps: int = Field(ge=2, description="decisions of each world between two updates")
-    n_epochs: int = Field(ge=1, le=1000, description="passes of one update over the collected decisions")
-    gae_lambda: Fraction = Field(description="lambda of the advantage estimates, from 0 (one step) to 1 (all)")
-    clip_range: Rate = Field(description="how far the probability of an action may move in one update")
-    ent_coef: NonNegative = Field(description="weight of the policy's entropy")
+    n_steps: int = Field(ge=2, description="number of decisions of each learner in each world between two updates")
+    n_epochs: int = Field(ge=1, le=1000, description="number of passes over the collected decisions in one update")
+    gae_lambda: Fraction = Field(
+        description="lambda of generalised advantage estimation, from 0 (one step) to 1 (whole return)"
+    )
+    clip_range: Rate = Field(
+        description="PPO's clip range: largest relative change of an action's probability in one update"
+    )
+    ent_coef: NonNegative = Field(description="weight of the policy's entropy in the loss")
     vf_coef: NonNegative = Field(description="weight of the critic's loss")
-    max_grad_norm: Positive = Field(description="largest norm of a gradient; a longer one is scaled down")
-    target_kl: Positive | None = Field(None, description="an update stops beyond this KL divergence")
-    turns: Annotated[int, Field(ge=1, le=1000)] | None = Field(  # None: all learn at once
-        None, description="rounds in which independent learners learn one after the other"
+    max_grad_norm: Positive = Field(description="largest norm of the gradient; longer gradients are scaled down to it")
+    target_kl: Positive | None = Field(None, description="KL divergence beyond which an update stops early")
+    turns: Annotated[int, Field(ge=1, le=1000)] | None = Field(  # None: all learners learn in every update
+        None, description="number of turns of each learner, if independent learners learn one after the other"
     )
     network: NetworkShape = Field(description=NETWORK)
 
     @model_validator(mode="after")
     def _keys_fit(self) -> PpoRecipe:
         if self.turns is not None and self.scheme != "independent":
-            refuse(("turns",), self.turns, "is for scheme: independent only; leave it out")
+            refuse(("turns",), self.turns, "is allowed with scheme: independent only; remove the key turns")
         rollout = self.n_envs * self.n_steps
         if rollout % self.batch_size:
             refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the training has fewer updates than turns of this number of learners."""
+        """Raise ``InvalidInput`` if the training has fewer updates than all learners together have turns."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
-                f"recipe {self.name!r}: turns = {self.turns}: {learners} learners need {self.turns * learners}"
-                f" updates, total_steps = {self.total_steps} are {updates}"
+                f"recipe {self.name!r}: turns = {self.turns}: {learners} learners need at least"
+                f" {self.turns * learners} updates, but total_steps = {self.total_steps} gives {updates}; raise"
+                " total_steps, or lower turns"
             )
 
 
 class SquashedShape(Shape):
-    """Hidden layers of SAC's actor and of each of its two critics; the actor's noise depends on the observation."""
+    """Hidden layers of SAC's actor and of its two critics."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     value: Layers = Field(description="hidden layers of each of the two critics")
     activation: Activation = "relu"
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description of the network in a policy bundle: the actor only, whose action is tanh of its mean.
+        """Return the description of the network in a policy bundle: an actor whose action is tanh of its output.
 
-        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        Args:
+            observation_size: number of features of an observation.
+            more: further fields of ``NetworkSpec``.
+
         """
         return super().spec(observation_size, output="tanh", **more)
 
 
 class SacRecipe(TrainingRecipe):
-    """SAC recipe: collect ``steps_per_update`` decisions of every learner, then take ``gradient_steps`` steps."""
+    """Recipe of SAC: an update adds ``steps_per_update`` decisions of every learner to a replay buffer, and learns."""
 
     algorithm: Literal["sac"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
-    steps_per_update: int = Field(1, ge=1, le=10_000, description="decisions of each world between two updates")
-    gradient_steps: int = Field(1, ge=1, le=100_000, description="steps of the optimiser in one update")
-    buffer_size: int = Field(ge=1, le=10_000_000, description="decisions that the replay memory holds")
-    learning_starts: int = Field(ge=0, description="decisions before the first update")
-    tau: Rate = Field(description="share by which the target critic follows in one update")
-    ent_coef: float | str = Field("auto", description="weight of the policy's entropy: auto, or a number")
-    initial_ent_coef: Positive = Field(1.0, description="value at which an automatic ent_coef starts")
-    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = Field(
-        None, description="entropy that an automatic ent_coef aims at; without it -1 per action"
+    steps_per_update: int = Field(
+        1, ge=1, le=10_000, description="number of decisions of each learner in each world between two updates"
     )
-    target_update_interval: int = Field(1, ge=1, description="updates between two changes of the target critic")
+    gradient_steps: int = Field(1, ge=1, le=100_000, description="number of steps of the optimiser in one update")
+    buffer_size: int = Field(ge=1, le=10_000_000, description="largest number of decisions in the replay buffer")
+    learning_starts: int = Field(ge=0, description="number of decisions before the first update")
+    tau: Rate = Field(description="fraction by which the target critic moves towards the critic in one update")
+    ent_coef: float | str = Field("auto", description="weight of the policy's entropy: a number, or auto (learned)")
+    initial_ent_coef: Positive = Field(1.0, description="initial value of ent_coef if it is learned")
+    target_entropy: Annotated[float, Field(allow_inf_nan=False)] | None = Field(
+        None, description="entropy at which a learned ent_coef aims; if missing, -1 per action"
+    )
+    target_update_interval: int = Field(1, ge=1, description="number of updates between two moves of the target critic")
     network: SquashedShape = Field(description=NETWORK)
-    log_every_updates: int = Field(ge=1, description="updates between two rows of the progress table")
+    log_every_updates: int = Field(ge=1, description="number of updates between two rows of progress.csv")
 
     @field_validator("ent_coef", mode="plain")
     @classmethod
@@ -109,7 +119,7 @@ class SacRecipe(TrainingRecipe):
         if value == "auto":
             return "auto"
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
-            raise ValueError("must be auto or a number of at least 0")
+            raise ValueError("must be auto, or a finite number of at least 0")
         return float(value)
 
     @model_validator(mode="after")
@@ -120,21 +130,21 @@ class SacRecipe(TrainingRecipe):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner in each world between two updates: ``steps_per_update``."""
+        """Number of decisions of each learner in each world between two updates (``steps_per_update``)."""
         return self.steps_per_update
 
     @property
     def updates_per_row(self) -> int:
-        """Number of updates between two rows of ``progress.csv``: ``log_every_updates``."""
+        """Number of updates between two rows of ``progress.csv`` (``log_every_updates``)."""
         return self.log_every_updates
 
     @property
     def update_ratio(self) -> float:
-        """Number of gradient steps per decision: ``gradient_steps / (n_envs * steps_per_update)``."""
+        """Number of gradient steps per decision, ``gradient_steps / (n_envs * steps_per_update)``."""
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """Return ``{"update_ratio": ...}``, gradient steps per decision, to be recorded in ``config.json``."""
+        """Return ``{"update_ratio": ...}``, the number of gradient steps per decision, for ``config.json``."""
         return {"update_ratio": self.update_ratio}
 
 

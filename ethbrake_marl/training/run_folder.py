@@ -1,4 +1,4 @@
-"""The folder of a run (a training and its results): the names of its files, and how they are written and read."""
+"""``RunDirectory``: the folder of a run, which contains a training and its results."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ RunStatus = Literal["running", "finished", "interrupted", "failed"]
 
 
 class RunDirectory:
-    """The folder of a run: paths of its files as attributes, and methods that read and write them.
+    """Folder of a run: the paths of its files, and methods that read and write these files.
 
     ``path`` is the folder, which need not exist yet.
     """
 
-    # Columns of progress.csv, where keys of evaluations have the prefix ``eval/``.
-    RETURN = "rollout/ep_rew_mean"  # mean over the last episodes, exploration included
-    OBJECTIVE = "objective"  # mean of the learners' objectives, if one of them is not total harm
+    # Columns of progress.csv. Columns with results of evaluations have the prefix ``eval/``.
+    RETURN = "rollout/ep_rew_mean"  # mean return of the latest training episodes, which include exploration
+    OBJECTIVE = "objective"  # mean of the learners' objectives, if one of them is not the harm of the line
     HARM: ClassVar[dict[HarmCount, str]] = {"first": "first_impact_harm", "total": "total_harm"}
 
     WRITTEN = "written"  # key of run.json: names of the files that ``ethbrake run`` wrote after the training
@@ -37,40 +37,40 @@ class RunDirectory:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.config = path / "config.json"  # recipe, scenario, seeds and versions of the run
-        self.status = path / "run.json"  # progress of the run: a ``RunStatus``, steps, updates, wall time
-        self.progress = path / "progress.csv"  # one row per update
-        self.tensorboard = path / "tensorboard"  # the same numbers as TensorBoard events
-        self.policy = path / "policy"  # bundle with the least harm on the fixed list, or the last one without a list
-        self.last_policy = path / "policy-last"  # bundle at the end of the run
+        self.status = path / "run.json"  # state of the run: a ``RunStatus``, steps, updates, wall time
+        self.progress = path / "progress.csv"  # log of the training, with one row per update
+        self.tensorboard = path / "tensorboard"  # TensorBoard events with the numbers of progress.csv
+        self.policy = path / "policy"  # bundle of the best policy, or of the last policy if nothing was measured
+        self.last_policy = path / "policy-last"  # bundle of the policy at the end of the training
         self.team = path / "team.json"  # which bundle drives which vehicle
         self.checkpoints = path / "checkpoints"  # checkpoints for ``resume``; deleted when the training has finished
-        self.lock = path / "run.lock"  # lock of the process that trains here
+        self.lock = path / "run.lock"  # lock file of the process that trains in this folder
 
     def checkpoint(self, steps: int) -> Path:
-        """Return the path of the checkpoint's folder after ``steps`` decisions of all learners."""
+        """Return the path of the checkpoint after ``steps`` decisions of all learners together."""
         return self.checkpoints / f"step_{steps:012d}"
 
     def create(
         self, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
     ) -> RunDirectory:
-        """Create the folder with ``config.json`` and ``run.json``, atomically. From then on the run can be resumed.
+        """Create the folder with ``config.json`` and ``run.json`` atomically. The run can then be resumed.
 
         Args:
             config: content of ``config.json``.
-            team: content of ``team.json``; None: no such file.
+            team: content of ``team.json``; None: the file is not written.
             force: replace an earlier run (a folder with a ``run.json``) or an empty folder.
 
-        Returns this object. Raises ``AlreadyExists`` if the path exists and is not replaced.
+        Returns this object. Raises ``AlreadyExists`` if the path exists and may not be replaced.
 
         """
         path, is_run = self.path, self.status.is_file()
         replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
         if not replace and (path.exists() or path.is_symlink()):
             if not is_run:
-                raise AlreadyExists(f"{path}: exists already and is not a run; give another name")
+                raise AlreadyExists(f"{path}: already exists and is not the folder of a run; choose another name")
             raise AlreadyExists(
-                f"{path}: exists already; give another folder (--output), resume it (ethbrake train --resume),"
-                " or replace it with force (--force; make run ARGS=--force)"
+                f"{path}: this run already exists; choose another folder (--output), resume the run (ethbrake train"
+                " --resume), or replace it (--force; make run ARGS=--force)"
             )
         with new_folder(path, replace=replace) as partial:
             new = RunDirectory(partial)
@@ -81,14 +81,16 @@ class RunDirectory:
         return self
 
     def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
-        """Write ``content`` as JSON to ``file``, a path in this folder, replacing the file completely or not at all."""
+        """Write ``content`` as JSON to ``file``, a path in this folder. After an error the old file is unchanged."""
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
     def write_status(self, status: RunStatus, **more: Any) -> None:
-        """Replace ``run.json`` by this status.
+        """Write a new ``run.json`` with this status, the old start time and, unless ``running``, the end time.
 
-        The start time does not change; a status other than ``running`` also records the end time. ``more`` are other
-        entries.
+        Args:
+            status: the status.
+            more: further entries of ``run.json``.
+
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {}
@@ -98,7 +100,7 @@ class RunDirectory:
         self.write_json(self.status, {"format": "ethbrake-run", "format_version": 1, "status": status, **times, **more})
 
     def remove_results(self) -> None:
-        """Delete the results and reports of ``ethbrake run``, because the training goes on to other weights."""
+        """Delete the results and reports of ``ethbrake run``, which do not apply to the continued training."""
         own, written = {path.name for path in vars(self).values()}, read_object(self.status).get(self.WRITTEN)
         names = written if isinstance(written, list) else []
         for path in [*self.path.iterdir()]:
@@ -108,13 +110,17 @@ class RunDirectory:
     def read_config(self) -> dict[str, Any]:
         """Return the content of ``config.json``: recipe, scenario, seeds and versions.
 
-        Raises ``InvalidInput`` if the folder holds no run, or if a file or folder in it is damaged.
+        Raises ``InvalidInput`` if the folder does not contain a run, or if a file or folder in it is damaged.
         """
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
-            raise InvalidInput(f"{self.path}: contains no training; give the folder of a run, for instance runs/my-run")
+            raise InvalidInput(
+                f"{self.path}: is not the folder of a run; name the folder of a run, for instance runs/my-run"
+            )
         for folder in (self.checkpoints, self.tensorboard, self.policy, self.last_policy):
             if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-                raise InvalidInput(f"{folder}: is not a plain folder; a training deletes in it, or replaces it")
+                raise InvalidInput(
+                    f"{folder}: must be a plain folder, not a link or a file, because the training replaces its content"
+                )
         status, config = read_object(self.status), read_object(self.config)
         for key, right in (("format", ("ethbrake-run",)), ("status", get_args(RunStatus))):
             if status.get(key) not in right:
@@ -127,20 +133,21 @@ class RunDirectory:
         return self.status.is_file() and read_object(self.status).get("status") == "finished"
 
     def wait_for_others(self, longest_s: float) -> None:
-        """Wait until no other process trains in this folder, at most ``longest_s`` seconds; never raise."""
+        """Wait until no other process trains in this folder, at most ``longest_s`` seconds. Raises no errors."""
         with suppress(Timeout, OSError), FileLock(self.lock, timeout=longest_s, mode=0o666):
             pass
 
     @classmethod
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
-        """Return the name of the metric whose least value chooses the best policy.
+        """Return the name of the metric that is smallest for the best policy.
 
-        It is ``objective`` if every evaluation has one, else the harm of the line under ``harm_count``.
+        The metric is ``objective`` if every evaluation has an entry ``objective``, else the harm of the line in
+        ``harm_count``.
 
         Args:
             evaluations: evaluations, or rows of ``progress.csv``.
-            harm_count: harm that the training minimises.
-            prefix: text before the names of metrics in ``evaluations`` and in the result: ``eval/`` for rows.
+            harm_count: count of harm that the training minimises.
+            prefix: prefix of metrics in ``evaluations`` and in the result (``eval/`` for rows of ``progress.csv``).
 
         """
         with_objective = evaluations and all(
@@ -149,19 +156,19 @@ class RunDirectory:
         return prefix + (cls.OBJECTIVE if with_objective else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows of ``progress.csv``, each as column -> text."""
+        """Return the rows of ``progress.csv``, each as a dictionary from column to text."""
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
-        """Return number of decisions at each evaluation -> processor time of learning until then (s).
+        """Return the processor time of learning (s) up to each evaluation, by the number of decisions so far.
 
-        Raises ``InvalidInput`` if none is recorded.
+        Raises ``InvalidInput`` if ``run.json`` has no such record.
         """
         recorded = read_object(self.status).get("cpu_s") or {}
         if not recorded:
-            raise InvalidInput(f"{self.path}: has no record of processor time; train again with this version")
+            raise InvalidInput(f"{self.status}: cpu_s (processor time) is missing; train again with this version")
         return {int(steps): float(spent) for steps, spent in recorded.items()}
 
     def column(self, name: str) -> dict[int, float]:
-        """Return the column ``name`` of ``progress.csv`` as number of decisions -> value, without empty cells."""
+        """Return the values of a column of ``progress.csv``, by the number of decisions. Empty cells are omitted."""
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}

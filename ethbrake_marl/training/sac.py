@@ -1,4 +1,4 @@
-"""SAC of Stable-Baselines3: one policy for all learners."""
+"""Algorithm SAC, with the model of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Sac(Algorithm):
-    """Algorithm SAC, with the model of Stable-Baselines3 and one policy for all learners."""
+    """Algorithm SAC, with one policy for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> SAC:
         """Return a new SAC model for a training, seeded by its recipe, which learns in ``environment``."""
@@ -44,25 +44,22 @@ class Sac(Algorithm):
         )
 
     def optimizers(self, model: Any) -> dict[str, Optimizer]:
-        """Return the model's optimisers by name.
-
-        These are ``actor``, ``critic`` and, if the entropy coefficient is learned, ``ent_coef``.
-        """
+        """Return the optimisers ``actor``, ``critic`` and, if the entropy coefficient is learned, ``ent_coef``."""
         optimizers = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
         return optimizers if model.ent_coef_optimizer is None else {**optimizers, "ent_coef": model.ent_coef_optimizer}
 
     def learned_beside(self, model: Any) -> dict[str, Tensor]:
-        """Return the logarithm of the model's entropy coefficient as ``log_ent_coef``; empty if it is fixed."""
+        """Return the logarithm of the learned entropy coefficient as ``log_ent_coef``; {} if it is not learned."""
         coefficient = self.log_noise(model)
         return {} if coefficient is None else {"log_ent_coef": coefficient}
 
     def log_noise(self, model: Any) -> Tensor | None:
-        """Return the logarithm of the model's entropy coefficient, which must stay finite; None if it is fixed."""
+        """Return the logarithm of the learned entropy coefficient; None if it is not learned."""
         return None if model.log_ent_coef is None else model.log_ent_coef.detach()
 
 
 def sac_arguments(recipe: SacRecipe) -> dict[str, Any]:
-    """Return ``policy_kwargs`` of Stable-Baselines3's SAC: layers and activation of an actor and two critics."""
+    """Return ``policy_kwargs`` of Stable-Baselines3's SAC: layers and activation of actor and critics."""
     shape = recipe.network
     return {
         "net_arch": {"pi": list(shape.policy), "qf": list(shape.value)},

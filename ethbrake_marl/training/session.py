@@ -1,4 +1,4 @@
-"""Train, or resume a training: build the model, learn, evaluate, save."""
+"""Train policies, or resume a training: build the model, learn, evaluate, save."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ from ethbrake_marl.training.training import Training, recorded_training
 
 Ended = Literal["finished", "interrupted"]
 
-_BUSY = "another process is training here"
+_BUSY = "another process is training in this folder"
 
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """Result of ``train`` or ``resume``: the policies, and how the training went.
+    """Result of ``train`` or ``resume``: the policies and the course of the training.
 
-    ``trained`` is the policy with the least harm on the fixed list, or the last policy if nothing was measured.
+    ``trained`` is the best policy: the policy with the least harm on the fixed list of worlds, or the last policy if
+    nothing was measured.
 
     >>> import ethbrake_marl as eb
     >>> short = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1}
@@ -51,44 +52,47 @@ class TrainResult:
 
     directory: Path  # the run's folder
     training: Training  # recipe and scenario
-    trained: Trained  # one policy for all learners, or one for each; also saved as directory/policy
-    last: Trained  # policy or policies at the end; also saved as directory/policy-last
-    status: Ended  # finished or interrupted
-    steps: int  # decisions of all learners together, whole updates
-    updates: int  # rounds of collecting and learning
-    wall_s: float  # time that all processes spent on this training (s)
-    evaluations: tuple[Mapping[str, float], ...]  # steps, updates and metrics of each evaluation, in order
+    trained: Trained  # best policy, or one best policy for each learner; also saved as directory/policy
+    last: Trained  # policy or policies at the end of the training; also saved as directory/policy-last
+    status: Ended  # whether the training finished or was interrupted
+    steps: int  # number of decisions of all learners together
+    updates: int  # number of updates (rounds of collecting and learning)
+    wall_s: float  # wall time that all processes spent on this training (s)
+    evaluations: tuple[Mapping[str, float], ...]  # steps, updates and metrics of each evaluation, in order of time
 
     @property
     def agent(self) -> str:
-        """Name of what was trained as an agent, for ``make_agent`` and ``--agents``: ``ppo@runs/mine``."""
+        """Spec of the trained agent, for ``make_agent`` and ``--agents``, such as ``ppo@runs/mine``."""
         return self.training.agent_in(self.directory)
 
     @property
     def metrics(self) -> Mapping[str, float] | None:
-        """Results of ``trained`` on the fixed list (an entry of ``evaluations``); None if nothing was measured."""
+        """Metrics of the policy ``trained`` on the fixed list of worlds; None if nothing was measured."""
         return next((each for each in self.evaluations if each["steps"] == self.trained.steps), None)
 
     @property
     def policies(self) -> dict[str, Policy]:
-        """The policy of each learner, by the vehicle's name."""
+        """Policy of each learner, by the vehicle's name."""
         return dict(self.trained.drivers)
 
     @property
     def policy(self) -> Policy:
-        """The policy that drives all learners; raises ``InvalidInput`` if each learner has its own."""
+        """Policy that drives all learners; raises ``InvalidInput`` if each learner has its own policy."""
         return _only(self.trained)
 
     @property
     def last_policy(self) -> Policy:
-        """The policy at the end of the training; raises ``InvalidInput`` if each learner has its own."""
+        """Policy at the end of the training; raises ``InvalidInput`` if each learner has its own policy."""
         return _only(self.last)
 
 
 def _only(trained: Trained) -> Policy:
     if isinstance(trained, Policy):
         return trained
-    raise InvalidInput(f"training: {', '.join(trained.drivers)} have a policy each; take one of policies")
+    raise InvalidInput(
+        f"training: {', '.join(trained.drivers)} have different policies; use policies, for instance"
+        f" policies[{next(iter(trained.drivers))!r}]"
+    )
 
 
 def train(
@@ -106,32 +110,34 @@ def train(
     stop_at: StopAt | None = None,
     on_progress: Told = "show",
 ) -> TrainResult:
-    """Train the learners of ``scenario`` and write the run's folder: build, learn, evaluate, save.
+    """Train the learners of a scenario, and write the folder of the run.
 
-    Ctrl-C stops after the current update (status ``interrupted``); a second Ctrl-C raises ``KeyboardInterrupt``. Unless
-    the process is killed, ``policy/`` then holds the best policy so far and ``policy-last/`` the last good one.
-    ``resume`` continues the training. The same recipe, scenario, seed and machine give the same policy, bit for bit.
-    The global random generators are not changed.
+    Ctrl-C stops the training after the current update (status ``interrupted``); a second Ctrl-C raises
+    ``KeyboardInterrupt``. In both cases, and after an error, ``policy/`` contains the best policy so far, and
+    ``policy-last/`` the last policy with finite weights. ``resume`` continues the training. The same recipe, scenario
+    and seed give exactly the same policy on the same machine.
 
     Args:
         recipe: a recipe, its name, or the path of its file.
         scenario: a scenario, its name, or the path of its file. Its roles determine the learners.
         directory: the new folder of the run.
-        scheme: overrides the recipe's scheme. By default one learner is ``single``, several are ``shared``.
-        turns: overrides the recipe's turns of independent learners (docs/train.md).
-        seed: overrides the recipe's seed.
-        steps: overrides the recipe's number of decisions. The last update may exceed it.
+        scheme: how several learners train together; None: the recipe's scheme.
+        turns: number of turns of each independent learner (docs/train.md); None: the recipe's number.
+        seed: seed of the training; None: the recipe's seed.
+        steps: number of decisions of all learners; None: the recipe's number. The training ends with a whole update, so
+            the actual number may be larger.
         force: replace an earlier run.
-        settings: how recipe and scenario differ from their files, ``KEY=VALUE`` each; recorded in ``config.json``.
-        measure: called with the training; returns the function that measures its policies before the first update,
-            every few updates (a key of the recipe), and at the end. By default the recipe's fixed list. None: no
-            measurements.
-        stop_at: called with every evaluation (an entry of ``TrainResult.evaluations``); returns a reason to stop there
-            with status ``interrupted``, or None.
-        on_progress: called with the progress. By default it is shown on stderr; None: silent.
+        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files, for ``config.json``.
+        measure: function that takes the training and returns a function that measures its policies. Policies are
+            measured before the first update, every few updates (a key of the recipe), and at the end. By default the
+            fixed list of worlds in the recipe is used. None: policies are not measured.
+        stop_at: function that takes an evaluation (an entry of ``TrainResult.evaluations``), and returns a reason to
+            stop the training with status ``interrupted``, or None to continue.
+        on_progress: function that is called with the progress. By default the progress is printed on stderr. None: it
+            is not printed.
 
-    Raises ``AlreadyExists`` for an existing directory without ``force``, ``InvalidInput`` if recipe and scenario do not
-    fit each other, ``TrainingDiverged`` for numbers that are not finite.
+    Raises ``AlreadyExists`` for an existing directory if ``force`` is false, ``InvalidInput`` if recipe and scenario do
+    not fit each other, ``TrainingDiverged`` if a number is not finite.
 
     """
     changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
@@ -151,42 +157,43 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Continue a training that was stopped or killed. Its policies are the same, bit for bit, as without the stop.
+    """Continue a training that was stopped or killed. The resulting policies are exactly the same as without the stop.
 
-    Training continues from the newest undamaged checkpoint, or from the beginning if there is none. Rows and events
-    after that checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about the policy so far are
-    deleted.
+    The training continues from the newest undamaged checkpoint, or from the beginning if there is no such checkpoint.
+    Rows of the logs after this checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about the
+    earlier policy are deleted.
 
     Args:
-        directory: the run's folder.
-        measure: the argument that ``train`` was called with.
-        stop_at: the argument that ``train`` was called with. It is called with new evaluations only.
-        on_progress: called with the progress. By default it is shown on stderr; None: silent.
-        other_versions: accept a checkpoint that other versions wrote, although the numbers may differ.
+        directory: the folder of the run.
+        measure: the same argument as in the call of ``train``.
+        stop_at: the same argument as in the call of ``train``. It is called with new evaluations only.
+        on_progress: as in ``train``.
+        other_versions: accept a checkpoint that was written by other versions of packages. The resulting policies may
+            differ from the policies of an uninterrupted training.
 
-    Raises ``InvalidInput`` for a folder without a training, with a finished training, with one that another process is
-    running, with a ``config.json`` edited since the checkpoint, and with a checkpoint of other versions.
+    Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if
+    ``config.json`` was edited after the checkpoint was written, and for a checkpoint of other versions.
 
     """
     run = RunDirectory(Path(directory))
     training = recorded_training(run, run.read_config())
     _check_unfinished(run, training)
     with build(training, run, measure, stop_at, on_progress) as callback:
-        run.write_json(run.team, training.team())  # the one that is there may be damaged
+        run.write_json(run.team, training.team())  # the existing file may be damaged
         with hold_lock(run.lock, _BUSY):
             state, damaged = _newest_checkpoint(run, training, other_versions)
             run.remove_results()
-            return learn(callback, state, [f"a damaged checkpoint was left aside: {reason}" for reason in damaged])
+            return learn(callback, state, [f"deleted a damaged checkpoint: {reason}" for reason in damaged])
 
 
 @contextmanager
 def build(
     training: Training, run: RunDirectory, measure: Measure | None, stop_at: StopAt | None, on_progress: Told
 ) -> Iterator[RunCallback]:
-    """Context manager: build environment and model of a training, and yield the callback to pass to ``learn``.
+    """Context manager that builds environment and model of a training, and yields the callback to pass to ``learn``.
 
-    Inside, Ctrl-C stops the training after the current update. At the end, also after an error, the environment is
-    closed and the global random generators are restored.
+    Inside, Ctrl-C stops the training after the current update. At the end, the environment is closed, and the global
+    random generators are restored.
 
     Args:
         training: recipe and scenario.
@@ -204,13 +211,13 @@ def build(
 
 
 def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
-    """Run the training of a callback to its end or the next stop; then save, and return the result.
+    """Run a training until it ends or is stopped, save the policies, and return the result.
 
-    However the training ends, its folder is complete.
+    The policies are also saved if the training ends with an error.
 
     Args:
-        callback: the callback from ``build``, which holds the model and measures it during the training.
-        state: checkpoint to continue from; None: begin from scratch.
+        callback: callback from ``build``, which contains the model and measures it during the training.
+        state: checkpoint from which the training continues; None: the training begins.
         notes: messages for the user, passed to ``on_progress`` when the training begins.
 
     """
@@ -218,7 +225,7 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     if state is not None:
         callback.restore(state)
     elif training.begins is not None:
-        callback.notes.append(f"begins with {training.begins}")
+        callback.notes.append(f"initial weights: {training.begins}")
     callback.notes += notes
     run.write_status("running", start=training.begins)
     model.logger.output_formats = open_logs(run, state)
@@ -228,13 +235,13 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
         model.learn(
             training.recipe.total_steps - model.num_timesteps,
             callback=[FiniteNumbers(), callback],
-            log_interval=None,  # type: ignore[arg-type]  # the callback writes the rows
+            log_interval=None,  # type: ignore[arg-type]  # the callback writes the logs
             reset_num_timesteps=state is None,
         )
     except StopRequested as stop:
         status, reason = "interrupted", stop.args[0]
     except BaseException as error:
-        cause = error  # torch's message about a NaN in a distribution would not help the user
+        cause = error  # replaced below if torch reports a NaN in a distribution, which would not help the user
         if isinstance(error, ValueError) and not weights_are_finite(model, algorithm):
             cause = TrainingDiverged(
                 f"training: a weight or the exploration noise is not finite at step {model.num_timesteps};"
@@ -256,14 +263,14 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
 
 
 def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
-    """Save the best and the last good policy, and record in ``run.json`` how the run ended.
+    """Save the best policy and the last policy with finite weights, and record in ``run.json`` how the run ended.
 
     The checkpoints of a finished run are deleted.
 
     Args:
-        callback: the callback of the training, with its policies so far.
+        callback: callback of the training, which contains these policies.
         status: how the run ended.
-        reason: why it was interrupted or failed; None: no reason.
+        reason: why the run was interrupted or failed; None: there is no reason to record.
 
     """
     run, training, course = callback.run, callback.learner.training, callback.course
@@ -288,23 +295,23 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
 
 
 def _check_unfinished(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput`` if the training has finished, even if its evaluation by ``ethbrake run`` has not."""
+    """Raise ``InvalidInput`` if the training has finished, even if the evaluation of ``ethbrake run`` has not."""
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
         raise InvalidInput(
-            f"{run.path}: this training has finished; measure what it has learned with: ethbrake evaluate --scenario"
-            f" {training.scenario.name} --agents full_brake,{training.agent_in(run.path)}"
+            f"{run.path}: this training has finished and cannot be resumed; evaluate its policy with: ethbrake evaluate"
+            f" --scenario {training.scenario.name} --agents full_brake,{training.agent_in(run.path)}"
         )
 
 
 def _newest_checkpoint(
     run: RunDirectory, training: Training, other_versions: bool
 ) -> tuple[TrainingState | None, list[str]]:
-    """Return the newest undamaged checkpoint (None if there is none), and what is wrong with newer ones.
+    """Return the newest undamaged checkpoint (None if there is none), and error messages about newer, damaged ones.
 
-    Raises ``InvalidInput`` if it belongs to another training, or, unless ``other_versions``, if other versions of the
-    packages wrote it.
+    Raises ``InvalidInput`` if the checkpoint belongs to another training, or if other versions of packages wrote it
+    (unless ``other_versions``).
     """
     remove_unfinished(run.path)
     if run.checkpoints.is_dir():
@@ -315,8 +322,8 @@ def _newest_checkpoint(
     if state.numbers.get("training") != training.identity:
         name = run.checkpoint(state.steps).name
         raise InvalidInput(
-            f"{run.config}: was changed after the checkpoint {name} of this training; restore it, or"
-            " train again in another folder"
+            f"{run.config}: this file was changed after the checkpoint {name} was written; restore the old content,"
+            " or train again in another folder"
         )
     now, then = installed_versions(), state.numbers["versions"]
     asked = then.keys() | (now.keys() - versions_used().keys())  # this process may have loaded more parts
@@ -324,7 +331,7 @@ def _newest_checkpoint(
     if other and not other_versions:
         name = other[0]
         raise InvalidInput(
-            f"{run.path}: was trained with {name} {then.get(name)}, here is {now.get(name)}: the numbers would"
-            " differ; install that version, or continue anyway with --other-versions"
+            f"{run.path}: this training began with {name} {then.get(name)}, but {name} {now.get(name)} is installed,"
+            " which may compute other numbers; install the old version, or continue anyway (--other-versions)"
         )
     return state, damaged

@@ -1,4 +1,4 @@
-"""Settings ``key=value``: which ones belong to the scenario, to the recipe or to the agents."""
+"""Settings ``KEY=VALUE`` of a command (``--set``): parse them, and sort them by scenario, recipe and agents."""
 
 from __future__ import annotations
 
@@ -12,23 +12,26 @@ from ethbrake_marl.game.harm import HarmCount, check_harm_count
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.recipe import WORDS, TrainingRecipe
 
-_NO_SETTING = {"name", *WORDS}  # descriptive fields, which cannot be set
+_NO_SETTING = {"name", *WORDS}  # descriptive keys, which cannot be set
 
 
 class Settings(NamedTuple):
     """Settings ``KEY=VALUE`` of a command, sorted by whether they belong to scenario, recipe or agents."""
 
     texts: tuple[str, ...]  # the settings as the user wrote them
-    scenario: tuple[Override, ...]  # keys of the scenario and their values
-    recipe: tuple[Override, ...]  # keys of the recipe and their values
-    harm_count: HarmCount = "first"  # harm that agents minimise: first impacts only, or all (``total``)
-    measures: tuple[str, ...] = ()  # names of additional measures of an evaluation
+    scenario: tuple[Override, ...]  # keys of the scenario and their new values
+    recipe: tuple[Override, ...]  # keys of the recipe and their new values
+    harm_count: HarmCount = "first"  # impacts whose harm agents minimise: first impacts (``first``) or all (``total``)
+    measures: tuple[str, ...] = ()  # names of additional measures that an evaluation reports
 
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
-        """Return the recipe with the values of ``self.recipe`` for those keys that its class has.
+        """Return the recipe with the new values of ``self.recipe``. Keys that the recipe's class lacks are ignored.
 
-        ``tell`` is called with a note for the user if only one of ``gamma`` and ``reward.shaping_discount``, which
-        should be equal, was set.
+        Args:
+            recipe: the recipe.
+            tell: function that is called with a note for the user if ``gamma`` and ``reward.shaping_discount``, which
+                should be equal, differ because only one of them was set.
+
         """
         own = [override for override in self.recipe if override.top in type(recipe).model_fields]
         if not own:
@@ -39,8 +42,8 @@ class Settings(NamedTuple):
         if tell is not None and len(set_here) == 1 and len({*together.values()}) > 1:
             (key,), (other,) = set_here, together.keys() - set(set_here)
             tell(
-                f"note: {key} = {together[key]:g}, but {other} stays {together[other]:g}: shaping leaves the best"
-                f" policy as it is only where both are equal (--set {other}={together[key]:g})"
+                f"note: {key} = {together[key]:g} differs from {other} = {together[other]:g}. Reward shaping then"
+                f" changes which policy is best; make both equal (--set {other}={together[key]:g})"
             )
         return changed
 
@@ -50,14 +53,14 @@ def read_settings(
 ) -> Settings:
     """Parse the settings of a command, and sort them by whether they belong to scenario, recipe or agents.
 
-    ``mass_t=40`` and ``scenario.mass_t=40`` belong to the scenario, ``gamma=0.9`` to a recipe.
+    For instance, ``mass_t=40`` and ``scenario.mass_t=40`` belong to the scenario, ``gamma=0.9`` to a recipe.
 
     Args:
-        texts: settings ``KEY=VALUE`` as the user wrote them; None: none.
+        texts: settings ``KEY=VALUE`` as the user wrote them; None: there are no settings.
         recipes: recipes of the command, whose keys may be set.
-        of_agents: which of ``harm_count`` and ``measures`` the command allows.
+        of_agents: settings of agents that the command allows, such as ``harm_count``.
 
-    Raises ``UnknownName`` with a suggestion for an unknown key, ``InvalidInput`` for an unknown harm count.
+    Raises ``UnknownName`` for an unknown key, and ``InvalidInput`` for an ambiguous key or an invalid value.
 
     """
     known = {
@@ -68,20 +71,25 @@ def read_settings(
     by_owner: dict[str, list[Override]] = {owner: [] for owner in known}
     for override in Override.parse(texts or ()):
         if override.top == "recipe" and len(override.path) > 1 and not recipes:
-            raise InvalidInput(f"--set {override.key}: this command takes no recipe, so nothing of one can be set")
+            raise InvalidInput(f"--set {override.key}: this command has no recipe; remove this setting")
         whose = [override.top] if override.top in known and len(override.path) > 1 else [*known]
         inside = override.inside() if whose == [override.top] else override
         owners = [each for each in whose if inside.top in known[each]]
         if not owners:
             raise unknown_name("setting", inside.top, {key for each in whose for key in known[each]})
         if len(owners) > 1:
-            raise InvalidInput(f"--set {override.key}: write scenario.{override.key} or recipe.{override.key}")
+            raise InvalidInput(
+                f"--set {override.key}: both scenario and recipe have this key; write scenario.{override.key} or"
+                f" recipe.{override.key}"
+            )
         by_owner[owners[0]].append(inside)
     for_agents = {each.top: each.value for each in by_owner["agents"]}
     check_harm_count(count := for_agents.get("harm_count", "first"))
     measures = for_agents.get("measures", "")
     if not isinstance(measures, str) or ("measures" in for_agents and not measures):
-        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=injury")
+        raise InvalidInput(
+            "--set measures: must be names of measures with commas between them, for instance measures=injury"
+        )
     return Settings(
         tuple(texts or ()),
         tuple(by_owner["scenario"]),

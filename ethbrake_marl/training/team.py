@@ -1,4 +1,4 @@
-"""The learners of a run as a team: ``team.json`` says which policy drives which vehicle."""
+"""Load the learners of a run as a team; ``team.json`` says which policy drives which vehicle."""
 
 from __future__ import annotations
 
@@ -23,27 +23,30 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 
 def bundle_of(scheme: Scheme, vehicle: str) -> str:
-    """Return the folder, relative to the run's folder, of the policy that drives a learner in this scheme.
+    """Return the folder of a learner's policy, relative to the folder of the run.
 
-    ``vehicle`` is the learner's name, such as ``vehicle_2``.
+    Args:
+        scheme: how the learners train together.
+        vehicle: name of the learner, such as ``vehicle_2``.
+
     """
     return f"policy/{vehicle}" if scheme == "independent" else "policy"
 
 
 _RIGHT_TEAM = (
-    'right is, for instance, {"scheme": "shared", "vehicles": 3, "drivers": {"vehicle_2": "policy", "vehicle_3":'
-    ' "policy"}}'
+    'the content must be similar to {"scheme": "shared", "vehicles": 3, "drivers": {"vehicle_2": "policy",'
+    ' "vehicle_3": "policy"}}'
 )
 
 
 class TeamFile(FileModel):
-    """Content of ``team.json`` in a run's folder, which says which policy drives which vehicle."""
+    """Content of ``team.json`` in the folder of a run: which policy drives which vehicle."""
 
-    format: Literal["ethbrake-team"] = "ethbrake-team"  # mark of this kind of file
+    format: Literal["ethbrake-team"] = "ethbrake-team"  # name of this kind of file
     format_version: Literal[1] = 1  # version of the format
     scheme: Scheme  # how the learners trained together
-    vehicles: Annotated[int, Field(ge=2, le=64)]  # number of vehicles of the line
-    drivers: Annotated[dict[str, str], Field(min_length=1)]  # learner's name -> folder of its policy in the run
+    vehicles: Annotated[int, Field(ge=2, le=64)]  # number of vehicles in the line
+    drivers: Annotated[dict[str, str], Field(min_length=1)]  # learner's name -> folder of its policy inside the run
 
     @model_validator(mode="after")
     def _drivers_of_the_line_and_scheme(self) -> TeamFile:
@@ -61,7 +64,7 @@ class TeamFile(FileModel):
 
 
 def read_team(file: Path) -> TeamFile:
-    """Read and check the file ``team.json`` of a run; raise ``CorruptBundle`` naming what is wrong with it."""
+    """Read and check the file ``team.json`` of a run; raise ``CorruptBundle`` if its content is invalid."""
     data = read_plain(file, 1 << 20)
     try:
         document = Document(str(file), parse_strict_json(data), {})
@@ -74,7 +77,7 @@ def read_team(file: Path) -> TeamFile:
 
 
 def has_policy_each(run: RunDirectory) -> bool:
-    """Return whether the learners of a run have different policies; False if it holds no ``team.json``."""
+    """Return whether the learners of a run have different policies; False if the run has no ``team.json``."""
     return os.path.lexists(run.team) and len(set(read_team(run.team).drivers.values())) > 1
 
 
@@ -84,38 +87,44 @@ def load_team(
     name: str = "team",
     vehicles: Collection[int] | None = None,
 ) -> Team:
-    """Load the policies of a run as a team in which each vehicle is controlled by the policy that it was trained with.
+    """Load the policies of a run as a team, in which each policy drives the vehicles that it was trained for.
 
     Args:
         folder: folder of the run.
-        scenario: scenario to drive in, its name or its path.
+        scenario: scenario to drive in, or its name or path.
         name: name of the team.
         vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. Other learners of the run
             are omitted.
 
-    Raises ``InvalidInput`` if the folder holds no team, or if the team has another line length or lacks one of the
-    vehicles; ``CorruptBundle`` for a damaged team.
+    Raises ``InvalidInput`` if the folder has no team, if the team is for a line of another length, or if it has no
+    policy for one of the vehicles; ``CorruptBundle`` for a damaged team.
 
     """
     path, scenario = Path(folder), scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     file = RunDirectory(path).team
     if not os.path.lexists(file):
-        raise InvalidInput(f"{path}: holds no team ({file.name}); give the folder of a run, or a bundle as ppo@{path}")
+        raise InvalidInput(
+            f"{path}: has no {file.name}, so it is not a team; name the folder of a run, or write ppo@{path} for a"
+            " policy bundle"
+        )
     team = read_team(file)
     if team.vehicles != scenario.vehicles:
         shared = len(set(team.drivers.values())) == 1
         raise InvalidInput(
-            f"{path}: is a team for a line of {team.vehicles} vehicles, scenario {scenario.name!r} has"
-            f" {scenario.vehicles}; "
+            f"{path}: this team is for a line of {team.vehicles} vehicles, but scenario {scenario.name!r} has"
+            f" {scenario.vehicles} vehicles; "
             + (
-                f"its one policy can drive other lines: policy@{path}"
+                f"its shared policy can drive lines of other lengths: write policy@{path}"
                 if shared
-                else "only a shared policy can drive others"
+                else "choose a scenario of the right length, or a run with a shared policy"
             )
         )
     wanted = {scenario.vehicle_names[i]: i for i in (scenario.learners if vehicles is None else vehicles)}
     missing = [each for each in wanted if each not in team.drivers]
     if missing or not wanted:
-        who = ", ".join(missing) or "nobody"
-        raise InvalidInput(f"{path}: drives {', '.join(team.drivers)}; scenario {scenario.name!r} has {who} to drive")
+        has = f"learner {', '.join(missing)}" if missing else "no learner"
+        raise InvalidInput(
+            f"{path}: this team can drive {', '.join(team.drivers)}, but scenario {scenario.name!r} has {has}; choose a"
+            " scenario with the same learners"
+        )
     return Team({i: LearnedAgent(load_policy(path / team.drivers[each]), name) for each, i in wanted.items()}, name)

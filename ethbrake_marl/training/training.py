@@ -1,4 +1,4 @@
-"""``Training``: a recipe combined with a scenario, before the training begins."""
+"""``Training``: the combination of a recipe and a scenario, from which a training is run."""
 
 from __future__ import annotations
 
@@ -25,25 +25,32 @@ from ethbrake_marl.training.team import TeamFile, bundle_of
 
 @dataclass(frozen=True, slots=True)
 class Training:
-    """What is to be trained: a recipe combined with a scenario, and everything that follows from the two.
+    """Combination of a recipe and a scenario, with the learners and observations that follow from them.
 
-    Create it with ``Training.of``.
+    Use ``Training.of`` to create one.
     """
 
     recipe: TrainingRecipe  # the recipe, with all changes
     scenario: Scenario  # the scenario, whose roles determine the learners
     scheme: Scheme  # how the learners train together: ``single``, ``shared``, ``independent`` or ``centralised``
-    drivers: Mapping[str, str]  # learner's name, front to rear -> folder of its policy, inside the run's folder
-    observation: ObservationSpec  # features of a row of the environment: everything that any learner observes
-    observations: Mapping[str, ObservationSpec]  # features that each learner observes, by name
+    drivers: Mapping[str, str]  # learner's name, front to rear -> folder of its policy inside the run
+    observation: ObservationSpec  # features of a row of the environment: all features that some learner observes
+    observations: Mapping[str, ObservationSpec]  # learner's name -> features that the learner observes
 
     @classmethod
     def of(cls, recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path, **changes: Any) -> Training:
-        """Combine a recipe and a scenario, each an object, a name or a path. ``changes`` override keys of the recipe.
+        """Combine a recipe and a scenario.
 
-        Learners observe the recipe's features, or else the scenario's. Raises ``InvalidInput`` if recipe and scenario
-        do not fit: no vehicle learns, the scheme needs another number of learners, or one policy would drive learners
-        that observe different features.
+        Learners observe the features that the recipe lists or, if it lists none, the features of the scenario.
+
+        Args:
+            recipe: a recipe, its name, or the path of its file.
+            scenario: a scenario, its name, or the path of its file.
+            changes: new values for keys of the recipe.
+
+        Raises ``InvalidInput`` if recipe and scenario do not fit each other: no vehicle learns, the scheme needs
+        another number of learners, or one policy would drive learners that observe different features.
+
         """
         recipe = recipe if isinstance(recipe, TrainingRecipe) else load_recipe(recipe)
         scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
@@ -62,37 +69,37 @@ class Training:
 
     @property
     def columns(self) -> list[list[int]]:
-        """For each learner, front to rear: the columns of an environment row that it observes."""
+        """Columns of an environment row that each learner observes, for all learners from front to rear."""
         place = {feature.name: column for column, feature in enumerate(self.observation.features)}
         return [[place[feature.name] for feature in spec.features] for spec in self.observations.values()]
 
     @property
     def begins(self) -> str | None:
-        """Description of the initial weights; None if the algorithm always begins with random weights."""
+        """Description of the initial weights; None if they are random."""
         return self.recipe.begins(self.scenario)
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Return everything that affects the training as plain data: ``{"recipe": {...}, "scenario": {...}}``.
+        """Return everything that affects the training as plain data ``{"recipe": {...}, "scenario": {...}}``.
 
-        Defaults are included; descriptive texts are not.
+        The result includes default values, but no descriptive texts.
         """
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
     @property
     def identity(self) -> str:
-        """SHA-256 of ``content()``, in hexadecimal digits; equal for trainings that give the same policy."""
+        """SHA-256 of ``content()``, in hexadecimal digits. Trainings with equal hashes give the same policy."""
         return self.identity_of(self.content())
 
     @staticmethod
     def identity_of(content: Mapping[str, Any]) -> str:
-        """Return the SHA-256 of ``content`` (plain data, as ``content()`` returns it), in hexadecimal digits."""
+        """Return the SHA-256 of ``content``, a result of ``content()``, in hexadecimal digits."""
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the content of ``config.json``: recipe, scenario, seeds and versions.
+        """Return the content of ``config.json``: recipe, scenario, seeds, versions and settings.
 
-        ``settings`` (``KEY=VALUE`` each) say how recipe and scenario differ from their files; they are recorded.
+        ``settings`` are the settings ``KEY=VALUE`` by which recipe and scenario differ from their files.
         """
         recipe = self.recipe
         return {
@@ -110,12 +117,12 @@ class Training:
         return file.model_dump(mode="json")
 
     def agent_in(self, folder: Path) -> str:
-        """Return the name, as an agent, of what this training leaves in the run's ``folder``: ``ppo@runs/mine``."""
+        """Return the spec of the agent that this training writes to the run's ``folder``, such as ``ppo@runs/mine``."""
         several, algorithm = len(self.drivers) > 1, self.recipe.algorithm
         return f"{'team' if several else algorithm if algorithm in AGENTS else 'policy'}@{folder}"
 
     def who_drives(self) -> str:
-        """Return scheme and drivers in words: ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Return a text about scheme and policies, such as ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         bundles: dict[str, list[str]] = {}
         for vehicle, bundle in self.drivers.items():
             bundles.setdefault(bundle, []).append(vehicle)
@@ -124,25 +131,31 @@ class Training:
 
 
 def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
-    """Return the training that the configuration of a run describes, for example to resume it.
+    """Return the training that the configuration of a run describes.
 
-    ``config`` is the content of the run's ``config.json``; ``run`` is named in errors. Raises ``InvalidInput`` for an
-    invalid configuration, and for a training by another library.
+    Args:
+        run: folder of the run, which error messages name.
+        config: content of the run's ``config.json``.
+
+    Raises ``InvalidInput`` for an invalid configuration, and for a training by another library.
+
     """
     if "library" in config:
-        raise InvalidInput(f"{run.path}: was trained by {config['library']}, which cannot be resumed; train again")
+        raise InvalidInput(
+            f"{run.path}: this run was trained by {config['library']} and cannot be resumed; train again"
+        )
     try:
         recipe = TrainingRecipe.of(config["recipe"])
         scenario = Scenario.from_document(Document("scenario", config["scenario"], {}))
     except KeyError as error:
-        raise InvalidInput(f"{run.config}: is not the configuration of a training: {error} is missing") from None
+        raise InvalidInput(f"{run.config}: does not describe a training, because {error} is missing") from None
     except InvalidInput as error:
         raise InvalidInput(f"{run.config}: {error}") from None
     return Training.of(recipe, scenario)
 
 
 def check_same_training(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput``, naming the keys that differ, unless the run's folder holds this training."""
+    """Raise ``InvalidInput`` if a run is another training; the message names the keys that differ."""
     recorded = recorded_training(run, read_object(run.config))
     if recorded.identity == training.identity:
         return
@@ -154,5 +167,6 @@ def check_same_training(run: RunDirectory, training: Training) -> None:
         if key not in before[part] or key not in wanted[part] or before[part][key] != wanted[part][key]
     ]
     raise InvalidInput(
-        f"{run.path}: holds another training (here other: {', '.join(other)}); give another folder (--output)"
+        f"{run.path}: this folder contains another training, which differs in {', '.join(other)}; choose another folder"
+        " (--output)"
     )

@@ -63,22 +63,24 @@ def policy(answer: Callable[[int], Any]) -> Any:
 
 SPECS: dict[str, Callable[[], object]] = {
     "agent 'coast:1': coast takes no argument": lambda: make_agent("coast:1"),
-    "agent 'full_brake@': a path is needed after '@'": lambda: make_agent("full_brake@"),
+    "agent 'full_brake@': a path must follow '@'": lambda: make_agent("full_brake@"),
     "agent 'coast@runs/x': coast takes no policy": lambda: make_agent("coast@runs/x"),
-    "agent 'ladder': stands for several agents in --agents; here one is needed": lambda: make_agent("ladder"),
+    "agent 'ladder': is the name of a group of agents; must be a single agent": lambda: make_agent("ladder"),
     "agent 'constant': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent("constant"),
     "agent 'constant:fast': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent(
         "constant:fast"
     ),
-    "agent 'e_v2x_bm:total': the argument must be 'coupled' or 'pairwise'": lambda: make_agent("e_v2x_bm:total"),
+    "agent 'e_v2x_bm:total': argument: must be 'coupled' or 'pairwise'": lambda: make_agent("e_v2x_bm:total"),
     "harm_count 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
-    "horizon_s 0.0: must be a positive number of seconds": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
+    "horizon_s = 0.0: must be a positive number of seconds": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
     "agent name 'mine:x': must be a plain name without argument": lambda: register_agent("mine:x", Own),
-    "file 'nowhere/none.py': there is no such file": lambda: make_agent("nowhere/none.py:make_agent"),
-    "agent 'profile:0=3,1=5+step': a profile is a role of a scenario, fixed at the alert; it is no agent": lambda: (
-        make_agent("profile:0=3,1=5+step", scenario=PAPER)
+    "file 'nowhere/none.py': does not exist": lambda: make_agent("nowhere/none.py:make_agent"),
+    "agent 'profile:0=3,1=5+step': a profile can only be a role in a scenario, not an agent": lambda: make_agent(
+        "profile:0=3,1=5+step", scenario=PAPER
     ),
-    "agent 'policy': a policy is needed: policy@PATH, where": lambda: make_agent("policy+step", scenario=PAPER),
+    "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of": lambda: make_agent(
+        "policy+step", scenario=PAPER
+    ),
 }
 
 
@@ -89,18 +91,18 @@ def test_agent__is_refused(message: str) -> None:
 
 
 SEARCHES: dict[str, Callable[[], object]] = {
-    "agent 'constant:7.5': above the braking capacity 7 m/s2": lambda: (
+    "agent 'constant:7.5': brakes harder than the braking capacity of 7 m/s2": lambda: (
         Asked(make_agent("constant:7.5")).begin(WORLDS, 1).act(WORLDS, 1)
     ),
-    "agent 'constant:-7.5': above the driving capacity 7 m/s2": lambda: (
+    "agent 'constant:-7.5': drives harder than the driving capacity of 7": lambda: (
         Asked(make_agent("constant:-7.5")).begin(WORLDS, 1).act(WORLDS, 1)
     ),
-    "vehicle 3: must be an index in 0..2": lambda: optimise_pairwise(WORLDS, 3),
+    "vehicle = 3: must be an index from 0 to 2": lambda: optimise_pairwise(WORLDS, 3),
     "deceleration_mps2[0, 1] = -1: must be finite and >= 0": lambda: pairwise_harm(WORLDS.take([0]), [1.0, -1.0, 1.0]),
-    "team 't': 'vehicle_2': must be the index of a vehicle, 0 or more": lambda: Team({"vehicle_2": BRAKE}, "t"),
-    "team 't': vehicle_2 is controlled by 'coast', which is no agent": lambda: Team({1: "coast"}, "t"),
-    "team 't' drives vehicle_2; the vehicles to drive are vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
-    "scenario 'cooperation-3-pair': needs one controlled vehicle; controlled are: vehicle_2, vehicle_3": lambda: (
+    "team 't': key 'vehicle_2': must be the index of a vehicle, 0 or more": lambda: Team({"vehicle_2": BRAKE}, "t"),
+    "team 't': 'coast' of vehicle_2: must be an agent, for instance": lambda: Team({1: "coast"}, "t"),
+    "team 't': drives vehicle_2; must drive exactly vehicle_2": lambda: Team.of(Team({1: BRAKE}, "t"), (1, 2)),
+    "scenario 'cooperation-3-pair': exactly one vehicle must be controlled here; the controlled vehicles are": lambda: (
         eb.evaluate(PAIR.sample(2, 0), {"b": BRAKE}, scenario=PAIR).vehicle
     ),
     "agent 'coast' drives vehicle_3, but vehicle_2 of scenario 'cooperation-3-pair'": lambda: eb.evaluate(
@@ -119,16 +121,16 @@ OWN: dict[str, Callable[[], object]] = {
     "agent 'own' of vehicle_2: act on 12 worlds at 0.50 s: ZeroDivisionError: division by zero": lambda: evaluated(
         Own(lambda worlds: 1 / 0)
     ),
-    "memory: act gave a memory of another form ((dtype('float64'),)) than it was given (None)": lambda: evaluated(
+    "memory: act got a memory of the form None and returned the form (dtype('float64'),)": lambda: evaluated(
         Remembers(lambda n: None, lambda m, n: np.zeros(n))
     ),
-    "memory: act gave a memory of another form ({'a': (dtype('float64'),), 'b': (dtype('float64'),)})": lambda: (
-        evaluated(Remembers(lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)}))
+    "and returned the form {'a': (dtype('float64'),), 'b': (dtype('float64'),)}": lambda: evaluated(
+        Remembers(lambda n: {"a": np.zeros(n)}, lambda m, n: m | {"b": np.zeros(n)})
     ),
-    "memory: act gave a memory of another form ((dtype('int64'),)) than it was given": lambda: evaluated(
+    "and returned the form (dtype('int64'),); keys": lambda: evaluated(
         Remembers(np.zeros, lambda m, n: np.zeros(n, np.int64))
     ),
-    "memory: act gave a memory of another form ((dtype('float64'), 2)) than it was given": lambda: evaluated(
+    "and returned the form (dtype('float64'), 2); keys": lambda: evaluated(
         Remembers(lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)))
     ),
     "agent 'mine' of vehicle_2: memory: key 'b.c'; must be a name": lambda: evaluated(
@@ -137,7 +139,7 @@ OWN: dict[str, Callable[[], object]] = {
     "agent 'mine' of vehicle_2: memory: key 0; must be a name": lambda: evaluated(
         Remembers(lambda n: {0: np.zeros(n)}, lambda m, n: m)
     ),
-    "agent 'mine' of vehicle_2: memory: an array of objects; it must hold numbers, truths or texts": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory: an array of objects; it must contain numbers": lambda: evaluated(
         Remembers(lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m)
     ),
     "the closed form of E-V2X-BM and planner: brakes of world 0 build up (brake_rate_mps3": lambda: evaluated(
@@ -156,16 +158,20 @@ def test_agent_of_a_user__is_refused(message: str) -> None:
 
 
 FAILED: dict[str, Callable[[], object]] = {
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape (12, 1); one number per world": lambda: evaluated(
-        Own(lambda worlds: np.zeros((worlds.n, 1)))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape (12, 1); one number per world": lambda: (
+        evaluated(Own(lambda worlds: np.zeros((worlds.n, 1))))
     ),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave float64 of shape ()": lambda: evaluated(Own(lambda worlds: 1.0)),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave object of shape ()": lambda: evaluated(Own(lambda worlds: None)),
-    "agent 'own', world 0, vehicle_2 at 0.50 s: gave <U1 of shape (12,); one number per world is needed": lambda: (
-        evaluated(Own(lambda worlds: ["x"] * worlds.n))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned float64 of shape ()": lambda: evaluated(
+        Own(lambda worlds: 1.0)
     ),
-    "agent 'own', world 7, vehicle_2 at 0.50 s: gave float64 of shape (7,); one number per world": lambda: evaluated(
-        Own(lambda worlds: np.zeros(7))
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned object of shape ()": lambda: evaluated(
+        Own(lambda worlds: None)
+    ),
+    "agent 'own', world 0, vehicle_2 at 0.50 s: act returned <U1 of shape (12,); one": lambda: evaluated(
+        Own(lambda worlds: ["x"] * worlds.n)
+    ),
+    "agent 'own', world 7, vehicle_2 at 0.50 s: act returned float64 of shape (7,); one number per world": lambda: (
+        evaluated(Own(lambda worlds: np.zeros(7)))
     ),
     "agent 'own', world 4, vehicle_2 at 0.50 s: command nan m/s2; must be in [-7, 7]": lambda: evaluated(
         Own(lambda worlds: np.where(np.arange(worlds.n) == 4, np.nan, 0.0))
@@ -173,8 +179,8 @@ FAILED: dict[str, Callable[[], object]] = {
     "agent 'own', world 4, vehicle_2 at 0.50 s: command -99 m/s2; must be in [-7, 7]": lambda: evaluated(
         Own(lambda worlds: np.where(np.arange(worlds.n) == 4, -99.0, 0.0))
     ),
-    "agent 'own', world 0, step 1 (0.50 s): observations of shape (12, 27): gave a tuple of 2 in place": lambda: (
-        evaluated(policy(lambda n: (np.zeros((n, 1)), None)))
+    "agent 'own', world 0, step 1 (0.50 s): observations of shape (12, 27): gave a tuple of 2; must": lambda: evaluated(
+        policy(lambda n: (np.zeros((n, 1)), None))
     ),
 }
 
@@ -188,11 +194,11 @@ def test_agent__fails_with_its_world_and_step(message: str) -> None:
 @pytest.mark.parametrize(
     ("answer", "world", "reason"),
     [
-        (lambda n: np.zeros((n, 2)), 0, "; one number per world is needed, shape (12, 1)"),
-        (lambda n: np.zeros(n), 0, "; one number per world is needed, shape (12, 1)"),
-        (lambda n: np.zeros((n, 1))[:5], 5, "; one number per world is needed, shape (12, 1)"),
-        (lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None], 3, ", in which stands nan; must be in [-1, 1]"),
-        (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, ", in which stands 1.5; must be in [-1, 1]; with clip=True"),
+        (lambda n: np.zeros((n, 2)), 0, "; must be one number per world, shape (12, 1)"),
+        (lambda n: np.zeros(n), 0, "; must be one number per world, shape (12, 1)"),
+        (lambda n: np.zeros((n, 1))[:5], 5, "; must be one number per world, shape (12, 1)"),
+        (lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None], 3, "; its action is nan; must be in [-1, 1]"),
+        (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, "; its action is 1.5; must be in [-1, 1]; clip=True"),
     ],
     ids=["two columns", "no column", "too few", "nan", "beyond 1"],
 )
@@ -204,18 +210,18 @@ def test_policy__fails_with_its_world_and_step(answer: Callable[[int], Any], wor
 
 
 POLICIES: dict[str, Callable[[], object]] = {
-    "agent 'int': 3 is no policy; must be a function of observations, an object": lambda: eb.policy_agent(3),
-    "agent 'none': policy 'none.onnx': there is no such file": lambda: eb.policy_agent(Path("none.onnx")),
-    "agent 'ActorCriticPolicy': the policy takes observations of shape (27,), here are 37 features": lambda: (
+    "agent 'int': policy = 3: must be a function of observations, an object": lambda: eb.policy_agent(3),
+    "agent 'none': policy = 'none.onnx': there is no such file": lambda: eb.policy_agent(Path("none.onnx")),
+    "agent 'ActorCriticPolicy': the policy takes observations of shape (27,), but this observation has 37": lambda: (
         eb.policy_agent(PPO("MlpPolicy", eb.EthBrakeEnv()).policy, observation=eb.ObservationSpec(front=2))
     ),
-    "agent 'PPO': initial_state is for a function (observation, state) -> (action, state)": lambda: eb.policy_agent(
+    "agent 'PPO': initial_state: can only be used with a function (observation,": lambda: eb.policy_agent(
         PPO("MlpPolicy", eb.EthBrakeEnv()), initial_state=lambda n: np.zeros((n, 1))
     ),
-    "agent 'Sequential': Dropout is in training mode, where it draws, or mixes the worlds of a batch": lambda: (
-        eb.policy_agent(torch.nn.Sequential(torch.nn.Linear(27, 4), torch.nn.Dropout(0.5), torch.nn.Linear(4, 1)))
+    "agent 'Sequential': the layer Dropout is in training mode, in which results are random": lambda: eb.policy_agent(
+        torch.nn.Sequential(torch.nn.Linear(27, 4), torch.nn.Dropout(0.5), torch.nn.Linear(4, 1))
     ),
-    "agent 'Sequential': BatchNorm1d is in training mode, where it draws, or mixes the worlds of a batch": lambda: (
+    "agent 'Sequential': the layer BatchNorm1d is in training mode, in which results are random": lambda: (
         eb.policy_agent(torch.nn.Sequential(torch.nn.Linear(27, 4), torch.nn.BatchNorm1d(4), torch.nn.Linear(4, 1)))
     ),
 }
@@ -253,12 +259,15 @@ def raising(): raise KeyError("weights")"""
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("My+File.py:", "agent 'My+File.py:': one from a file is FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT or"),
+        (
+            "My+File.py:",
+            "agent 'My+File.py:': an agent from a file must be FILE.py:FUNCTION, FILE.py:FUNCTION:ARGUMENT",
+        ),
         ("My+File.py:make_agent+stpe", "unknown shield or search 'stpe'; did you mean 'step'?"),
-        ("My+File.py:make_agent:3", "make_agent has no parameters, so it takes no argument"),
-        ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is no agent: it has no name and no act"),
+        ("My+File.py:make_agent:3", "the function make_agent has no parameters; leave out argument"),
+        ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is not an agent, because it has no name and no act"),
         ("My+File.py:raising", "agent 'My+File.py:raising': KeyError: 'weights' (My+File.py, line 4)"),
-        ("My+File.py:nobody", "file 'My+File.py': has no 'nobody'; name what it defines: My+File.py:NAME"),
+        ("My+File.py:nobody", "file 'My+File.py': does not define 'nobody'; after the colon, give a name that it"),
     ],
 )
 def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Path) -> None:
@@ -271,13 +280,15 @@ def test_file_of_an_agent__is_the_same_as_long_as_the_process_lives(empty_folder
     Path("mine.py").write_text(FILE)
     make_agent("mine.py:make_agent")
     Path("mine.py").write_text(f"{FILE}# changed")
-    with refused("file 'mine.py': was changed since it was loaded; begin a new process"):
+    with refused("file 'mine.py': has changed since it was loaded; start a new Python process"):
         make_agent("mine.py:make_agent")
 
 
 def test_file_of_an_agent__is_not_run_for_a_role(empty_folder: Path) -> None:
     Path("half.py").write_text("raise SystemExit('this ran')")
-    with refused("agent 'half.py:make_agent': is a function of a Python file, and those are loaded only where"):
+    with refused(
+        "agent 'half.py:make_agent': is a function in a Python file; a scenario cannot use one, only the option"
+    ):
         PAPER.replace(roles={"vehicle_1": "half.py:make_agent"})
 
 
@@ -285,9 +296,7 @@ def test_agent_that_is_registered__takes_a_policy_only_if_it_says_so() -> None:
     with refused("agent 'ppo' is registered already", AlreadyExists):
         register_agent("ppo", Own)
     register_agent("leads", lambda argument, settings: make_agent(f"constant:{argument}"))
-    with refused(
-        "agent 'leads@anything': leads takes no policy; register_agent(..., takes_policy=True) says that it does"
-    ):
+    with refused("agent 'leads@anything': leads takes no policy; to allow one, register the agent"):
         make_agent("leads@anything")
 
 
@@ -322,14 +331,14 @@ def test_knowledge__is_of_known_kinds(knows: Any) -> None:
 def test_agent__has_a_name_and_its_act_takes_a_memory_if_it_begins_with_one() -> None:
     nameless = Own(len)
     del nameless.name
-    with refused("evaluate: agent 'own': 'Own' is no agent: it has no name; make_agent(name) makes one"):
+    with refused("evaluate: agent 'own': 'Own' is not an agent, because it has no name; to make an agent"):
         evaluated(nameless)
 
     class Begins(Own):
         def begin(self, worlds: Any) -> None:
             return None
 
-    with refused("agent 'own' of vehicle_2: has begin, and act without a memory; one that remembers has"):
+    with refused("agent 'own' of vehicle_2: the agent has begin, but act takes no memory; an agent with memory has"):
         evaluated(Begins(len))
 
 
@@ -344,9 +353,9 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
         def predict(self, seen: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False) -> Any:
             return np.zeros((len(seen), 1)), np.zeros((1, 8))
 
-    with refused("learned: actions of shape (12, 2); one per world is needed, (12, 1)"):
+    with refused("learned: shape of actions = (12, 2): must be (12, 1), one action per world"):
         LearnedAgent(Fixed()).act(WORLDS, 1)
-    with refused("predict on 27 features: its state has arrays of shape (1, 8) for two worlds and (1, 8) for three"):
+    with refused("predict on 27 features: a state array has shape (1, 8) for two worlds and (1, 8) for three"):
         eb.policy_agent(Shared())
     states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
     with refused("initial_state(12): state: ndarray of shape (3,); its first axis must be the 12 worlds", AgentFailed):
@@ -383,11 +392,11 @@ def test_failure__after_the_first_step_is_told_with_its_step() -> None:
 
 def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_given() -> None:
     rows = eb.make_sb3_vec_env(PAPER, 2, observation=eb.ObservationSpec(front=2, rear=0))
-    with refused("agent 'PPO': the model is trained on other features than ObservationSpec(front=1, rear=1"):
+    with refused("agent 'PPO': the model was trained with the observation ObservationSpec(front=2, rear=0"):
         eb.policy_agent(PPO("MlpPolicy", rows), observation=eb.ObservationSpec())
     numbered = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="number")).policy
-    with refused("the policy takes observations of shape (28,), here are 27 features; give what it was trained on"):
+    with refused("the policy takes observations of shape (28,), but this observation has 27 features; pass scenario"):
         eb.policy_agent(numbered, scenario=PAIR)
     stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
-    with refused("agent 'ActorCriticPolicy': appended = 'state' needs the scenario that it was trained in"):
+    with refused("agent 'ActorCriticPolicy': appended = 'state': pass scenario=, the scenario of the training"):
         eb.policy_agent(stated, appended="state")

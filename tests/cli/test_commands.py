@@ -100,9 +100,17 @@ def test_completion__a_shell_that_asks_gets_what_can_follow(monkeypatch, capsys,
 @pytest.mark.parametrize(
     ("loaded", "temporary", "told"),
     [
-        ([], False, "compiling the physics, once: minutes of one core; the result is stored\n"),
-        (["advance-1"], False, "compiling new parts of the physics, once; the result is stored\n"),
-        ([], True, "no folder can be written"),
+        (
+            [],
+            False,
+            "compiling the physics for the first time, which takes minutes; later commands use the stored result\n",
+        ),
+        (
+            ["advance-1"],
+            False,
+            "compiling parts of the physics for the first time; later commands use the stored result\n",
+        ),
+        ([], True, "no folder for compiled kernels is writable"),
     ],
 )
 def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, temporary, told) -> None:
@@ -125,7 +133,7 @@ def test_first_compilation__is_told_once(tmp_path, monkeypatch, capsys, loaded, 
     captured = capsys.readouterr()
     first, *more = captured.err.splitlines()
     assert captured.out == "" and told in f"{first}\n" and more  # each as long as it lasts
-    assert all(re.fullmatch(r"still compiling: \d+ kernels are done, after \d+ s", line) for line in more)
+    assert all(re.fullmatch(r"still compiling: \d+ kernels are done after \d+ s", line) for line in more)
     time.sleep(0.1)
     assert capsys.readouterr().err == ""  # nothing is compiled any more
 
@@ -298,7 +306,9 @@ def test_command__of_the_users_cannot_take_the_place_of_a_built_in_one(ethbrake,
         """Another one."""
 
     answer = ethbrake("evaluate", "--episodes", "3")
-    check_refused(answer, "command 'evaluate' is there already; give yours another name: app.command('my-evaluate')")
+    check_refused(
+        answer, "command 'evaluate' already exists; give your command another name: app.command('my-evaluate')"
+    )
 
 
 def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, monkeypatch):
@@ -316,10 +326,12 @@ def test_command_of_a_program__appears_runs_and_takes_no_other_place(ethbrake, m
 
 
 def test_measures__asked_for_wrongly_are_one_line(ethbrake):
-    check_refused(ethbrake("evaluate", "--set", "measures="), "--set measures: must be names with commas between them")
+    check_refused(
+        ethbrake("evaluate", "--set", "measures="), "--set measures: must be names of measures with commas between them"
+    )
     check_refused(
         ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),
-        "--set measures: benchmark is a group",
+        "--set measures: is impossible for benchmark, a group",
     )
 
 
@@ -336,7 +348,7 @@ def test_agent__that_raises_no_exception_is_told_in_one_line(ethbrake: Command, 
     (tmp_path / "bad.py").write_text(BAD)
     check_refused(
         ethbrake("evaluate", "--episodes", "2", "--agents", f"{tmp_path}/bad.py:Leaves"),
-        "code of yours ended the process: GeneratorExit: enough (bad.py, line 6)",
+        "your own code ended the process: GeneratorExit: enough (bad.py, line 6)",
     )
 
 
@@ -372,7 +384,7 @@ def test_sigterm__is_as_ctrl_c_while_processes_work_unless_somebody_else_answers
 
 
 def test_evaluate__says_where_the_uncertainty_of_robust_is_given_and_keeps_no_place_for_it(ethbrake: Command) -> None:
-    assert "+robust needs an uncertainty, which only Python can set" in " ".join(
+    assert "+robust needs an uncertainty, which can be set only in Python" in " ".join(
         ethbrake("evaluate", "--help").out.split()
     )
     (row,) = told_json(ethbrake("evaluate", "--episodes", "2", "--agents", "full_brake", "--json"))

@@ -47,7 +47,7 @@ def test_dependencies__too_old_missing_and_untested_ones_are_told(monkeypatch) -
     ok, told = found("numpy")
     assert not ok and "needs >=99" in told
     assert found("no-such-package") == (False, "is not installed; needs >=1")
-    assert found("no-such-extra") == (True, "is not installed; the extra train brings it")
+    assert found("no-such-extra") == (True, "is not installed; the extra train installs it")
     ok, told = found("scipy")
     assert ok and "(tested with 1.0)" in told
 
@@ -78,7 +78,7 @@ def test_compile__only_when_asked_and_says_how_far_it_is_and_what_failed(ethbrak
     answer = ethbrake("doctor", "--compile")
     assert answer.status == 1 and re.search("FAIL +compile +shield failed: no luck", answer.out)
     *far, failed = [line for line in answer.err.splitlines() if line.startswith("compile: ")]
-    assert re.fullmatch(r"compile: (\d+) of \1 commands done, \d+ files in the cache", far[-1])
+    assert re.fullmatch(r"compile: (\d+) of \1 commands done, \d+ files in the kernel cache", far[-1])
     assert failed == "compile: shield failed: no luck"
     monkeypatch.setattr(doctor, "is_temporary", lambda folder: True)
     monkeypatch.setattr(doctor, "_call", None)  # where nothing can be kept it does not begin

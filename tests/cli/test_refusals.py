@@ -42,11 +42,14 @@ SCENARIOS = [
         "scenario name 'Not Good': must be 1 to 64 lower case letters, digits, - and _, beginning",
     ),
     ("scenario new mine --based-on paper-randm", "unknown scenario 'paper-randm'; did you mean 'paper-random'?"),
-    ("scenario new mine --output nowhere", "nowhere/mine.yaml: there is no folder nowhere; make it first"),
+    ("scenario new mine --output nowhere", "nowhere/mine.yaml: the folder nowhere does not exist; create it first"),
     ("scenario new mine --output /proc", "/proc/mine.yaml: cannot be written (No such file or directory)"),
     ("scenario sample paper-random --episodes 0", "number of worlds = 0: must be a whole number, at least 1"),
-    ("scenario sample paper-random --output x.txt", "x.txt: worlds must end in .csv or .png or .svg or .pdf"),
-    ("evaluate --scenario nowhere/mine.yaml", "nowhere/mine.yaml: no such file"),
+    (
+        "scenario sample paper-random --output x.txt",
+        "x.txt: the name of a file with worlds must end in .csv or .png or .svg",
+    ),
+    ("evaluate --scenario nowhere/mine.yaml", "nowhere/mine.yaml: the file does not exist"),
 ]
 
 
@@ -60,33 +63,36 @@ EVALUATIONS = [
     ("evaluate --episodes 0", "number of worlds = 0: must be a whole number, at least 1"),
     ("evaluate --episodes 100000000000000", "episodes = 100000000000000: must be a whole number in 1..1000000000000"),
     ("evaluate --seed -1", "seed of the list = -1: must be a whole number, at least 0"),
-    ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command takes no recipe, so nothing of one can be set"),
+    ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command has no recipe; remove this setting"),
     ("evaluate --agents full_brke", "unknown agent 'full_brke'; did you mean 'full_brake'?"),
-    ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; each agent drives every world once"),
+    ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; list each agent once"),
     (
         "evaluate --agents coast,",
-        "agent '': must be name or name:argument, the name in lower case letters, digits and _ @ . -",
+        "agent '': must be name or name:argument, for instance full_brake or constant:3.5; a name begins with a",
     ),
-    ("evaluate --agents constant:7.5", "agent 'constant:7.5': above the braking capacity 7 m/s2"),
+    ("evaluate --agents constant:7.5", "agent 'constant:7.5': brakes harder than the braking capacity of 7 m/s2"),
     (
         "evaluate --agents policy",
-        "agent 'policy': a policy is needed: policy@PATH, where PATH is a run or a policy bundle",
+        "agent 'policy' needs a policy: write policy@PATH, where PATH is the folder of a run or a policy bundle,",
     ),
     (
         "evaluate --agents ppo@runs/nothing-here",
-        "runs/nothing-here: is not a folder; give a policy bundle (manifest.json, weights.safetensors)",
+        "runs/nothing-here: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)",
     ),
     (
         "evaluate --scenario cooperation-0-sensors --agents vine-pair",
-        "scenario 'cooperation-0-sensors' has no learner to drive; give the scenario",
+        "scenario 'cooperation-0-sensors' has no learner that the agents could drive; choose the scenario",
     ),
-    ("evaluate --agents team@.", ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@."),
+    (
+        "evaluate --agents team@.",
+        ".: has no team.json, so it is not a team; name the folder of a run, or write ppo@. for a policy",
+    ),
     ("evaluate --agents policy@shipped+step", "'policy@shipped' is now written universal (the policies"),
     ("evaluate --agents ppo@shipped/ppo", "'ppo@shipped/ppo' is now written ppo"),
     ("agent export shipped/ppo --onnx policy.onnx", "'shipped/ppo' is now written ppo"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
-    ("evaluate --per-world csv", "--per-world: needs a folder for it: --output FOLDER"),
-    ("evaluate --report", "--report: needs a folder for it: --output FOLDER"),
+    ("evaluate --per-world csv", "--per-world: can be used only with a folder; add --output FOLDER"),
+    ("evaluate --report", "--report: can be used only with a folder; add --output FOLDER"),
 ]
 
 
@@ -98,22 +104,22 @@ def test_evaluation__is_refused(line: str, message: str, refuse: Refuse) -> None
 TRAININGS = [
     ("run --recipe pp", "unknown recipe 'pp'; did you mean 'ppo'?"),
     ("run --list-seed -1", "seed of the list = -1: must be a whole number, at least 0"),
-    ("train --recipe nowhere/ppo.yaml", "nowhere/ppo.yaml: no such file"),
+    ("train --recipe nowhere/ppo.yaml", "nowhere/ppo.yaml: the file does not exist"),
     ("train --steps 0", "recipe 'ppo': total_steps = 0: must be greater than or equal to 1"),
     ("train --output /proc/x", "/proc/x: No such file or directory"),
     (
         "train --scenario cooperation-3-pair --set scheme=single --output no",
-        "scheme single: scenario 'cooperation-3-pair' has 2 learners; use shared, independent or centralised",
+        "scheme single: scenario 'cooperation-3-pair' has 2 learners; use the scheme shared, independent or",
     ),
     (
         "train --scenario cooperation-3-pair --set scheme=centralized --output no",
         "recipe 'ppo': scheme = centralized: must be single, shared, independent or centralised",
     ),
-    ("train --resume .", ".: contains no training; give the folder of a run"),
-    ("agent export ppo --onnx none/policy.onnx", "none/policy.onnx: there is no folder none; make it first"),
+    ("train --resume .", ".: is not the folder of a run; name the folder of a run, for instance"),
+    ("agent export ppo --onnx none/policy.onnx", "none/policy.onnx: the folder none does not exist; create it first"),
     (
         "shield --agents ppo+episode",
-        "agent 'ppo+episode': has a shield already; this command puts its own around each agent",
+        "agent 'ppo+episode' already has a shield, and this command adds its own; name the agent without a",
     ),
 ]
 
@@ -140,7 +146,11 @@ def write_scenario(old: str, new: str) -> None:
             "mine.yaml, line 76: restitution = .nan: must be a finite number",
         ),
         ("vehicle_3: full_brake\n", "vehicle_3: ful_brake\n", "unknown agent 'ful_brake'; did you mean 'full_brake'?"),
-        ("\nname: mine", "\nname: mine\nname: mine", "line 14, column 1: key 'name' is given twice, first on line 13"),
+        (
+            "\nname: mine",
+            "\nname: mine\nname: mine",
+            "line 14, column 1: key 'name' occurs twice; the first is on line 13",
+        ),
         ("vehicle_3: full_brake\n", "vehicle_3: coast:4\n", "agent 'coast:4': coast takes no argument"),
     ],
 )
@@ -157,7 +167,7 @@ def test_role_that_cannot_drive__is_refused_before_anything_is_written(command: 
 
 def test_run__needs_a_learner(refuse: Refuse) -> None:
     write_scenario("vehicle_2: learner\n", "vehicle_2: full_brake\n")
-    refuse("run --output new --scenario mine.yaml", "has no learner to drive")
+    refuse("run --output new --scenario mine.yaml", "has no learner that the agents could drive")
 
 
 @pytest.mark.parametrize(
@@ -172,15 +182,15 @@ def test_run__needs_a_learner(refuse: Refuse) -> None:
 def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refuse: Refuse) -> None:
     Path(file).parent.mkdir(exist_ok=True)
     Path(file).write_text("precious")
-    refuse(line, f"{file}: is there already; give another name or use force (--force)")
+    refuse(line, f"{file}: already exists; give another name, or replace the file with force")
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("evaluate --output file/x", "is no folder; give a folder of its own (--output)"),
+        ("evaluate --output file/x", "file/x"),
         ("run --output file/x", "file: Not a directory"),
-        ("train --output . --force", ".: exists already and is not a run; give another name"),
+        ("train --output . --force", ".: already exists and is not the folder of a run; choose another name"),
     ],
 )
 def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse) -> None:
@@ -207,17 +217,21 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
             "--agents bad.py:make",
             "file 'bad.py', line 2: file 'bad.py': loads itself",
         ),
-        ("worst = 3\n", "--set measures=bad.py:worst", "measure 'worst': needs a function with a docstring"),
+        (
+            "worst = 3\n",
+            "--set measures=bad.py:worst",
+            "measure 'worst': must be a function with a docstring that describes the",
+        ),
         (
             "worst = 3\n",
             "--agents bad.py:worst",
-            "file 'bad.py': 'worst' is no function; name the one that makes the agent",
+            "file 'bad.py': 'worst' is not a function; name the function that makes the agent",
         ),
         ("", "--set measures=injur", "unknown measure 'injur'; did you mean 'injury'?"),
         (
             "import ethbrake_marl as eb\ndef slow(): return eb.policy_agent(lambda seen: exit(0))\n",
             "--agents bad.py:slow --episodes 3",
-            "code of yours ended the process: SystemExit: 0",
+            "your own code ended the process: SystemExit: 0",
         ),
     ],
     ids=["fails", "exits", "takes a name", "loads itself", "no function", "no maker", "unknown measure", "exits later"],

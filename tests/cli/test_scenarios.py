@@ -60,7 +60,7 @@ def test_validate__drives_scripts_and_tells_what_refuses_them(ethbrake: Command,
     assert "command is not fixed at the alert" in calm["refused_by"]["+step"]
     assert told_json(tried("own_fixed", "--json"))["refused_by"].keys() == {"early_impacts: reject"}
     greedy = tried("own_greedy")
-    (many,) = re.findall(r"vehicle_3 asks for more than it can in (\d+) of 200 worlds", greedy.out)
+    (many,) = re.findall(r"the command of vehicle_3 exceeds its capacity in (\d+) of 200 worlds", greedy.out)
     fast = load_scenario("paper-random").sample(200, 7).worlds.speeds_mps[:, 0]
     braked = fast - 0.8 * 6.0  # when Vehicle 3 may act
     assert greedy.status == 2 and greedy.out.startswith("NOT OK") and int(many) == (braked > 16.0).sum() > 0
@@ -86,7 +86,7 @@ def test_explain__tells_every_quantity_that_is_declared(ethbrake: Command) -> No
         scenario = load_scenario(entry.name)
         keys = set(scenario.declared()) & set(QUANTITY.declared)
         assert all(QUANTITY.declared[key].meaning in told for key in keys), entry.name
-        assert scenario.title in told and f"cut off after {scenario.horizon_s:g} s" in told
+        assert scenario.title in told and f"truncated after {scenario.horizon_s:g} s" in told
     assert "Time gaps (s): 0.19 to 1.75 (normal, mean 0.97, sd 0.26), drawn for each pair" in " ".join(
         ethbrake("scenario", "explain", "realistic-motorway").out.split()
     )

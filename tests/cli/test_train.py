@@ -202,7 +202,7 @@ def test_resume__goes_on_and_says_what_is_next(ethbrake, tiny_recipe, tmp_path, 
         answer = ethbrake("train", "--recipe", tiny_recipe, "--output", folder)
     assert answer.status == 130 and status_of(folder, "policy") == ("policy",)
     last = answer.err.splitlines()[-1]
-    assert "interrupted after 128 training steps" in last and f"go on with: ethbrake train --resume {folder}" in last
+    assert "interrupted after 128 training steps" in last and f"continue with: ethbrake train --resume {folder}" in last
     told = told_json(ethbrake("train", "--resume", folder, "--json"))
     assert (told["status"], told["steps"]) == ("finished", 256)
     again = ethbrake("train", "--resume", folder)
@@ -239,7 +239,7 @@ def test_run__whose_further_training_was_interrupted_ends_with_130(
     monkeypatch.setattr("ethbrake_marl.training.experiment.RUN_REPORTS", {"mine": make})
     answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", tmp_path / "run")
     assert answer.status == 130 and "a table" in answer.out
-    told = "interrupted: the training alone/vehicle_3; the report is without it: "
+    told = "interrupted: the training alone/vehicle_3; the report does not include it: "
     assert answer.err.splitlines()[-1].startswith(told)
 
 
@@ -252,7 +252,7 @@ def test_export__writes_onnx(ethbrake: Command, finished_run: Path, tmp_path: Pa
     graph = onnx.load(str(tmp_path / "policy.onnx")).graph
     assert [output.name for output in graph.output] == ["action", "acceleration_mps2"]
     monkeypatch.setitem(sys.modules, "onnx", None)  # not installed: the output is looked at before that is
-    check_refused(ethbrake(*line), "is there already")
+    check_refused(ethbrake(*line), "already exists")
 
 
 # ---------------------------------------------------------------- parts of a report

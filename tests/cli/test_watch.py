@@ -75,7 +75,10 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_a_follower
     way = 0.6 * speed + 0.2 * speed + speed**2 / 18.0 - 0.75 * speed
     assert hardest == pytest.approx(3.6 * (speed**2 - 2.0 * 7.59 * way) ** 0.5, rel=1e-6)
     refused = ethbrake(*words, "--jobs", "2")
-    assert refused.status == 2 and "--jobs: standards is a group of 7 scenarios; give one of them" in refused.err
+    assert (
+        refused.status == 2
+        and "--jobs: is impossible for standards, a group of 7 scenarios; give one of them" in refused.err
+    )
 
 
 def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(ethbrake, tmp_path) -> None:
@@ -91,7 +94,7 @@ def test_evaluate__a_damaged_bundle_is_refused_by_file_whatever_is_around_it(eth
 def test_evaluate__one_agent_that_cannot_drive_is_refused_before_another_works(ethbrake, monkeypatch) -> None:
     monkeypatch.setattr("ethbrake_marl.evaluation.chunks.evaluate_held", lambda *args, **kwargs: pytest.fail("worked"))
     refused = ethbrake("evaluate", "--agents", "e_v2x_bm,constant:99", "--episodes", "5")
-    check_refused(refused, "agent 'constant:99': above the braking capacity 7 m/s2")
+    check_refused(refused, "agent 'constant:99': brakes harder than the braking capacity of 7 m/s2")
 
 
 # Lists of agents and worlds
@@ -104,7 +107,7 @@ def test_lineup__a_team_goes_behind_the_step_shield_and_no_other(monkeypatch) ->
     )
     assert sorted(make_lineup(["team@run+step"], scenario)["team@run+step"].drivers) == [1, 2]
     with pytest.raises(
-        InvalidInput, match=r"'team@run\+episode': is a team, and \+episode is for one controlled vehicle"
+        InvalidInput, match=r"'team@run\+episode': \+episode works for one controlled vehicle only, not for a team"
     ):
         make_lineup(["team@run+episode"], scenario)
 
@@ -118,7 +121,7 @@ def test_check_agents__a_constant_above_the_capacity_of_any_world_is_refused_and
     assert vars(lineup["e_v2x_bm"]) == before
     capacity = worlds.vehicles.braking_capacity_mps2[:, 1]
     between = (capacity[0] + capacity.min()) / 2  # the first world could, another could not
-    with pytest.raises(InvalidInput, match="above the braking capacity"):
+    with pytest.raises(InvalidInput, match="brakes harder than the braking capacity"):
         check_agents(make_lineup([f"constant:{between}"], scenario), worlds, scenario)
 
 
@@ -170,7 +173,7 @@ def test_compare__difference_is_paired_by_world_where_every_world_is_there(resul
     both = [found.differences[1].harms["total_harm"].value for found in (paired, apart)]
     assert both[0] == pytest.approx(both[1])
     assert [found.to_json()["intervals"] for found in (paired, apart)] == ["paired", "unpaired"]
-    assert "alone.json has none" in str(apart.unpaired_because)
+    assert "alone.json was written without such a file" in str(apart.unpaired_because)
 
 
 def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command, results: Path) -> None:
@@ -193,8 +196,8 @@ def test_compare__marks_who_exploits_what_harm_does_not_count(ethbrake: Command,
     ("wrong", "says"),
     [
         ({"horizon_ends": -1}, "horizon_ends = -1: must be 0 to "),
-        ({"horizon_ends": "3"}, "horizon_ends is missing or no int"),
-        ({"vehicle_1_shoved_m": "far"}, "vehicle_1_shoved_m = 'far': must be metres, or null"),
+        ({"horizon_ends": "3"}, "horizon_ends is missing or not of type int"),
+        ({"vehicle_1_shoved_m": "far"}, "vehicle_1_shoved_m = 'far': must be a number of metres, or null"),
     ],
 )
 def test_compare__refuses_what_no_evaluation_wrote(results: Path, wrong: dict[str, Any], says: str) -> None:
@@ -278,7 +281,7 @@ def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
 
 def check_extra(ethbrake: Command, package: str, extra: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    missing = f"needs the package {package}, which is not installed: {sys.executable} -m pip install"
+    missing = f"needs the package {package}, which is not installed; install it with: {sys.executable} -m pip install"
     check_refused(ethbrake(*line.split()), f"{missing} 'ethbrake-marl[{extra}]'\n")
     assert list(Path().iterdir()) == []
 

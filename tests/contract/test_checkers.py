@@ -24,7 +24,7 @@ from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 pytestmark = pytest.mark.filterwarnings(
     "error",
     # PettingZoo's checkers pass {"options": 1} on purpose; asking for a warning here is our own rule.
-    "ignore:reset. unknown option options, ignored:ethbrake_marl.envs.making.UnknownResetOption",
+    "ignore:reset. options has the unknown keys options:ethbrake_marl.envs.making.UnknownResetOption",
     "ignore::ethbrake_marl.envs.making.IgnoredAction",  # they act for all agents
     "ignore:.*is different from the unwrapped version",  # a shield is: that is its use
 )

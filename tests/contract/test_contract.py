@@ -229,7 +229,7 @@ def starts(state: Any) -> Callable[[Interface], Any]:
 
 
 REFUSED: list[tuple[Callable[[Interface], Any], str]] = [
-    *((acts(value), r"(nan|1\.001|-inf); must be in \[-1, 1\]") for value in (np.nan, 1.001, -np.inf)),
+    *((acts(value), r"(nan|1\.001|-inf); must be from -1 \(full braking\) to 1") for value in (np.nan, 1.001, -np.inf)),
     (acts("full"), r"'full'.* is not a number"),
     (acts(0.5, (2,)), "shape"),
     *((lambda given, seed=seed: given.reset(seed), "seed = .*must be None or a") for seed in (-1, 1.5, True, "1")),
@@ -274,7 +274,9 @@ def test_action__as_a_number_or_one_float32_step_beyond_1_is_the_same(name: str)
 def test_options__an_unknown_one_warns_and_is_ignored(name: str) -> None:
     interface = make(name)
     expected = interface.reset(5)
-    with pytest.warns(UnknownResetOption, match="reset: unknown option colour, ignored; known: initial_state") as seen:
+    with pytest.warns(
+        UnknownResetOption, match="unknown keys colour, which are ignored; known keys: initial_state"
+    ) as seen:
         given = interface.reset(5, {"colour": "red"})
     assert len(seen) == 1 and np.array_equal(given, expected)
 

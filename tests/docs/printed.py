@@ -174,13 +174,13 @@ TABLES: dict[str, How] = {
     ),
     "| no. | label | the paper": _by(BY_HAND),
     "| `--draw` | full_brake": _by(SUITE, "tests/extensions/recorded/test_recorded.py"),
-    "| agent in a host | here | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
+    "| agent | our physics | SUMO": _by(SUITE, "tests/extensions/hosts/test_sumo.py"),
     "| work | has | lacks": _by(BY_HAND),
     "| you write | values": _by(BY_HAND),
     "| agent | what it does | knows": _by(
         NIGHTLY, "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json"
     ),
-    "| for | recipe | scenario | differs": _by(BY_HAND),
+    "| for | recipe | scenario | settings that differ": _by(BY_HAND),
     "| Vehicle 2 minimises": _by(SEARCH),
     "| | equal weights | the other weights": _by(SEARCH),
     "| who learns, objective": _by(SEARCH),

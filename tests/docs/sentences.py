@@ -58,11 +58,16 @@ def pages() -> Iterator[Found]:
 
 
 def messages() -> Iterator[Found]:
-    """Each text of an exception, a warning or a ``help=`` in the package; ``{...}`` stands for a value."""
+    """Each text of an exception, a warning or a ``help=`` in the package; ``{...}`` stands for a value.
+
+    A ``ValueError`` without a subject comes from the check of a file or field; its name is printed before the text.
+    """
     for path, tree in _modules():
         for node in ast.walk(tree):
+            checks = False
             if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
                 texts: list[ast.expr] = node.exc.args
+                checks = getattr(node.exc.func, "id", "") == "ValueError"
             elif isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "warn":
                 texts = node.args[:1]
             else:
@@ -70,7 +75,8 @@ def messages() -> Iterator[Found]:
             for text in texts:
                 written = _written(text)
                 if len(written.split()) > 3:
-                    yield f"{path}:{text.lineno}", written, ""
+                    subject = "{name}: " if checks and re.match("(must|is|not|has|holds) ", written) else ""
+                    yield f"{path}:{text.lineno}", subject + written, ""
 
 
 def _written(node: ast.expr) -> str:

@@ -99,7 +99,7 @@ def test_weights__that_are_none_are_refused(weights: object, words: str) -> None
 
 
 def test_world__in_which_nobody_counts_is_refused_by_its_number() -> None:
-    with pytest.raises(InvalidInput, match="harm_weight of world 1: must be at least 1e-06 for one vehicle"):
+    with pytest.raises(InvalidInput, match="world 1: the weight of at least one vehicle must be 1e-06"):
         eb.make_worlds(
             [7.0, 7.0], [[20.0, 18.0, 20.0]] * 2, braking_capacity_mps2=6.0, driving_capacity_mps2=3.0, latency_s=0.0,
             mass_t=4.5, restitution=0.1, harm_weight=[[1.0, 0.0, 0.0], [0.0, 0.0, 1e-9]],

@@ -32,22 +32,22 @@ def one(value: object) -> np.ndarray:
 
 
 ACTIONS: dict[str, Callable[[], object]] = {
-    "action of vehicle_2: -1.0000003; must be in [-1, 1], from full braking to full driving": lambda: checked_action(
+    "action of vehicle_2: -1.0000003; must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
         [0.5, -1.0000003], (2,), "vehicle_2"
     ),
-    "action of vehicle_2: 1.0000001193; must be in [-1, 1], from full braking to full driving": lambda: checked_action(
+    "action of vehicle_2: 1.0000001193; must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
         [0.5, 1.0000001193], (2,), "vehicle_2"
     ),
-    "action of vehicle_2: nan; must be in [-1, 1], from full braking to full driving": lambda: checked_action(
+    "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
         [0.5, np.nan], (2,), "vehicle_2"
     ),
-    "action of vehicle_2: shape (2,); (1,) is needed": lambda: one(np.zeros(2)),
-    "action of vehicle_2: shape (2, 3); (3, 2) is needed": lambda: checked_action(
+    "action of vehicle_2: has shape (2,); must have shape (1,)": lambda: one(np.zeros(2)),
+    "action of vehicle_2: has shape (2, 3); must have shape (3, 2)": lambda: checked_action(
         np.zeros((2, 3)), (3, 2), "vehicle_2"
     ),
-    "action of vehicle_2: '-1' is not a number; a number in [-1, 1] is needed": lambda: one("-1"),
-    "action of vehicle_2: None is not a number; a number in [-1, 1] is needed": lambda: one(None),
-    "action of vehicle_2: [1j] is not a number; a number in [-1, 1] is needed": lambda: one([1j]),
+    "action of vehicle_2: '-1' is not a number; must be a number in [-1, 1]": lambda: one("-1"),
+    "action of vehicle_2: None is not a number; must be a number in [-1, 1]": lambda: one(None),
+    "action of vehicle_2: [1j] is not a number; must be a number in [-1, 1]": lambda: one([1j]),
 }
 
 
@@ -58,21 +58,21 @@ def test_action__is_refused(message: str) -> None:
 
 
 OBSERVATIONS: dict[str, Callable[[], object]] = {
-    "observation: front = 1.5; must be a whole number in 0..64": lambda: ObservationSpec(1.5, 0),
-    "observation: front = True; must be a whole number in 0..64": lambda: ObservationSpec(True, 0),
-    "observation: front = 65; must be a whole number in 0..64": lambda: ObservationSpec(65, 0),
-    "observation: front = -1; must be a whole number in 0..64": lambda: ObservationSpec(front=-1),
+    "observation: front = 1.5; must be a whole number from 0 to 64": lambda: ObservationSpec(1.5, 0),
+    "observation: front = True; must be a whole number from 0 to 64": lambda: ObservationSpec(True, 0),
+    "observation: front = 65; must be a whole number from 0 to 64": lambda: ObservationSpec(65, 0),
+    "observation: front = -1; must be a whole number from 0 to 64": lambda: ObservationSpec(front=-1),
     "observation: obstacle = 1; must be True or False": lambda: ObservationSpec(obstacle=1),
-    "observe: vehicle index 4; must be in 0..2": lambda: observe(
+    "observe: vehicle index 4; must be from 0 to 2": lambda: observe(
         load_scenario("paper-random").sample(1, 7).worlds, 4, ObservationSpec()
     ),
-    "observation: contact features need the time between two decisions; give it as time_step_s": lambda: observe(
+    "observation: contact features need the time between two decisions; give the argument time_step_s": lambda: observe(
         WORLDS, 1, choose_observation(["own", "contact"])
     ),
     "observation: time_step_s = -1.0; must be a positive number of seconds": lambda: ObservationSpec(
         contact=True, time_step_s=-1.0
     ),
-    "policy: scenario: time_step_s = None; contact features need a number above 0": lambda: make_policy(
+    "policy: scenario: time_step_s = None: must be a number above 0": lambda: make_policy(
         choose_observation(["own", "contact"]), {}
     ),
 }
@@ -91,8 +91,10 @@ REWARDS: dict[str, Callable[[], object]] = {
     "reward: harm_count = 'all': must be first or total": lambda: reward_params({"harm_count": "all"}),
     "reward: shaping_discount = 1.5: must be less than or equal to 1": lambda: reward_params({"shaping_discount": 1.5}),
     "reward: jerk = 'a': must be a number": lambda: reward_params({"jerk": "a"}),
-    "reward: harm: is left out, and would weigh 1 beside shaping; say harm: 1": lambda: reward_params({"shaping": 1.0}),
-    "reward: objective: changes the term harm alone, whose weight is 0; give that a weight, or leave it": lambda: (
+    "reward: harm: must be given together with shaping, because its default weight is 1": lambda: reward_params(
+        {"shaping": 1.0}
+    ),
+    "reward: objective: has no effect, because it changes only the term harm, whose weight is 0; leave it": lambda: (
         reward_params({"harm": 0.0, "objective": "own"})
     ),
 }
@@ -113,38 +115,46 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "objective 'social:91': social needs an angle from 0 to 90 degrees": lambda: PAPER.replace(objective="social:91"),
     "objective 'social:nan': social needs an angle": lambda: PAPER.replace(objective="social:nan"),
     "objective 'social:4_5': social needs an angle": lambda: PAPER.replace(objective="social:4_5"),
-    "'weighted:0,0,0': weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6": lambda: PAPER.replace(
-        objective="weighted:0,0,0"
+    "'weighted:0,0,0': weighted needs one weight per vehicle, as in weighted:1,4,1; a weight is 0": lambda: (
+        PAPER.replace(objective="weighted:0,0,0")
     ),
-    "'weighted:1,-1,1': weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6": lambda: PAPER.replace(
-        objective="weighted:1,-1,1"
+    "'weighted:1,-1,1': weighted needs one weight per vehicle, as in weighted:1,4,1; a weight is 0": lambda: (
+        PAPER.replace(objective="weighted:1,-1,1")
     ),
-    "'weighted': weighted needs a weight for each vehicle, 0 or from 1e-6 to 1e6": lambda: PAPER.replace(
+    "'weighted': weighted needs one weight per vehicle, as in weighted:1,4,1; a weight is 0": lambda: PAPER.replace(
         objective="weighted"
     ),
-    "scenario 'paper-random': objective = \"weighted:1,2\": objective 'weighted:1,2': 2 weights; 3": lambda: (
+    "scenario 'paper-random': objective = \"weighted:1,2\": objective 'weighted:1,2': has 2 weights; must": lambda: (
         PAPER.replace(objective="weighted:1,2")
     ),
-    "2 entries; 3 vehicles need 3 (one per vehicle), or one for all": lambda: PAPER.replace(objective=["own", "own"]),
-    "objective = 5: must be a name, for instance own or social:45, or a list with one per vehicle": lambda: (
+    "2 entries; must have 3, one per vehicle, or be a single entry for all": lambda: PAPER.replace(
+        objective=["own", "own"]
+    ),
+    "objective = 5: must be the name of an objective, for instance own or social:45, or a list with one name": lambda: (
         PAPER.replace(objective=5)
     ),
-    "objective = [own, 5, own]: must be a name": lambda: PAPER.replace(objective=["own", 5, "own"]),
-    "reward: objective 'weighted:1,2': 2 weights; 3 vehicles need 3": lambda: parallel_env(
+    "objective = [own, 5, own]: must be the name of an objective, for": lambda: PAPER.replace(
+        objective=["own", 5, "own"]
+    ),
+    "reward: objective 'weighted:1,2': has 2 weights; must have 3, one per": lambda: parallel_env(
         PAPER, reward={"objective": "weighted:1,2"}
     ),
     "reward: objective = 'onw': unknown objective 'onw'; did you mean 'own'?": lambda: parallel_env(
         PAPER, reward={"objective": "onw"}
     ),
-    "reward: objective = 5: must be a name": lambda: parallel_env(PAPER, reward={"objective": 5}),
+    "reward: objective = 5: must be the name of an objective, for instance": lambda: parallel_env(
+        PAPER, reward={"objective": 5}
+    ),
     "scored: 'own': must be a list of objectives, for instance ['own']": lambda: scored(
         empty_ledger(line([5.0], [9.0, 9.0])), "first", "own"
     ),
-    "objective 'own' is given twice": lambda: declared_objectives(["own", "own"], 2),
+    "objective 'own' is listed twice; list it once": lambda: declared_objectives(["own", "own"], 2),
     "objective 'social:91': social needs an angle from 0 to 90 degrees, as in social:45": lambda: declared_objectives(
         ["social:91"], 2
     ),
-    "objective 'weighted:1,2,3': 3 weights; 2 vehicles need 2": lambda: declared_objectives(["weighted:1,2,3"], 2),
+    "objective 'weighted:1,2,3': has 3 weights; must have 2, one per vehicle": lambda: declared_objectives(
+        ["weighted:1,2,3"], 2
+    ),
 }
 
 
@@ -155,15 +165,17 @@ def test_objective__is_refused(message: str) -> None:
 
 
 ENGINE: dict[str, Callable[[], object]] = {
-    "engine: deciders (3,) must be from 0 to 2": lambda: Engine(PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)),
-    "engine snapshot: state is (6, 20); (7, 20) is needed": lambda: make_engine(PAPER, 7).restore(
-        make_engine(PAPER, 6).snapshot()
+    "engine: deciders = (3,): must be vehicle indices": lambda: Engine(
+        PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)
     ),
-    "renew: rows [1, 9]; must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
-    "observe: vehicle index 'vehicle_2'; must be in 0..2": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
-    "since: these are not the same worlds; ask before a row is renewed": lambda: make_engine(PAPER, 6).ledger.since(
-        make_engine(PAPER, 1).ledger
-    ),
+    "engine snapshot: the array state has the shape (6, 20); the shape (7, 20) is": lambda: make_engine(
+        PAPER, 7
+    ).restore(make_engine(PAPER, 6).snapshot()),
+    "renew: rows = [1, 9]: must be different numbers from 0 to 5": lambda: make_engine(PAPER, 6).renew([1, 9]),
+    "observe: vehicle = 'vehicle_2': must be a vehicle index": lambda: make_engine(PAPER, 6).observe("vehicle_2"),
+    "since: the earlier ledger is not of the same episodes; call since before a": lambda: make_engine(
+        PAPER, 6
+    ).ledger.since(make_engine(PAPER, 1).ledger),
 }
 
 
@@ -199,14 +211,14 @@ def test_episode__starts_at_the_alert_without_an_impact() -> None:
 
 def test_branch__has_an_end_and_no_shaping() -> None:
     shaped = make_engine(PAPER, 2, reward={"harm": 1.0, "shaping": 0.1})
-    with refused("branches: reward: shaping = 0.1: must be 0; a branch has an end"):
+    with refused("branches: the reward has shaping = 0.1; it must be 0 for branches"):
         shaped.branch(shaped.moment())
 
 
 def test_snapshot__of_another_engine_is_refused() -> None:
     kept = make_engine(PAPER, 6).snapshot()
-    with refused("engine snapshot: params is (6, 25); (6, 37) is needed"):
+    with refused("engine snapshot: the array params has the shape (6, 25); the shape (6, 37) is needed"):
         make_engine(load_scenario("cooperation-2-blocked"), 6).restore(kept)
     del kept["params"]
-    with refused("engine snapshot: params is nothing; (6, 25) is needed"):
+    with refused("engine snapshot: the array params is missing; the shape (6, 25) is needed"):
         make_engine(PAPER, 6).restore(kept)

@@ -192,7 +192,9 @@ def test_number_of_actions__is_at_least_2(name: str, count: Any) -> None:
 
 
 def test_number_of_actions__is_refused_where_nobody_learns() -> None:
-    with pytest.raises(InvalidInput, match="actions = 9: nobody learns in 'paper-random'; leave it out"):
+    with pytest.raises(
+        InvalidInput, match="actions = 9: scenario 'paper-random' has no learner; omit actions, or pass"
+    ):
         eb.parallel_env(learners=[], actions=9)
 
 
@@ -242,7 +244,7 @@ def test_dqn__of_a_file_says_what_its_indices_mean(tmp_path: Any) -> None:
     model.save(tmp_path / "dqn.zip")
     loaded = DQN.load(tmp_path / "dqn.zip")
     with pytest.raises(
-        InvalidInput, match=r"gives actions in Discrete\(9\); must be a number in \[-1, 1\]; say actions=9 if"
+        InvalidInput, match=r"gives actions in Discrete\(9\); must be a number in \[-1, 1\]; pass actions=9 if"
     ):
         eb.policy_agent(loaded)
     with pytest.raises(InvalidInput, match=r"in Discrete\(9\); must be an index from 0 to 4 \(actions=5\)"):
@@ -279,12 +281,12 @@ def test_function__of_indices_drives(shape: tuple[int, ...]) -> None:
 @pytest.mark.parametrize(
     ("gives", "message"),
     [
-        (lambda n: np.full(n, 9), r"world 0, step 1 \(0.50 s\): .* in which stands 9; with actions=9 a whole number"),
-        (lambda n: np.full(n, -1), "in which stands -1"),
+        (lambda n: np.full(n, 9), r"world 0, step 1 \(0.50 s\): .* its index is 9; must be a whole number"),
+        (lambda n: np.full(n, -1), "its index is -1"),
         (lambda n: np.full(n, 2.0), "gave float64 of shape"),
         (lambda n: np.full(n, True), "gave bool of shape"),
-        (lambda n: np.full(n + 1, 2), r"from 0 to 8 per world is needed, shape \(3,\) or \(3, 1\)"),
-        (lambda n: np.full((n, 2), 2), "is needed, shape"),
+        (lambda n: np.full(n + 1, 2), r"from 0 to 8 per world with actions=9, shape \(3,\) or \(3, 1\)"),
+        (lambda n: np.full((n, 2), 2), "with actions=9, shape"),
     ],
 )
 def test_function__of_indices_that_gives_something_else_is_refused(gives: Any, message: str) -> None:

@@ -217,7 +217,7 @@ def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch:
     environment.close()
     assert pygame.display.get_surface() is None
     monkeypatch.setenv("SDL_VIDEODRIVER", "nothing")
-    with pytest.raises(InvalidInput, match=r"no window can be opened here .*; 'rgb_array' needs no display"):
+    with pytest.raises(InvalidInput, match=r"cannot open a window .*; use 'rgb_array', which needs no display"):
         eb.parallel_env(render_mode="human").reset(seed=0)
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(eb.MissingExtra, match=r"^[^\n]*pip install 'ethbrake-marl\[render\]'[^\n]*$"):

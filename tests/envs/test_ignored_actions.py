@@ -69,8 +69,8 @@ def told(way: str, steps: int = 3, **settings: Any) -> list[str]:
 def test_warning__comes_once_names_the_vehicles_and_what_to_do(way: str) -> None:
     (text,) = told(way)
     assert text == (
-        "step: actions of vehicle_1, vehicle_3 are ignored, as scripts drive them; with agents='learners' the"
-        " environment has the learners alone: vehicle_2"
+        "step: actions of vehicle_1, vehicle_3 are ignored, because scripts drive these vehicles; create the"
+        " environment with agents='learners' if only vehicle_2 should be agents"
     )
 
 
@@ -84,7 +84,7 @@ def test_warning__does_not_come_where_every_agent_learns(way: str, settings: dic
 
 def test_warning__says_that_nobody_learns() -> None:
     (text,) = told("parallel", learners=[])
-    assert text.endswith("scripts drive them; nobody learns: name learners, for instance learners=['vehicle_2']")
+    assert text.endswith("these vehicles; no vehicle is a learner; name learners, for instance learners=['vehicle_2']")
 
 
 @pytest.mark.parametrize("actions", [{}, {"vehicle_1": None, "vehicle_3": None}], ids=str)
@@ -99,7 +99,7 @@ def test_warning__does_not_come_for_actions_that_are_left_out(actions: dict[str,
 def test_warning__of_a_step_that_is_refused_comes_with_it_and_not_again() -> None:
     env = eb.parallel_env()
     env.reset(seed=0)
-    with pytest.warns(IgnoredAction), pytest.raises(InvalidInput, match="no action for the learner vehicle_2"):
+    with pytest.warns(IgnoredAction), pytest.raises(InvalidInput, match="the action of learner vehicle_2 is missing"):
         env.step({"vehicle_1": COAST})
     env.step(dict.fromkeys(env.agents, COAST))
 
@@ -107,5 +107,5 @@ def test_warning__of_a_step_that_is_refused_comes_with_it_and_not_again() -> Non
 def test_engine__refuses_actions_of_vehicles_that_do_not_learn() -> None:
     engine = eb.make_engine("paper-random", 2)
     for extra in (2, 7):
-        with pytest.raises(InvalidInput, match=rf"step: an action for vehicle index {extra}; .* indices \(1,\)"):
+        with pytest.raises(InvalidInput, match=rf"step: vehicle index {extra} has an action .* indices \(1,\)"):
             engine.step({1: np.zeros(2), extra: np.zeros(2)})

@@ -91,7 +91,7 @@ def test_infos__cost_is_the_harm_of_the_step_as_the_reward_counts_it(reward: str
             costs.append(info["cost"])
             assert cost == info["cost"]
         assert sum(costs) == near(info[total] - before) and info["reward_harm"] == -info["cost"]
-    with pytest.raises(InvalidInput, match="reports no cost"):
+    with pytest.raises(InvalidInput, match="must be an EthBrakeEnv, or a wrapper"):
         eb.CostEnv(eb.make_sb3_vec_env("paper-random", n_envs=2))  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match="already contains a CostEnv"):
         eb.CostEnv(gymnasium.wrappers.ClipAction(environment))
@@ -399,7 +399,7 @@ def test_set_options__gives_each_world_its_own_start_once_and_fails_one_reset_on
     env.reset()
     assert env.engine.worlds.gaps_m[:, 0].tolist() == [3.0, 3.0]
     env.set_options([{"listed_world": {"seed": 7, "number": 40}}] * 4)
-    with pytest.warns(UserWarning, match="unknown option listed_world, ignored; known: initial_state"):
+    with pytest.warns(UserWarning, match="unknown keys listed_world, which are ignored; known keys: initial_state"):
         env.reset()
 
 

@@ -31,7 +31,7 @@ def rows(*options: dict[str, Any]) -> Any:
 
 
 MADE: dict[str, Callable[[], object]] = {
-    "learners = 5: must be a list of vehicles, for instance ['vehicle_2']": lambda: parallel_env(FIVE, learners=5),
+    "learners = 5: must be a list of vehicle names, for instance ['vehicle_2']": lambda: parallel_env(FIVE, learners=5),
     "learners: 'vehicle_2': must be a list of vehicles": lambda: eb.EthBrakeEnv(learners="vehicle_2"),
     "scenario 'paper-random': mass_t = -1: must be finite and in (0, 1000] t (tonnes)": lambda: parallel_env(
         {**load_scenario("paper-random").declared(), "mass_t": -1.0}
@@ -40,26 +40,34 @@ MADE: dict[str, Callable[[], object]] = {
     "observation = 'x': must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields": lambda: (
         parallel_env(observation="x")
     ),
-    "observation: front = 'two'; must be a whole number in 0..64": lambda: parallel_env(observation={"front": "two"}),
+    "observation: front = 'two'; must be a whole number from 0 to 64": lambda: parallel_env(
+        observation={"front": "two"}
+    ),
     "observation: chosen = 3; must be a list of features": lambda: parallel_env(observation={"chosen": 3}),
     "agents = 'scripted': must be 'all' or 'learners'": lambda: parallel_env(agents="scripted"),
-    "nobody learns in 'paper-random'; name learners, or take": lambda: parallel_env(agents="learners", learners=[]),
+    "agents = 'learners': scenario 'paper-random' has no learner; pass": lambda: parallel_env(
+        agents="learners", learners=[]
+    ),
     "max_cycles = 0: must be a whole number, at least 1": lambda: parallel_env(max_cycles=0),
-    "must be 'human', 'rgb_array', 'rgb_array_list', 'ansi', or None": lambda: parallel_env(render_mode="depth"),
-    "render_mode = 'depth': must be 'rgb_array', 'ansi', or None": lambda: eb.EthBrakeVectorEnv(render_mode="depth"),
-    "render_mode = 'ansi': must be 'rgb_array', or None": lambda: eb.make_sb3_vec_env(PAPER, 3, render_mode="ansi"),
-    "render: render_mode must be one of human, rgb_array, rgb_array_list": lambda: parallel_env().render(),
-    "render: no episode was started; call reset first": lambda: parallel_env(render_mode="rgb_array").render(),
+    "must be one of 'human', 'rgb_array', 'rgb_array_list', 'ansi', or None": lambda: parallel_env(render_mode="depth"),
+    "render_mode = 'depth': must be one of 'rgb_array', 'ansi', or None": lambda: eb.EthBrakeVectorEnv(
+        render_mode="depth"
+    ),
+    "render_mode = 'ansi': must be 'rgb_array' or None": lambda: eb.make_sb3_vec_env(PAPER, 3, render_mode="ansi"),
+    "render: the environment needs a render_mode: human, rgb_array, rgb_array_list, ansi; pass": lambda: (
+        parallel_env().render()
+    ),
+    "render: no episode has started; call reset first": lambda: parallel_env(render_mode="rgb_array").render(),
     "step_frames: fps = 0: must be a whole number, at least 1": lambda: started(
         eb.EthBrakeEnv(render_mode="rgb_array")
     ).viewer.step_frames(0),
-    "state: no episode was started; call reset first": lambda: parallel_env().state(),
-    "describe_world: no episode was started; call reset first": lambda: eb.EthBrakeEnv().describe_world(),
-    "describe_worlds: no episode was started; call reset first": lambda: eb.make_sb3_vec_env(
+    "state: no episode has started; call reset first": lambda: parallel_env().state(),
+    "describe_world: no episode has started; call reset first": lambda: eb.EthBrakeEnv().describe_world(),
+    "describe_worlds: no episode has started; call reset first": lambda: eb.make_sb3_vec_env(
         PAPER, 4
     ).describe_worlds(),
-    "scenario 'five' has 0 learners (none); this environment needs exactly one: pass": lambda: eb.EthBrakeVectorEnv(
-        2, FIVE, learners=[]
+    "scenario 'five' has 0 learners (none); this environment needs exactly one learner: pass": lambda: (
+        eb.EthBrakeVectorEnv(2, FIVE, learners=[])
     ),
     "scenario 'paper-random' has no learner; pass learners=['vehicle_2']": lambda: eb.make_sb3_vec_env(
         PAPER, 2, learners=[]
@@ -69,11 +77,11 @@ MADE: dict[str, Callable[[], object]] = {
     "reset: seed = -1: must be None or a whole number, at least 0": lambda: eb.make_sb3_vec_env(PAPER, 1, seed=-1),
     "appended = 'x': must be number or state, or None": lambda: eb.make_sb3_vec_env(FIVE, 3, appended="x"),
     "step: no episode is running; call reset first": lambda: eb.make_sb3_vec_env(PAPER, 2).step_wait(),
-    "set_attr: indices 0; rows share one batch, so leave indices out": lambda: eb.make_sb3_vec_env(PAPER, 3).set_attr(
-        "label", 8, indices=0
+    "set_attr: indices = 0: must not be passed, because all rows belong to one environment": lambda: (
+        eb.make_sb3_vec_env(PAPER, 3).set_attr("label", 8, indices=0)
     ),
-    "ShieldedVectorEnv: goes around gymnasium.make_vec('EthBrake-v0')": lambda: eb.ShieldedVectorEnv(parallel_env()),
-    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, here learners": lambda: (
+    "must be an environment made by gymnasium.make_vec('EthBrake-v0')": lambda: eb.ShieldedVectorEnv(parallel_env()),
+    "observation: vehicle_2 and vehicle_3 of 'five' observe different features, but here all learners": lambda: (
         eb.make_sb3_vec_env(FIVE, 3, learners=PAIR, observation={"vehicle_3": ["own"]})
     ),
     "observe_all: vehicle_2, vehicle_3 observe different features; use observe for each": lambda: eb.make_engine(
@@ -86,7 +94,7 @@ MADE: dict[str, Callable[[], object]] = {
         PAPER.replace(observation={"vehicle_2": ["own", "own.speed"]})
     ),
     "scenario 'paper-random': observation = {}: must be a list of groups": lambda: PAPER.replace(observation={}),
-    "observe different features, here learners must observe the same: give one list for all": lambda: eb.train(
+    "observe different features, but here all learners must observe the same features; give one list": lambda: eb.train(
         "cooperation-ppo", FIVE.with_learners(PAIR).replace(observation={"vehicle_2": ["own"]}), "run", scheme="shared"
     ),
 }
@@ -99,22 +107,24 @@ def test_environment__is_not_made_or_asked_so(message: str) -> None:
 
 
 STEPS: dict[str, Callable[[], object]] = {
-    "step: no action for the learner vehicle_2": lambda: started(parallel_env(FIVE, learners=PAIR)).step(
+    "step: the action of learner vehicle_2 is missing": lambda: started(parallel_env(FIVE, learners=PAIR)).step(
         {"vehicle_3": [0.0]}
     ),
-    "action of vehicle_3: nan; must be in [-1, 1], from full braking to full driving": lambda: started(
+    "action of vehicle_3: nan; must be from -1 (full braking) to 1 (full driving)": lambda: started(
         parallel_env(FIVE, learners=PAIR)
     ).step({"vehicle_2": [0.0], "vehicle_3": [np.nan]}),
-    "action of vehicle_3: -1.01; must be in [-1, 1], from full braking to full driving": lambda: started(
+    "action of vehicle_3: -1.01; must be from -1 (full braking) to 1 (full driving)": lambda: started(
         parallel_env(FIVE, learners=PAIR)
     ).step({"vehicle_2": [0.0], "vehicle_3": [-1.01]}),
-    "step: actions = None: must be a mapping such as {'vehicle_2': [-1.0]}": lambda: started(parallel_env()).step(None),
+    "step: actions = None: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}": lambda: started(
+        parallel_env()
+    ).step(None),
     "reset: options = 5: must be None or a mapping": lambda: parallel_env().reset(options=5),
-    "reset: listed_world = 3: must name a world of a list, for instance {'seed': 7, 'number': 3}": lambda: (
-        eb.EthBrakeEnv().reset(options={"listed_world": 3})
+    "reset: listed_world = 3: must be seed and number of a world in an evaluation list": lambda: eb.EthBrakeEnv().reset(
+        options={"listed_world": 3}
     ),
-    "reset: listed_world = {'seed': 7}: must name a world of a list": lambda: eb.EthBrakeEnv().reset(
-        options={"listed_world": {"seed": 7}}
+    "reset: listed_world = {'seed': 7}: must be seed and number of a world in an evaluation": lambda: (
+        eb.EthBrakeEnv().reset(options={"listed_world": {"seed": 7}})
     ),
     "reset: listed_world: number = -1: must be a whole number, at least 0": lambda: eb.EthBrakeEnv().reset(
         options={"listed_world": {"seed": 7, "number": -1}}
@@ -122,26 +132,26 @@ STEPS: dict[str, Callable[[], object]] = {
     "reset: listed_world: seed = 0.5: must be a whole number, at least 0": lambda: eb.EthBrakeEnv().reset(
         options={"listed_world": {"seed": 0.5, "number": 40}}
     ),
-    "reset: initial_state and listed_world are both given; an episode has one start": lambda: eb.EthBrakeEnv().reset(
+    "reset: options has both initial_state and listed_world; pass only one of them": lambda: eb.EthBrakeEnv().reset(
         options={"listed_world": {"seed": 7, "number": 40}, "initial_state": {"gaps_m": 7}}
     ),
     "scenario 'paper-random' has 2 learners (vehicle_2, vehicle_3); this environment needs exactly one": lambda: (
         eb.EthBrakeEnv(PAPER, learners=PAIR)
     ),
-    "action of the learners: shape (3, 2); (3, 1) is needed": lambda: started(eb.EthBrakeVectorEnv(3)).step(
+    "action of the learners: has shape (3, 2); must have shape (3, 1)": lambda: started(eb.EthBrakeVectorEnv(3)).step(
         np.zeros((3, 2), np.float32)
     ),
-    "action of vehicle_2: nan; must be in [-1, 1], from full braking to full driving": lambda: started(
+    "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full driving)": lambda: started(
         eb.EthBrakeVectorEnv(2)
     ).step(np.full((2, 1), np.nan)),
-    "env_method: indices [1]; rows share one batch, so leave indices out": lambda: eb.make_sb3_vec_env(
-        PAPER, 3
-    ).env_method("seed", 4, indices=[1]),
+    "env_method: indices = [1]: must not be passed, because all rows belong to one environment": lambda: (
+        eb.make_sb3_vec_env(PAPER, 3).env_method("seed", 4, indices=[1])
+    ),
     "set_options: row 1 has {'initial_state': {'gaps_m': array([4.])}}": lambda: rows(FAR, NEAR, NEAR, NEAR).reset(),
-    "set_options: row 1 has {}; if one row has an initial_state, every row needs one, and the learners": lambda: rows(
+    "set_options: row 1 has {}; either all rows or no rows may have an initial_state": lambda: rows(
         FAR, {}, NEAR, NEAR
     ).reset(),
-    "set_options: 2 entries; one for each of 4 rows is needed": lambda: rows(FAR, FAR).reset(),
+    "set_options: the list has 2 entries: must have one for each of the 4 rows": lambda: rows(FAR, FAR).reset(),
 }
 
 
@@ -184,7 +194,7 @@ def test_step__needs_an_episode_that_runs() -> None:
     in_turn = started(eb.env(scenario=PAPER, agents="learners", max_cycles=1))
     for _ in in_turn.possible_agents:
         in_turn.step(np.zeros(1, np.float32))
-    with refused("step: the episode of vehicle_2 is over; only None may follow, or reset"):
+    with refused("step: the episode of vehicle_2 has ended; pass the action None, or call reset"):
         in_turn.step(np.zeros(1, np.float32))
 
 
@@ -194,18 +204,22 @@ def test_worlds__that_go_on_from_a_snapshot_are_not_described() -> None:
     start |= {"driving_capacity_mps2": 1, "latency_s": 0, "speed_limit_mps": 40}
     env.reset(options={"initial_state": start})
     env.engine.restore(env.engine.snapshot())
-    with refused("describe_worlds: these episodes go on from a snapshot, which does not keep worlds that were given"):
+    with refused(
+        "describe_worlds: the initial states of these worlds are not known, because the environment was restored"
+    ):
         env.describe_worlds()
 
 
 def test_world__that_was_left_out_is_not_described() -> None:
     env = started(eb.EthBrakeVectorEnv(2, "realistic-mixed"))
     env.engine.roster.numbers[1] = 40  # as if world 40 had been left out
-    with refused("describe_worlds: world 40 of seed 3 could not be advanced to its first decision"):
+    with refused(
+        "describe_worlds: row 1 is unknown, because the physics failed in world 40 of seed 3 before its first"
+    ):
         env.describe_worlds()
 
 
 def test_action__is_compared_after_the_rounding_of_float32() -> None:
     beyond = np.nextafter(np.float32(1), np.float32(2))
-    with refused("action of vehicle_2: 1.000000238418579; must be in [-1, 1], from full braking to full driving"):
+    with refused("action of vehicle_2: 1.000000238418579; must be from -1 (full braking) to 1 (full driving)"):
         started(eb.EthBrakeVectorEnv(2)).step(np.full((2, 1), np.nextafter(beyond, np.float32(2))))

@@ -109,7 +109,7 @@ def test_intervals__of_one_cluster_are_unknown() -> None:
     assert paired_difference(x, x[::-1], one).interval is None
     assert relative_decrease(x, x[::-1], one).interval is None
     assert share_of(x > 1.0, one).interval is None
-    with refused("statistics: 2 clusters of 3 values; one for each is needed", InvalidInput):
+    with refused("statistics: clusters has 2 entries for 3 values: must have one per value", InvalidInput):
         mean(x, one[:2])
 
 
@@ -207,12 +207,12 @@ def test_single_recording__has_no_interval_and_the_table_says_so() -> None:
     scenario = recorded(1)
     rows = eb.summarise(eb.evaluate(scenario.sample(50, 7), AGENTS, scenario=scenario))
     assert rows[0].total_harm.interval is None and rows[0].collision_rate.interval is None
-    assert "no 95 % intervals: all worlds are of one recording" in in_one_line(rows)
+    assert "no 95 % intervals: all worlds come from one recording" in in_one_line(rows)
     far = recorded(1, gaps_m=[9, 300], speeds_mps=[20, 20, 20], table={
         "columns": ["gap_1_m", "recording"], "rows": [[300.0, "a"]]
     })  # fmt: skip
     text = in_one_line(eb.summarise(eb.evaluate(far.sample(5, 7), AGENTS, scenario=far)))
-    assert "They are all of one recording, which says nothing about others." in text
+    assert "All worlds come from one recording, so nothing is known about other recordings." in text
 
 
 def test_rejected_rows__are_counted_below_the_table() -> None:
@@ -221,11 +221,11 @@ def test_rejected_rows__are_counted_below_the_table() -> None:
     table = {"columns": ["gap_1_m", "speed_1_mps", "speed_2_mps", "recording"], "rows": rows}
     scenario = recorded(1, latency_s=[0, 0.5, 0.8], table=table)
     sample = scenario.sample(400, 7)
-    again = f"Drawn again: {sample.rejected} of {sample.rejected + 400} draws ("
+    again = f"{sample.rejected} of {sample.rejected + 400} drawn worlds ("
     text = in_one_line(eb.summarise(eb.evaluate(sample, AGENTS, scenario=scenario)))
     assert again in text and 60 < sample.rejected < 140
     kept = scenario.replace(early_impacts="keep")
-    assert "Drawn again" not in str(eb.summarise(eb.evaluate(kept.sample(50, 7), AGENTS, scenario=kept)))
+    assert "drawn again" not in str(eb.summarise(eb.evaluate(kept.sample(50, 7), AGENTS, scenario=kept)))
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])

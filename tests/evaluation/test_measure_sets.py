@@ -135,5 +135,5 @@ def test_set__that_is_none_or_has_a_name_twice_is_refused(core_alone: None) -> N
     class Twice(MeasureSet):
         measures = (Measure("total_harm", lambda o, _: o.total_harm),)
 
-    with pytest.raises(AlreadyExists, match="another set has total_harm"):
+    with pytest.raises(AlreadyExists, match="another set already has measures with the names total_harm"):
         register_measure_set("twice", Twice())

@@ -193,7 +193,7 @@ def test_summarise__where_nobody_collided_a_bound_of_the_share_is_said_and_none_
         assert row.first_impact_harm == row.total_harm == Estimate(0.0, None)
         assert row.collision_rate.interval[1] >= 1.0 - 0.025 ** (1.0 / 500)  # Clopper-Pearson's
     assert rows.markdown().count("| 0.00 | 0.00 |") == 2
-    sentence = "No impact in 500 worlds: full_brake, coast. With 95 % confidence at most 0.76 % of all such worlds"
+    sentence = "No impact in 500 worlds: full_brake, coast. With 95 % confidence, at most 0.76 % of all such worlds"
     assert sentence in rows.markdown() and sentence in " ".join(str(rows).split())
     first = summarise(evaluate(load_scenario("paper-random").sample(500, 7), BRAKE, scenario="paper-random"))
     assert "No impact" not in first.markdown()
@@ -211,8 +211,8 @@ KNOWN = ("own sensors", "messages", "messages + true model", "true state", "not 
 def check_marked(text: str, share: float) -> None:
     assert all(words in text for words in (*SPECS, *KNOWN, "† messages + true model", "† true state"))
     assert "† messages |" not in text and "† own sensors" not in text
-    assert f"In {100 * share:.1f} % of these worlds the channel hides something" in text
-    assert "† ppo+episode, e_v2x_bm:pairwise: sees the line as it is" in text
+    assert f"In {100 * share:.1f} % of these worlds the V2X channel hides something" in text
+    assert "† ppo+episode, e_v2x_bm:pairwise: reads hidden values nevertheless" in text
     assert "These agents do not state what they know: mine." in text
 
 

@@ -54,58 +54,60 @@ class Confused:
 
 
 EVALUATIONS: dict[str, Callable[[], object]] = {
-    "evaluate: no agents; at least one": lambda: eb.evaluate(WORLDS, {}, scenario=PAPER),
+    "evaluate: agents is empty; pass at least one agent, for instance": lambda: eb.evaluate(WORLDS, {}, scenario=PAPER),
     "evaluate: chunk = 0: must be a whole number, at least 1": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER, chunk=0
     ),
     "evaluate: chunk = 2.5: must be a whole number, at least 1": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER, chunk=2.5
     ),
-    "vehicle = 3: must be a name or an index from 0 to 2": lambda: eb.evaluate(
+    "vehicle = 3: must be the name of a vehicle, or an index from 0 to 2": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER, vehicle=3
     ),
-    "scenario 'paper-random' has 0 learners (none); say which vehicle the agents drive": lambda: eb.evaluate(
-        WORLDS, BRAKE, scenario=PAPER.replace(roles={}, early_impacts="keep")
+    "scenario 'paper-random' has 0 learners (none); name the vehicle that the agents drive, for instance": lambda: (
+        eb.evaluate(WORLDS, BRAKE, scenario=PAPER.replace(roles={}, early_impacts="keep"))
     ),
-    "scenario 'paper-random': its learners are vehicle_2, vehicle_3, but only vehicle_2 is controlled": lambda: (
+    "scenario 'paper-random' has the learners vehicle_2, vehicle_3, but vehicle = vehicle_2 is the only": lambda: (
         eb.evaluate(WORLDS, BRAKE, scenario=PAPER.with_learners([1, 2]), vehicle=1)
     ),
-    "reset: 3 worlds of 3 vehicles are given; 3 of 4 vehicles needed": lambda: eb.evaluate(
+    "reset: got 3 worlds of 3 vehicles; 3 worlds of 4 vehicles must be passed": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=FOUR
     ),
-    "evaluate: worlds: there are none; at least one is needed": lambda: eb.evaluate(
+    "evaluate: worlds is empty; pass at least one world": lambda: eb.evaluate(
         WORLDS.take(np.arange(0)), BRAKE, scenario=PAPER
     ),
     "reset: world 0 is at 0.1 s; episodes start at the alert, t = 0, without any impact": lambda: eb.evaluate(
         advance(WORLDS, -WORLDS.vehicles.braking_capacity_mps2, until_s=0.1)[0], BRAKE, scenario=PAPER
     ),
-    "must be worlds or a sample, as scenario.sample(n, seed) gives": lambda: eb.evaluate(5, BRAKE, scenario=PAPER),
+    "must be Worlds or a Sample, for instance scenario.sample(100, seed=7)": lambda: eb.evaluate(
+        5, BRAKE, scenario=PAPER
+    ),
     "must be specs such as 'full_brake,ppo', or a mapping": lambda: eb.evaluate(WORLDS, 5, scenario=PAPER),
     "agent 5: must be name or name:argument": lambda: eb.evaluate(agents=[5], scenario=PAPER, episodes=2),
-    "worlds were passed too; leave one of the two out": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER, episodes=2),
+    "worlds or episodes, not both": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER, episodes=2),
     "number of worlds = 0: must be a whole number, at least 1": lambda: eb.evaluate(
         agents="coast", scenario=PAPER, episodes=0
     ),
-    "evaluate: agent 'a': 'str' is no agent: it has no name and no act; make_agent(name) makes one": lambda: (
+    "evaluate: agent 'a': 'str' is not an agent, because it has no name and no act; to make an agent": lambda: (
         eb.evaluate(WORLDS, {"a": "full_brake"}, scenario=PAPER)
     ),
-    "agent 'confused': predicted_harm is float64 of shape (3, 2); one number per world, (3,), is needed": lambda: (
+    "agent 'confused': predicted_harm in its memory has type float64 and shape (3, 2); must be one": lambda: (
         eb.evaluate(WORLDS, {"x": Confused((3, 2))}, scenario=PAPER)
     ),
     "agent 'confused' of vehicle_2: memory: ndarray of shape (2,); its first axis must be the 3 worlds": lambda: (
         eb.evaluate(WORLDS, {"x": Confused((2,))}, scenario=PAPER)
     ),
-    "agent 'ppo' was not evaluated; evaluated: full_brake": lambda: eb.evaluate(WORLDS, BRAKE, scenario=PAPER).outcome(
-        "ppo"
-    ),
-    "x.csv: is no file of --per-world: 'agent'": lambda: read_harms(Path("x.csv"), b"a,b\n1,2\n"),
-    "x.csv: is no file of --per-world: invalid literal for int() with base 10: 'x'": lambda: read_harms(
+    "agent 'ppo' was not evaluated; evaluated agents: full_brake": lambda: eb.evaluate(
+        WORLDS, BRAKE, scenario=PAPER
+    ).outcome("ppo"),
+    "x.csv: is not a file that --per-world wrote: 'agent'": lambda: read_harms(Path("x.csv"), b"a,b\n1,2\n"),
+    "x.csv: is not a file that --per-world wrote: invalid literal for int() with base 10: 'x'": lambda: read_harms(
         Path("x.csv"), f"{HEAD}a,x,1,1\n".encode()
     ),
-    "x.csv: is no file of --per-world: world 1: harm ['nan', '1']": lambda: read_harms(
+    "x.csv: is not a file that --per-world wrote: world 1 has the invalid harms ['nan',": lambda: read_harms(
         Path("x.csv"), f"{HEAD}a,1,nan,1\n".encode()
     ),
-    "x.csv: is no file of --per-world: world 1: harm ['1', '1e300']": lambda: read_harms(
+    "x.csv: is not a file that --per-world wrote: world 1 has the invalid harms ['1',": lambda: read_harms(
         Path("x.csv"), f"{HEAD}a,1,1,1e300\n".encode()
     ),
 }
@@ -135,7 +137,7 @@ def test_name__is_unknown(message: str) -> None:
 
 
 def test_groups__are_those_of_a_mixture_or_of_vehicle_types() -> None:
-    with refused("by 'scenario': these worlds have no groups; those of a mixture have scenario"):
+    with refused("by = 'scenario': these worlds have no groups; worlds of a mixture can be grouped by 'scenario',"):
         eb.summarise_by(eb.evaluate(WORLDS, BRAKE, scenario=PAPER), "scenario")
     mixed = eb.load_scenario("realistic-mixed")
     with refused("unknown group 'vehicle_9_type'; did you mean 'vehicle_3_type'?", UnknownName):
@@ -165,21 +167,25 @@ def row(**changes: Any) -> dict[str, Any]:
 
 
 RESULTS: dict[str, Callable[[], object]] = {
-    "x.json: is no JSON, or was not written to its end: Expecting value: line 1 column 2 (char 1)": lambda: result("["),
-    "x.json: is no results file, as ethbrake evaluate --json prints one (kind is missing)": lambda: result("{}"),
-    "x.json: is no results file, as ethbrake evaluate --json prints one": lambda: result("3"),
+    "x.json: is not JSON, or is incomplete: Expecting value: line 1 column 2 (char 1)": lambda: result("["),
+    "x.json: is not a results file of ethbrake evaluate --json (kind is missing)": lambda: result("{}"),
+    "x.json: is not a results file of ethbrake evaluate --json": lambda: result("3"),
     "x.json: unknown kind of results 'evalute'; did you mean 'evaluate'?": lambda: result('[{"kind": "evalute"}]'),
-    "x.json: results of best-harm cannot be compared; those of evaluate": lambda: result('{"kind": "best-harm"}'),
-    "x.json: agents is missing or no list of objects: it is not whole": lambda: result(
+    "x.json: results of the kind best-harm cannot be compared; results of evaluate and shield": lambda: result(
+        '{"kind": "best-harm"}'
+    ),
+    "x.json: agents is missing or not a list of objects; the file is incomplete": lambda: result(
         '{"kind": "evaluate", "seed": 7}'
     ),
-    "x.json: worlds_sha256 is missing or no str: evaluate again": lambda: result(
+    "x.json: worlds_sha256 is missing or not of type str; run ethbrake evaluate again": lambda: result(
         '[{"kind": "evaluate", "agent": "x", "episodes": 3}]'
     ),
-    "x.json: full_brake: first_impact_harm is no mean with an interval [low": lambda: result([row(episodes=1)]),
+    "x.json: full_brake: first_impact_harm = 27.178703352274425, first_impact_harm_interval = [0.0,": lambda: result(
+        [row(episodes=1)]
+    ),
     "x.json: full_brake: episodes = 0: must be 1 to 1,000,000,000,000": lambda: result([row(episodes=0)]),
     "x.json: full_brake: episodes = True: must be 1 to 1,000,000,000,000": lambda: result([row(episodes=True)]),
-    "x.json: full_brake stands in it twice": lambda: result([row(), row()]),
+    "x.json: lists the agent full_brake twice; evaluate each agent once": lambda: result([row(), row()]),
 }
 
 
@@ -205,19 +211,19 @@ def test_results_file__is_refused(message: str) -> None:
     ids=lambda changes: str(changes)[:40],
 )
 def test_results_file__has_means_inside_their_intervals(changes: dict[str, Any], empty_folder: Path) -> None:
-    with refused("x.json: full_brake: total_harm is no mean with an interval [low, high] around it"):
+    with refused(": must be a mean harm, and an interval [low, high] that contains the mean"):
         result([row(**changes)])
 
 
 @pytest.mark.parametrize(
     ("key", "message"),
     [
-        ("scenario_sha256", "is about another scenario than x.json"),
-        ("worlds_sha256", "is about another list of worlds"),
+        ("scenario_sha256", "cannot be compared: their scenarios differ"),
+        ("worlds_sha256", "cannot be compared: their worlds differ"),
     ],
 )
 def test_results__of_something_else_are_not_compared(key: str, message: str, empty_folder: Path) -> None:
-    with refused(f"x.json: {message}"):
+    with refused(f"x.json and x.json {message}"):
         compare_results(result([row()]), result([row(**{key: "0" * 64})]))
 
 
@@ -229,7 +235,9 @@ def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_
     (told,) = json.loads(Path("a/results.json").read_text())
     changed = {**told, "first_impact_harm": 3.0, "first_impact_harm_interval": [2.0, 4.0]}
     Path("a/x.json").write_text(json.dumps([changed]))
-    with refused("a/x.json: full_brake: first_impact_harm = 3, but the mean of its worlds is 27.1787"):
+    with refused(
+        "a/x.json: full_brake: first_impact_harm = 3, but the mean over the worlds in the file with one row per"
+    ):
         compare_results(read_result(Path("a/results.json")), read_result(Path("a/x.json")))
 
 
@@ -238,32 +246,44 @@ def test_results__whose_mean_is_not_that_of_their_worlds_are_not_compared(empty_
 
 @pytest.mark.parametrize("sample_s", [0.0, nan, inf])
 def test_record__is_of_one_world_at_a_positive_time(sample_s: float) -> None:
-    with refused("record_episode: 3 worlds; exactly 1 is needed, for instance worlds.take([0])"):
+    with refused("record_episode: world has 3 worlds; pass exactly 1, for instance worlds.take([0])"):
         eb.record_episode(WORLDS, BRAKE["full_brake"], scenario=PAPER)
-    with refused(f"record_episode: sample_s = {sample_s}; must be finite and above 0"):
+    with refused(f"record_episode: sample_s = {sample_s}: must be a finite number of seconds above 0"):
         eb.record_episode(WORLDS.take([0]), BRAKE["full_brake"], scenario=PAPER, sample_s=sample_s)
 
 
 STATISTICS: dict[str, Callable[[], object]] = {
-    "exact sum: shape (1,); finite numbers, as [n], are needed": lambda: exact_sum(np.array([nan])),
-    "exact sum: shape (1, 1); finite numbers, as [n], are needed": lambda: exact_sum(np.array([[1.0]])),
-    "rate: -1 of 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(-1, 10),
-    "rate: 11 of 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(11, 10),
-    "rate: 0 of 0: must be 0 <= successes <= count, and count at least 1": lambda: rate(0, 0),
-    "statistics: shape (0,); at least one finite number per world is needed, as [n]": lambda: mean(np.array([])),
-    "statistics: shape (2,); at least one finite number per world is needed": lambda: mean(np.array([1.0, nan])),
-    "statistics: 3 values cannot be paired with 2 of the baseline": lambda: paired_difference(np.zeros(3), np.zeros(2)),
-    "interquartile_mean: no tasks; at least one list of figures is needed": lambda: interquartile_mean([]),
-    "interquartile_mean: task 0: shape (0,); at least one finite number per seed": lambda: interquartile_mean([[]]),
-    "interquartile_mean: task 0: shape (2,); at least one finite number": lambda: interquartile_mean([[1.0, nan]]),
-    "mean_over_seeds: shapes (1, 2) and (1, 3): must be [seeds, worlds] with the same worlds": lambda: mean_over_seeds(
-        [[1.0, 2.0]], [[1.0, 2.0, 3.0]]
+    "exact sum: values of shape (1,): must be finite numbers of shape [n]": lambda: exact_sum(np.array([nan])),
+    "exact sum: values of shape (1, 1): must be finite numbers of shape [n]": lambda: exact_sum(np.array([[1.0]])),
+    "rate: successes = -1, count = 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(-1, 10),
+    "rate: successes = 11, count = 10: must be 0 <= successes <= count, and count at least 1": lambda: rate(11, 10),
+    "rate: successes = 0, count = 0: must be 0 <= successes <= count, and count at least 1": lambda: rate(0, 0),
+    "statistics: values of shape (0,): must be one finite number per world, shape [n] with n at least 1": lambda: mean(
+        np.array([])
     ),
-    "mean_over_seeds: every harm must be finite": lambda: mean_over_seeds([[inf, 1.0, 2.0]], [[1.0, 2.0, 3.0]]),
-    "mean_over_seeds: shapes (1, 1, 3) and (1, 3): must be [seeds, worlds] with the same worlds": lambda: (
+    "statistics: values of shape (2,): must be one finite number per world, shape [n] with n at": lambda: mean(
+        np.array([1.0, nan])
+    ),
+    "statistics: 3 values and 2 values of the baseline: must be equally many": lambda: paired_difference(
+        np.zeros(3), np.zeros(2)
+    ),
+    "interquartile_mean: tasks is empty; pass the results of at least one task": lambda: interquartile_mean([]),
+    "interquartile_mean: task 0: values of shape (0,): must be one finite number per seed, shape [n]": lambda: (
+        interquartile_mean([[]])
+    ),
+    "interquartile_mean: task 0: values of shape (2,): must be one finite number per seed,": lambda: interquartile_mean(
+        [[1.0, nan]]
+    ),
+    "mean_over_seeds: the arrays have the shapes (1, 2) and (1, 3): must be [seeds, worlds] with the same": lambda: (
+        mean_over_seeds([[1.0, 2.0]], [[1.0, 2.0, 3.0]])
+    ),
+    "mean_over_seeds: some values are NaN or infinite: all values must be finite": lambda: mean_over_seeds(
+        [[inf, 1.0, 2.0]], [[1.0, 2.0, 3.0]]
+    ),
+    "mean_over_seeds: the arrays have the shapes (1, 1, 3) and (1, 3): must be [seeds, worlds] with the same": lambda: (
         mean_over_seeds([[[1.0, 2.0, 3.0]]], [[1.0, 2.0, 3.0]])
     ),
-    "share_over_seeds: shapes (2, 200) and (1, 200) and (1, 5): must be [seeds, worlds] with the same": lambda: (
+    "share_over_seeds: the arrays have the shapes (2, 200) and (1, 200) and (1, 5): must be [seeds, worlds]": lambda: (
         share_over_seeds(np.ones((2, 200)), np.ones(200), np.zeros(5))
     ),
 }

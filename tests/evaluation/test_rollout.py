@@ -350,7 +350,7 @@ def test_policy__that_drives_beyond_what_it_was_trained_for_is_told_so_once(agen
 
 def check_beyond(agent: str, scenario: Scenario, beyond: str) -> None:
     with pytest.warns(
-        Unfamiliar, match=f"{agent.partition('+')[0]}.*, and not for what {scenario.name} has: {beyond}$"
+        Unfamiliar, match=f"{agent.partition('+')[0]}.*, but {scenario.name} differs from it: {beyond}$"
     ) as told:
         evaluate(None, [agent], scenario=scenario, episodes=50, vehicle=None)
     assert len(told) == 1
@@ -424,7 +424,7 @@ def test_figures__are_the_same_bits_from_two_processes(paper_random: Scenario) -
 def test_worker__of_other_measures_is_refused(paper_random: Scenario, monkeypatch) -> None:
     monkeypatch.setitem(REPORTED, "here_alone", REPORTED.get("here_alone"))
     lineup = Lineup.of(("full_brake",), paper_random)
-    with pytest.raises(InvalidInput, match="a worker has other policies, measures or versions than the process"):
+    with pytest.raises(InvalidInput, match="a worker process has other policies, measures or package"):
         tally_list(lineup, 6_000, 5, jobs=2)
 
 
@@ -439,7 +439,7 @@ def test_lineup__tells_the_measures_of_its_time_in_every_process(paper_random: S
     assert found[0] == set() and found[1] == found[2] and "injury_lr4s" in found[1]
     REPORTED.clear()  # as in a worker, which makes them in whatever order
     for lineup, expected in zip((before, *after, before), (*found, found[0]), strict=True):
-        monkeypatch.setattr(chunks, "_MADE", {})
+        monkeypatch.setattr(chunks, "_BUILT", {})
         assert told(lineup) == expected
 
 
@@ -455,9 +455,9 @@ def test_worker__needs_the_packages_and_files_of_the_process_that_asks_and_no_ot
     lineup = Lineup.of((failing(9.0) if other == "file" else "full_brake",), paper_random)
     monkeypatch.setattr(registry, "_VERSIONS", {})
     monkeypatch.setattr(python_file, "_RUN", {})
-    monkeypatch.setattr(chunks, "_MADE", {})
+    monkeypatch.setattr(chunks, "_BUILT", {})
     (tmp_path / "failing.py").write_text(f"{FAILING}# changed")
-    with pytest.raises(InvalidInput, match="a worker has other policies") if other else nullcontext():
+    with pytest.raises(InvalidInput, match="a worker process has other policies") if other else nullcontext():
         lineup.make()
 
 

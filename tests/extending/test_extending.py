@@ -194,8 +194,14 @@ def test_term__built_in_is_counted_as_soon_as_it_has_a_weight(name: str) -> None
         (lambda step: np.array([0.0, 0.0, np.nan]), "is nan in world 2 at step 1; must be finite"),
         (lambda step: step.speed_mps, r"at step 1: its function fails: AttributeError: .*test_extending.py, line \d+"),
         (lambda step: step.speeds_mps.fill(0.0), "read-only"),
-        (lambda step: np.zeros((3, 4)), r"at step 1: gave float64 of shape \(3, 4\); must be numbers of shape"),
-        (lambda step: np.zeros((3, 3)), "gave a number per vehicle; when it was registered it gave a number per world"),
+        (
+            lambda step: np.zeros((3, 4)),
+            r"at step 1: its function returned float64 of shape \(3, 4\); must return numbers",
+        ),
+        (
+            lambda step: np.zeros((3, 3)),
+            "its function returned a number per vehicle, but a number per world when it was",
+        ),
     ],
 )
 def test_term__that_is_wrong_is_named_and_the_step_is_not_made(later: Any, message: str) -> None:

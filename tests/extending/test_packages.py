@@ -131,7 +131,7 @@ def test_package__that_pip_installs_drives_measures_pays_and_commands(tmp_path: 
         return done.stdout
 
     assert (
-        "hello      From the installed package hills." in told("--help")
+        "hello      Command of the installed package hills." in told("--help")
         and told("hello", "you", "--loud") == "hello you!\n"
     )
     assert "gentle[:ARGUMENT]" in told("agent", "list") and "+softer[:ARGUMENT]" in told("agent", "list")
@@ -162,7 +162,7 @@ def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: 
     install(
         "hills", HILLS, agents=AGENTS, objectives={"front-first": "hills:front_first"}, commands={"hi": "hills:hello"}
     )
-    assert run_command(["--help"]) == 0 and "From the installed package hills." in capsys.readouterr().out
+    assert run_command(["--help"]) == 0 and "Command of the installed package hills." in capsys.readouterr().out
     assert "gentle" in eb.agent_names()
     assert eb.make_agent("full_brake").name == "full_brake" and "hills" not in sys.modules and not versions_used()
     assert eb.make_agent("gentle:0.8").share == 0.8  # type: ignore[union-attr]
@@ -216,10 +216,10 @@ def test_entry_point__without_a_part_of_its_name_is_named(install: Install) -> N
     more = "\nSEVERAL = {'other': make_gentle}\n"
     install("hills", HILLS + more, agents={"hills": "hills:SEVERAL", "itself": "circle:make"})
     install("circle", "import ethbrake_marl as eb\nmake = eb.make_agent('itself')\n")
-    with pytest.raises(InvalidInput, match="agent 'hills': stands for several of other names"):
+    with pytest.raises(InvalidInput, match="agent 'hills' is an entry point that defines parts with other names"):
         eb.make_agent("hills")
     assert eb.make_agent("other").name == "gentle"
-    with pytest.raises(InvalidInput, match=r"agent 'itself', .*: agent 'itself': is asked for while it is loaded"):
+    with pytest.raises(InvalidInput, match=r"agent 'itself', .*: agent 'itself' is looked up by its own module"):
         eb.make_agent("itself")
 
 
@@ -227,15 +227,21 @@ def test_name__that_two_packages_give_is_told_with_both(install: Install, capsys
     install("hills", HILLS, agents=AGENTS, commands={"evaluate": "hills:hello", "hey": "hills:hello"})
     agents = {"gentle": "valleys:make_gentle", "coast": "valleys:make_gentle"}
     install("valleys", HILLS, agents=agents, commands={"hey": "valleys:hello"})
-    both = "installed packages hills and valleys give it; uninstall all but one"
-    with pytest.raises(InvalidInput, match=f"agent 'gentle': the {both}"):
+    both = "several installed packages, hills and valleys; uninstall all but one"
+    with pytest.raises(InvalidInput, match=f"agent 'gentle' is defined by {both}"):
         eb.make_agent("gentle")
-    with pytest.raises(InvalidInput, match="agent 'coast': the installed packages ethbrake-marl and valleys give it"):
+    with pytest.raises(InvalidInput, match=r"agent 'coast' is defined by several .*, ethbrake-marl and valleys"):
         eb.make_agent("coast")
     assert eb.make_agent("full_brake").name == "full_brake"
-    assert run_command(["--help"]) == 0 and "From the installed packages hills and valleys." in capsys.readouterr().out
+    assert (
+        run_command(["--help"]) == 0
+        and "Command of the installed packages hills and valleys." in capsys.readouterr().out
+    )
     assert run_command(["evaluate", "--episodes", "3"]) == 2
-    assert "command 'evaluate': the installed packages ethbrake-marl and hills give it" in capsys.readouterr().err
+    assert (
+        "command 'evaluate' is defined by several installed packages, ethbrake-marl and hills"
+        in capsys.readouterr().err
+    )
     with pytest.raises(UnknownName, match="unknown agent 'gentel'; did you mean 'gentle'"):
         eb.make_agent("gentel")
 
@@ -281,5 +287,5 @@ def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) 
 
 def test_metadata__that_is_missing_is_what_an_unknown_name_tells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ethbrake_marl.registry.points", lambda group: {})
-    with pytest.raises(UnknownName, match="unknown agent 'mine': of the package ethbrake-marl no entry points are"):
+    with pytest.raises(UnknownName, match="unknown agent 'mine': no entry points of the package ethbrake-marl are"):
         eb.make_agent("mine")

@@ -35,10 +35,10 @@ NOTHING = gives(lambda episodes: np.zeros(episodes.worlds.n))
 
 PARTS: dict[str, Callable[[], object]] = {
     "reward: terms: unknown measure 'hury'": lambda: reward_params({"terms": {"hury": 1.0}}),
-    "feature 'front_1.gap': must be 1 to 64 of a-z, 0-9 and _, beginning with a letter": lambda: eb.register_feature(
-        "front_1.gap", TIME, **SCALED
+    "feature 'front_1.gap': the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a": lambda: (
+        eb.register_feature("front_1.gap", TIME, **SCALED)
     ),
-    "feature 'mine': needs a function with a docstring that says what it means": lambda: eb.register_feature(
+    "feature 'mine': must be a function with a docstring that describes the": lambda: eb.register_feature(
         "mine", 3, **SCALED
     ),
     "feature 'mine': scale = 0: must be above 0": lambda: eb.register_feature("mine", TIME, **SCALED | {"scale": 0.0}),
@@ -48,13 +48,13 @@ PARTS: dict[str, Callable[[], object]] = {
     "feature 'mine': high = nan: must be a finite number": lambda: eb.register_feature(
         "mine", TIME, **SCALED | {"high": float("nan")}
     ),
-    "of = 'both', unknown = 0: must be own, or neighbour (with any unknown)": lambda: eb.register_feature(
+    "of = 'both', unknown = 0: of must be own or neighbour; with own, unknown must be 0": lambda: eb.register_feature(
         "mine", TIME, **SCALED, of="both"
     ),
-    "of = 'own', unknown = 1: must be own, or neighbour (with any unknown)": lambda: eb.register_feature(
+    "of = 'own', unknown = 1: of must be own or neighbour; with own, unknown must be 0": lambda: eb.register_feature(
         "mine", TIME, **SCALED, unknown=1.0
     ),
-    "feature 'mine': gave float64 of shape (); must be numbers of shape (3,), one per world": lambda: (
+    "feature 'mine': its function returned float64 of shape (); must return numbers of shape (3,), one": lambda: (
         eb.register_feature("mine", gives(1.0), **SCALED)
     ),
     "feature 'mine': is nan for vehicle_1 in world 0 at 0 s; must be finite": lambda: eb.register_feature(
@@ -65,8 +65,8 @@ PARTS: dict[str, Callable[[], object]] = {
     ),
     "observation: own.speed is listed twice": lambda: eb.choose_observation(["own", "own.speed"]),
     "observation: must be a list of groups and features": lambda: eb.choose_observation([]),
-    "feature 'age' is of a neighbour: write front_1.age or rear_1.age": lambda: eb.choose_observation(["age"]),
-    "observation: 5: must be the name of a group or a feature": lambda: eb.choose_observation([5]),
+    "feature 'age' describes a neighbour; write front_1.age or rear_1.age": lambda: eb.choose_observation(["age"]),
+    "observation: 5: must be the name of a group or of a feature": lambda: eb.choose_observation([5]),
     "scenario 'paper-random': observation = [own, own.speed]: own.speed is listed twice": lambda: PAPER.replace(
         observation=["own", "own.speed"]
     ),
@@ -77,41 +77,43 @@ PARTS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': reward.rsik: unknown key; did you mean risk?": lambda: eb.load_recipe("ppo").replace(
         reward={"harm": 1.0, "rsik": 0.5}
     ),
-    "preset 'My preset': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: eb.register_preset(
-        "My preset", {}
+    "preset 'My preset': the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a": lambda: (
+        eb.register_preset("My preset", {})
     ),
-    "must be paper, clear, nominal, congested, blocked": lambda: eb.register_preset("mine", {"preset": "ruarl"}),
+    "must be a preset: paper, clear, nominal, congested, blocked or": lambda: eb.register_preset(
+        "mine", {"preset": "ruarl"}
+    ),
     "preset 'mine': los: unknown key; did you mean lost?": lambda: eb.register_preset("mine", {"los": 1}),
     "preset 'mine': lost = 2: must be less than or equal to 1": lambda: eb.register_preset(
         "mine", {"preset": "clear", "lost": 2.0}
     ),
-    "preset paper has no generated messages; leave it out": lambda: eb.register_preset("mine", {"loss_begins": 0.1}),
+    "preset paper generates no messages; leave it out": lambda: eb.register_preset("mine", {"loss_begins": 0.1}),
     "preset 'mine': settings = 'clear': must be a mapping such as {'lost'": lambda: eb.register_preset("mine", "clear"),
-    "objective 'Mine': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: eb.register_objective(
-        "Mine", gives(0.0)
+    "objective 'Mine': the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a": lambda: (
+        eb.register_objective("Mine", gives(0.0))
     ),
-    "objective 'mine': needs a function with a docstring that says what it is": lambda: eb.register_objective(
+    "objective 'mine': must be a function with a docstring that describes the objective": lambda: eb.register_objective(
         "mine", 3
     ),
-    "measure 'Squared': must be 1 to 64 of a-z, 0-9 and _, beginning with a letter, not ending in _": lambda: (
+    "measure 'Squared': the name must be 1 to 64 characters a-z, 0-9 and _, begin with a letter, and not end": lambda: (
         eb.register_measure("Squared", NOTHING, unit="1")
     ),
-    "measure 'delta_v_2': must be 1 to 64 of a-z, 0-9 and _, beginning with a letter, not ending in _": lambda: (
+    "measure 'delta_v_2': the name must be 1 to 64 characters a-z, 0-9 and _, begin with a letter, and not": lambda: (
         eb.register_measure("delta_v_2", NOTHING, unit="1")
     ),
-    "measure 'delta_v_interval': must be 1 to 64 of a-z, 0-9 and _, beginning with a letter": lambda: (
+    "measure 'delta_v_interval': the name must be 1 to 64 characters a-z, 0-9 and _, begin with a": lambda: (
         eb.register_measure("delta_v_interval", NOTHING, unit="1")
     ),
-    "measure 'mine': needs a function with a docstring that says what it is": lambda: eb.register_measure(
+    "measure 'mine': must be a function with a docstring that describes the measure": lambda: eb.register_measure(
         "mine", 3, unit="1"
     ),
-    "gave float64 of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle": lambda: (
+    "its function returned float64 of shape (); must return numbers of shape (2,), one per world or (2, 3)": lambda: (
         eb.register_measure("mine", gives(1.0), unit="1")
     ),
     "measure 'mine': is nan in world 0; must be finite": lambda: eb.register_measure(
         "mine", gives(lambda episodes: np.full(episodes.worlds.n, np.nan)), unit="1"
     ),
-    "gave object of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle": lambda: (
+    "its function returned object of shape (); must return numbers of shape (2,), one per world or (2, 3)": lambda: (
         eb.register_measure(
             "mine", gives(lambda episodes: np.ma.masked_array(np.zeros(episodes.worlds.n), True)), unit="1"
         )
@@ -119,7 +121,7 @@ PARTS: dict[str, Callable[[], object]] = {
     "measure 'mine': its function fails: ValueError: assignment destination is read-only": lambda: eb.register_measure(
         "mine", gives(lambda episodes: episodes.rows.closing_speed_mps.fill(0.0)), unit="1"
     ),
-    "scenarios 'nowhere': there is no such folder": lambda: eb.register_scenarios("nowhere"),
+    "scenarios 'nowhere': does not exist": lambda: eb.register_scenarios("nowhere"),
 }
 
 
@@ -130,18 +132,20 @@ def test_part__is_refused(message: str) -> None:
 
 
 THERE: dict[str, Callable[[], object]] = {
-    "feature 'own' is registered already; give another name": lambda: eb.register_feature("own", TIME, **SCALED),
-    "feature 'front_1' is registered already; give another name": lambda: eb.register_feature(
+    "feature 'own': this name is already in use; give another name": lambda: eb.register_feature("own", TIME, **SCALED),
+    "feature 'front_1': this name is already in use; give another name": lambda: eb.register_feature(
         "front_1", TIME, **SCALED
     ),
-    "feature 'gap' is registered already; give another name": lambda: eb.register_feature("gap", TIME, **SCALED),
-    "measure 'jerk' is registered already; give another name": lambda: eb.register_measure("jerk", NOTHING),
-    "measure 'k_energy' is registered already; give another name": lambda: eb.register_measure("k_energy", NOTHING),
-    "preset 'nominal' is registered already; give another name": lambda: eb.register_preset(
+    "feature 'gap': this name is already in use; give another name": lambda: eb.register_feature("gap", TIME, **SCALED),
+    "measure 'jerk': this name is already in use; give another name": lambda: eb.register_measure("jerk", NOTHING),
+    "measure 'k_energy': this name is already in use; give another name": lambda: eb.register_measure(
+        "k_energy", NOTHING
+    ),
+    "preset 'nominal': another channel is already registered under this": lambda: eb.register_preset(
         "nominal", {"lost": 0.1, "preset": "clear"}
     ),
     "objective 'own' is registered already; give another name": lambda: eb.register_objective("own", gives(0.0)),
-    "agent 'ladder': stands for several agents in --agents; give another name": lambda: eb.register_agent(
+    "agent 'ladder': is the name of a group of agents; choose another name": lambda: eb.register_agent(
         "ladder", gives(None)
     ),
 }
@@ -178,7 +182,7 @@ def test_name__is_unknown(message: str) -> None:
     ids=["feature", "measure by step", "objective", "measure by impacts"],
 )
 def test_part__needs_a_docstring_and_a_name_that_no_other_part_has(register: Callable[[Any], None]) -> None:
-    with refused(" 'mine': needs a function with a docstring that says what it"):
+    with refused(" 'mine': must be a function with a docstring that describes the"):
         register(lambda *given: given[0])
     ours = gives(lambda first: np.zeros(len(first.time_s) if hasattr(first, "time_s") else first.worlds.n))
     register(ours)
@@ -197,12 +201,18 @@ def started(reward: dict[str, Any]) -> Any:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (lambda step: step.speeds_mps[:, :1], "gave float64 of shape (2, 1); must be numbers of shape (2,), one per"),
+        (
+            lambda step: step.speeds_mps[:, :1],
+            "its function returned float64 of shape (2, 1); must return numbers of shape",
+        ),
         (
             "no",
-            "gave <U2 of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle or (2, 2)",
+            "its function returned <U2 of shape (); must return numbers of shape (2,), one per world or (2, 3), one",
         ),
-        (None, "gave object of shape (); must be numbers of shape (2,), one per world or (2, 3), one per vehicle"),
+        (
+            None,
+            "its function returned object of shape (); must return numbers of shape (2,), one per world or (2, 3), one",
+        ),
         (lambda step: np.full(len(step.time_s), np.nan), "is nan in world 0; must be finite"),
         (lambda step: np.full(step.speeds_mps.shape, np.inf), "is inf for vehicle_1 in world 0; must be finite"),
         (lambda step: step.speed_mps, "its function fails: AttributeError: 'StepOutcome' object has no attribute"),
@@ -218,9 +228,9 @@ def test_measure_by_step__gives_a_finite_number_per_vehicle(given: Any, message:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (1.0, "gave float64 of shape (); must be numbers of shape (1,), one per world"),
-        (lambda harm: np.full(len(harm.whole), np.nan), "gave nan for vehicle_1 in world 0; must be finite"),
-        (lambda harm: harm.borne.fill(0.0), "of vehicle_1: ValueError: assignment destination is read-only"),
+        (1.0, "its function returned float64 of shape (); must return numbers of shape (1,), one"),
+        (lambda harm: np.full(len(harm.whole), np.nan), "its function returned nan for vehicle_1 in world 0; must be"),
+        (lambda harm: harm.borne.fill(0.0), "its function fails for vehicle_1: ValueError: assignment destination is"),
     ],
     ids=["shape", "nan", "writes"],
 )
@@ -251,9 +261,9 @@ def test_feature__that_is_not_finite_later_is_told_with_its_world_and_step() -> 
 @pytest.mark.parametrize(
     ("urgency", "message"),
     [
-        (None, "observes 'urgency', which is not registered; install the package that gives it"),
-        ((1.0, 3.0), "observes 'urgency', whose scale was 2.0 when it was trained and is 3.0 now"),
-        ((1.001, 2.0), "observes 'urgency', whose function gives other numbers than when it was trained"),
+        (None, "observes 'urgency', which is not registered; install the package that registers"),
+        ((1.0, 3.0), "observes 'urgency', whose scale was 2.0 in training and is 3.0 now"),
+        ((1.001, 2.0), "observes 'urgency', whose function returns other numbers than in training"),
     ],
     ids=["missing", "other scale", "other numbers"],
 )
@@ -272,21 +282,23 @@ def test_policy__observes_the_features_that_it_was_trained_on(urgency: Any, mess
 
 def test_channel__of_the_user_is_checked_and_listed_as_ours() -> None:
     eb.register_preset("wired", {"preset": "nominal", "link_latency_s": 0.4})
-    with refused("v2x.radio_s = 0.1: a fixed link_latency_s has no generated messages; leave it out"):
+    with refused("v2x.radio_s = 0.1: has no effect, because link_latency_s fixes the delay of messages"):
         PAPER.replace(v2x={"preset": "wired", "radio_s": 0.1})
-    with refused("v2x.preset = wierd: must be paper, clear, nominal, congested, blocked, sensors-only or wired"):
+    with refused(
+        "v2x.preset = wierd: must be a preset: paper, clear, nominal, congested, blocked, sensors-only or wired"
+    ):
         PAPER.replace(v2x="wierd")
 
 
 @pytest.mark.parametrize(
     ("few", "kind"),
-    [(lambda n: np.zeros(n, bool), "truth per world"), (lambda n: np.zeros((n, 3)), "number per vehicle")],
+    [(lambda n: np.zeros(n, bool), "truth value per world"), (lambda n: np.zeros((n, 3)), "number per vehicle")],
     ids=["truth", "number per vehicle"],
 )
 def test_measure__always_gives_what_it_gave_when_it_was_registered(few: Any, kind: str) -> None:
     changes = gives(lambda episodes: few(episodes.worlds.n) if episodes.worlds.n < 10 else np.zeros(episodes.worlds.n))
     eb.register_measure("mine", changes, unit="1")
-    with refused(f"measure 'mine': gave a number per world; when it was registered it gave a {kind}"):
+    with refused(f"measure 'mine': its function returned a number per world, but a {kind} when it was registered"):
         eb.evaluate(PAPER.sample(40, 7), {"full_brake": eb.make_agent("full_brake")}, scenario=PAPER)
 
 
@@ -299,18 +311,22 @@ def folder(name: str, *scenarios: str) -> None:
 
 def test_folder_of_scenarios__has_some_and_names_of_its_own(empty_folder: Path) -> None:
     folder("empty")
-    with refused("scenarios 'empty': no file in it ends in .yaml"):
+    with refused("scenarios 'empty': has no file that ends in .yaml"):
         eb.register_scenarios("empty")
     folder("shipped", "paper-random")
-    with refused("shipped/paper-random.yaml: a shipped scenario has the name 'paper-random' already", AlreadyExists):
+    with refused(
+        "shipped/paper-random.yaml: a shipped scenario already has the name 'paper-random'; rename", AlreadyExists
+    ):
         eb.register_scenarios("shipped")
     folder("mine", "hills", "valleys")
     folder("twin", "hills")
     eb.register_scenarios("mine")
-    with refused("mine/hills.yaml has the name 'hills' already; give the file another one", AlreadyExists):
+    with refused("mine/hills.yaml already has the name 'hills'; rename the file", AlreadyExists):
         eb.register_scenarios("twin")
     with refused("unknown scenario 'valley'; did you mean 'valleys'?", UnknownName):
         eb.load_scenario("valley")
     Path("mine", "valleys.yaml").write_text("name: valleys\n")
-    with refused("mine/valleys.yaml: braking_capacity_mps2: missing; the largest deceleration of each vehicle"):
+    with refused(
+        "mine/valleys.yaml: braking_capacity_mps2: missing; write, for instance, braking_capacity_mps2: [6, 7"
+    ):
         eb.load_scenario("valleys")

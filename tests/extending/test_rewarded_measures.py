@@ -130,7 +130,7 @@ def test_snapshot__holds_the_impacts_so_far(before: int) -> None:
     rng.bit_generator.state = drawn
     assert [each.tobytes() for each in walk(second, rng, 120)] == [each.tobytes() for each in expected]
     del kept["impacts.rows"]
-    with refused("engine snapshot: impacts"):
+    with refused("engine snapshot: the array impacts.rows is missing; must have shape"):
         second.restore(kept)
 
 
@@ -210,7 +210,7 @@ def test_step__that_a_guard_rolls_back_leaves_the_impacts_as_they_were() -> None
 
 def test_place__is_refused_as_nobody_knows_the_impacts() -> None:
     engine = eb.make_engine(CRASH, 1, reward=INJURY)
-    with refused("place: reward: injury_lr4s needs every impact"):
+    with refused("place: the reward injury_lr4s needs every impact"):
         engine.place(engine.worlds)
 
 
@@ -330,9 +330,11 @@ def test_weights__of_measures_may_be_negative_and_of_built_in_terms_not() -> Non
         reward_params({"harm": 1.0, "jerk": -1.0})
     with refused("reward: injury_lr4s = nan: must be a finite number"):
         reward_params({"harm": 1.0, "injury_lr4s": float("nan")})
-    with refused("reward: harm: is left out, and would weigh 1 beside injury_lr4s; say harm: 1, or 0 for none"):
+    with refused(
+        "reward: harm: must be given together with injury_lr4s, because its default weight is 1; write harm: 1"
+    ):
         reward_params({"injury_lr4s": -1.0})
-    with refused("measure 'injury': stands for several of other names"):
+    with refused("measure 'injury' is an entry point that defines parts with other names"):
         reward_params({"harm": 1.0, "injury": -1.0})
 
 
@@ -341,10 +343,10 @@ def test_weights__of_measures_may_be_negative_and_of_built_in_terms_not() -> Non
     [
         (
             lambda n: np.zeros((n, 4)),
-            "gave float64 of shape (1, 4); must be numbers of shape (1,), one per world or (1, 2)",
+            "its function returned float64 of shape (1, 4); must return numbers of shape (1,), one per world or (1, 2)",
         ),
         (lambda n: np.full(n, np.nan), "is nan in world 0 at step"),
-        (lambda n: np.zeros((n, 2)), "gave a number per vehicle; when it was registered it gave a number per world"),
+        (lambda n: np.zeros((n, 2)), "its function returned a number per vehicle, but a number per world when it was"),
         (lambda n: 1 / 0, "its function fails: ZeroDivisionError"),
     ],
     ids=["shape", "nan", "form", "error"],

@@ -26,7 +26,7 @@ def test_pipe_and_device__are_not_even_opened(tmp_path: Path, monkeypatch: pytes
     os.mkfifo(tmp_path / "pipe")
     monkeypatch.setattr("os.open", lambda *args: pytest.fail("opened"))
     for path in (tmp_path / "pipe", Path("/dev/zero"), Path("/dev/tty")):
-        with pytest.raises(InvalidInput, match=r"is not a plain file but a device, a pipe or a socket"):
+        with pytest.raises(InvalidInput, match=r"is a device, a pipe or a socket; must be a plain file"):
             read_plain(path, 8)
 
 
@@ -42,7 +42,7 @@ def test_plain_file__is_looked_at_again_once_it_is_open_and_while_it_is_read(
         read_plain(path, 8)
     path.unlink()
     os.mkfifo(path)
-    with pytest.raises(InvalidInput, match=r"is not a plain file but a device, a pipe"):
+    with pytest.raises(InvalidInput, match=r"is a device, a pipe"):
         read_plain(path, 8)
 
 
@@ -69,7 +69,10 @@ def check_target(words: str, path: Path, monkeypatch: pytest.MonkeyPatch, capsys
     monkeypatch.setattr(Scenario, "sample", sample)
     path.symlink_to("nowhere")
     assert run_command([*words.split(), str(path), "--force"]) == 2
-    assert capsys.readouterr().err == f"ethbrake: error: {path}: is a symbolic link; give the file it points to\n"
+    assert (
+        capsys.readouterr().err
+        == f"ethbrake: error: {path}: is a symbolic link; give the path of the file to which it points\n"
+    )
     assert not path.with_name("nowhere").exists()
 
 

@@ -26,42 +26,42 @@ def parse(text: str | bytes) -> object:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: 1\nb: &x 2\n", ", line 2, column 4: anchor &x is not supported; write the value out where it is needed"),
-        ("a: *x\n", ", line 1, column 4: alias *x is not supported; write the value out"),
-        ("a: !!int 3\n", ", line 1, column 4: tag tag:yaml.org,2002:int is not supported; write a plain value"),
-        ("a: ! 3\n", ", line 1, column 4: tag ! is not supported; write a plain value"),
+        ("a: 1\nb: &x 2\n", ", line 2, column 4: anchor &x is not supported; write the value wherever it is needed"),
+        ("a: *x\n", ", line 1, column 4: alias *x is not supported; write the value itself"),
+        ("a: !!int 3\n", ", line 1, column 4: tag tag:yaml.org,2002:int is not supported; write the value without a"),
+        ("a: ! 3\n", ", line 1, column 4: tag ! is not supported; write the value without a tag"),
         (
             "a: !!python/object/apply:os.system [ls]\n",
             ", line 1, column 4: tag tag:yaml.org,2002:python/object/apply:os.system is not supported",
         ),
-        ("<<: {a: 1}\n", ", line 1, column 1: merge key << is not supported; write the values out"),
-        ("a: 1\nb: 2\na: 3\n", ", line 3, column 1: key 'a' is given twice, first on line 1"),
-        ("o: {a: 1, 'a': 2}\n", ", line 1, column 11: key 'a' is given twice, first on line 1"),
-        ("1: a\n", ", line 1, column 1: key '1' must be text; quote it if that is what is meant"),
+        ("<<: {a: 1}\n", ", line 1, column 1: merge key << is not supported; write the keys and values"),
+        ("a: 1\nb: 2\na: 3\n", ", line 3, column 1: key 'a' occurs twice; the first is on line 1"),
+        ("o: {a: 1, 'a': 2}\n", ", line 1, column 11: key 'a' occurs twice; the first is on line 1"),
+        ("1: a\n", ", line 1, column 1: key '1' must be text; if it is meant as text, put it in quotes"),
         ("? [a, b]\n: 1\n", ", line 1, column 3: a key must be text, not a list or a mapping"),
-        ("a: 1\n---\nb: 2\n", ", line 2, column 1: a second document starts here; one file holds one document"),
-        ("%TAG ! tag:x,2000:\n---\na: 1\n", ", line 1, column 1: directives are not supported here"),
+        ("a: 1\n---\nb: 2\n", ", line 2, column 1: a second document starts here; a file must contain only one"),
+        ("%TAG ! tag:x,2000:\n---\na: 1\n", ", line 1, column 1: YAML directives are not supported; remove"),
         ("a: [1, 2\nb: 3\n", ", line 2, column 2: not valid YAML: expected ',' or ']', but got ':'"),
         ("a:\n\t- 1\n", ", line 2, column 1: not valid YAML: found character '\\t' that cannot start any token"),
         ("a: \x07\n", ", line 1, column 4: not valid YAML: character #x0007 is not allowed"),
         ("a: 99999999999999999999\n", ", line 1, column 4: integer 99999999999999999999 does not fit into 64 bits"),
         (f"a: {'9' * 5000}\n", ", line 1, column 4: integer 999999999999999999999999... does not fit into 64 bits"),
-        ("[" * (DEPTH_LIMIT + 1) + "1" + "]" * (DEPTH_LIMIT + 1), ", line 1, column 17: nested deeper than 16 levels"),
+        ("[" * (DEPTH_LIMIT + 1) + "1" + "]" * (DEPTH_LIMIT + 1), ", line 1, column 17: mappings and lists must not"),
         (
             "{a: " * (DEPTH_LIMIT + 1) + "1" + "}" * (DEPTH_LIMIT + 1),
-            ", line 1, column 65: nested deeper than 16 levels",
+            ", line 1, column 65: mappings and lists must not be nested more",
         ),
-        ("- " * (DEPTH_LIMIT + 1) + "1", ", line 1, column 33: nested deeper than 16 levels"),
-        ("a: " + "x" * (SIZE_LIMIT - 2), ": larger than 64 KiB, the limit for these files"),
-        (LAUGHS, ", line 1, column 4: anchor &a is not supported; write the value out where it is needed"),
-        ("[" * 60_000, ", line 1, column 17: nested deeper than 16 levels"),
+        ("- " * (DEPTH_LIMIT + 1) + "1", ", line 1, column 33: mappings and lists must not be nested more"),
+        ("a: " + "x" * (SIZE_LIMIT - 2), ": is larger than 64 KiB, the limit for this kind of file"),
+        (LAUGHS, ", line 1, column 4: anchor &a is not supported; write the value wherever it is needed"),
+        ("[" * 60_000, ", line 1, column 17: mappings and lists must not be nested more"),
         ("{" * 60_000, ", line 1, column 2: a key must be text, not a list or a mapping"),
         ("a: " * 20_000, ", line 1, column 5: not valid YAML: mapping values are not allowed here"),
         ("? " * 30_000, ", line 1, column 3: a key must be text, not a list or a mapping"),
-        ("a: &a\n  <<: *a\n", ", line 1, column 4: anchor &a is not supported; write the value out where it is needed"),
+        ("a: &a\n  <<: *a\n", ", line 1, column 4: anchor &a is not supported; write the value wherever it is needed"),
         ("key: " + "'" * 1001, ", line 1, column 1007: not valid YAML: found unexpected end of stream"),
-        ("\ud800", ", line 1, column 1: not UTF-8 text (byte 0xed)"),
-        (b"a: 1\nb: \xff\n", ", line 2, column 4: not UTF-8 text (byte 0xff)"),
+        ("\ud800", ", line 1, column 1: byte 0xed is not valid UTF-8 text"),
+        (b"a: 1\nb: \xff\n", ", line 2, column 4: byte 0xff is not valid UTF-8 text"),
     ],
     ids=lambda value: ascii(value)[:40],
 )
@@ -71,16 +71,16 @@ def test_yaml__is_refused_with_its_place(text: str | bytes, message: str) -> Non
 
 
 PATHS: dict[str, Callable[[], object]] = {
-    "gone.yaml: no such file": lambda: read_yaml("gone.yaml"),
+    "gone.yaml: the file does not exist": lambda: read_yaml("gone.yaml"),
     "a\\x00b: cannot be read (embedded null byte)": lambda: read_plain(Path("a\0b"), 8),
-    "none: no such file": lambda: read_plain(Path("none"), 8),
+    "none: the file does not exist": lambda: read_plain(Path("none"), 8),
     "xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx": lambda: read_plain(Path("x" * 5000), 8),
-    "/dev/zero: is not a plain file but a device, a pipe or a socket": lambda: read_plain(Path("/dev/zero"), 8),
-    "/dev/tty: is not a plain file but a device, a pipe or a socket": lambda: read_plain(Path("/dev/tty"), 8),
+    "/dev/zero: is a device, a pipe or a socket; must be a plain file": lambda: read_plain(Path("/dev/zero"), 8),
+    "/dev/tty: is a device, a pipe or a socket; must be a plain file": lambda: read_plain(Path("/dev/tty"), 8),
     "/dev/null: is a device or a pipe, not a plain file; give another name": lambda: write_output(
         "/dev/null", b"new", force=True
     ),
-    "missing/out.csv: there is no folder missing; make it first": lambda: write_output(
+    "missing/out.csv: the folder missing does not exist; create it first": lambda: write_output(
         "missing/out.csv", b"new", force=True
     ),
     "a\\x00b: cannot be written (embedded null byte)": lambda: check_target("a\0b"),
@@ -99,26 +99,26 @@ def test_path__is_refused(message: str) -> None:
 @pytest.mark.parametrize("read", [lambda: read_plain(Path("a"), 7), lambda: open_plain("a", 7).__enter__()])
 def test_file__that_is_larger_than_its_limit_is_not_read(read: Callable[[], object], empty_folder: Path) -> None:
     Path("a").write_bytes(b"12345678")
-    with refused("a: larger than 0 KiB, the limit for such a file"):
+    with refused("is larger than 0 KiB, the limit for this kind of file"):
         read()
     with open("huge.yaml", "wb") as stream:
         stream.truncate(10**7)  # sparse
-    with refused("huge.yaml: larger than 64 KiB, the limit for such a file"):
+    with refused("huge.yaml: is larger than 64 KiB, the limit for this kind of file"):
         read_yaml("huge.yaml")
 
 
 def test_folder_pipe_and_broken_link__are_not_read(empty_folder: Path) -> None:
     Path("folder").mkdir()
-    with refused("folder: is not a plain file but a folder"):
+    with refused("folder: is a folder; must be a plain file"):
         read_yaml("folder")
     os.mkfifo("pipe")
-    with refused("pipe: is not a plain file but a device, a pipe or a socket"):
+    with refused("pipe: is a device, a pipe or a socket; must be a plain file"):
         read_plain(Path("pipe"), 8)
     Path("loop").symlink_to("loop")
     with refused("loop: cannot be read (Too many levels of symbolic links)"):
         read_plain(Path("loop"), 8)
     Path("dangling").symlink_to("nowhere")
-    with refused("dangling: no such file"):
+    with refused("dangling: the file does not exist"):
         read_plain(Path("dangling"), 8)
     Path("file").touch()
     with refused("file/below: cannot be read (Not a directory)"):
@@ -128,22 +128,22 @@ def test_folder_pipe_and_broken_link__are_not_read(empty_folder: Path) -> None:
 def test_link__is_not_followed_where_it_must_not_be(empty_folder: Path) -> None:
     Path("a").write_bytes(b"12345678")
     Path("link").symlink_to("a")
-    with refused("link: is a symbolic link; give the file it points to", CorruptBundle):
+    with refused("link: is a symbolic link; give the path of the file to which it points", CorruptBundle):
         read_plain(Path("link"), 8, refusal=CorruptBundle, follow_links=False)
 
 
 def test_output__replaces_no_file_unasked_and_nothing_else_even_if_asked(empty_folder: Path) -> None:
     Path("out.csv").write_text("mine")
-    with refused("out.csv: is there already; give another name or use force (--force)", AlreadyExists):
+    with refused("out.csv: already exists; give another name, or replace the file with force", AlreadyExists):
         write_output("out.csv", b"new")
     for link, target in (("link", "out.csv"), ("dangling", "nowhere")):
         Path(link).symlink_to(target)
-        with refused(f"{link}: is a symbolic link; give the file it points to"):
+        with refused(f"{link}: is a symbolic link; give the path of the file to which it"):
             write_output(link, b"new", force=True)
     os.mkfifo("pipe")
     with refused("pipe: is a device or a pipe, not a plain file; give another name"):
         write_output("pipe", b"new", force=True)
     Path("folder").mkdir()
-    with refused("folder: is a folder; give the name of a file"):
+    with refused("folder: is a folder; give the path of a file"):
         write_output("folder", b"new", force=True)
     assert Path("out.csv").read_text() == "mine" and not Path("nowhere").exists()

@@ -109,7 +109,7 @@ def test_own_algorithm__under_vec_normalize_is_refused_as_no_bundle_holds_its_st
     kind = type(load_recipe(recipe_file(tmp_path)).make_algorithm())
     build = kind.build
     monkeypatch.setattr(kind, "build", lambda self, training, rows: build(self, training, VecNormalize(rows)))
-    with pytest.raises(InvalidInput, match="'a2c': its model is trained under VecNormalize, whose statistics are no"):
+    with pytest.raises(InvalidInput, match="'a2c': its model uses VecNormalize, whose statistics"):
         train(recipe_file(tmp_path), SCENARIO, tmp_path / "run")
 
 

@@ -63,7 +63,7 @@ RECIPES: dict[str, Callable[[], object]] = {
         "policy: [8]", "policies: [8]"
     ),
     "mine.yaml, line 16: reward.speed: unknown key": lambda: recipe("harm: 1", "speed: 1"),
-    "mine.yaml: gamma: missing; it is needed; every key is in the shipped recipe ppo": lambda: recipe(
+    "mine.yaml: gamma: missing; this key is required; the shipped recipe ppo has all keys": lambda: recipe(
         "gamma: 0.99\n", ""
     ),
     "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: recipe("gamma: 0.99", "gamma: .nan"),
@@ -78,8 +78,8 @@ RECIPES: dict[str, Callable[[], object]] = {
     ),
     "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
-    "mine.yaml, line 16: reward = {harm: 0}: every weight is 0; nothing could be learned": lambda: recipe(
-        "harm: 1", "harm: 0"
+    "mine.yaml, line 16: reward = {harm: 0}: all weights are 0, so there is nothing to learn; set at least": lambda: (
+        recipe("harm: 1", "harm: 0")
     ),
     "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
         "every_updates: 2", "every_updates: 0"
@@ -89,9 +89,9 @@ RECIPES: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2, column 10: not valid YAML: expected ',' or ']'": lambda: recipe("name: mine", "name: [mine"),
     "mine.yaml: must be a mapping of keys to values": lambda: recipe(GOOD, "- ppo\n"),
     "recipe 'ppo': seed = -1: must be greater than or equal to 0": lambda: load_recipe("ppo").replace(seed=-1),
-    "recipe 'sac': ent_coef = automatic: must be auto or a number of at least 0": lambda: load_recipe("sac").replace(
-        ent_coef="automatic"
-    ),
+    "recipe 'sac': ent_coef = automatic: must be auto, or a finite number of at least 0": lambda: load_recipe(
+        "sac"
+    ).replace(ent_coef="automatic"),
     "recipe 'sac': buffer_size = 63: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=63),
     "recipe 'sac': n_steps: unknown key; did you mean total_steps?": lambda: load_recipe("sac").replace(n_steps=3),
 }
@@ -110,11 +110,11 @@ SETTINGS: dict[str, Callable[[], object]] = {
     "--set gamma, line 1, column 2: not valid YAML: expected the node content, but found '<stream end>'": lambda: (
         read_settings(["gamma=["], [PPO])
     ),
-    "--set gamma: is given twice": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
+    "--set gamma: this setting is given twice; give it once": lambda: read_settings(["gamma=0.9", "gamma=0.8"], [PPO]),
     "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(
         ["reward.terminl=1"], [PPO]
     ).change(PPO),
-    "--set gamma.x: there is nothing inside 0.995; set the whole value": lambda: read_settings(
+    "--set gamma.x: 'x' cannot be set, because 0.995 is neither a mapping nor a": lambda: read_settings(
         ["gamma.x=1"], [PPO]
     ).change(PPO),
     "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable(
@@ -130,41 +130,43 @@ def test_setting__is_refused(message: str) -> None:
 
 
 TRAININGS: dict[str, Callable[[], object]] = {
-    "algorithm 'My algorithm': must be 1 to 64 of a-z, 0-9, - and _, not beginning with - or _": lambda: (
+    "algorithm 'My algorithm': the name must have 1 to 64 characters (a-z, 0-9, - and _), and must not begin": lambda: (
         register_algorithm("My algorithm", PpoRecipe, Ppo)
     ),
-    "algorithm 'new': recipe = <class 'dict'>: must be a class with network_spec": lambda: register_algorithm(
-        "new", dict, Ppo
+    "algorithm 'new': recipe = <class 'dict'>: must be a class with the method network_spec, a subclass": lambda: (
+        register_algorithm("new", dict, Ppo)
     ),
-    "algorithm 'new': algorithm = <built-in function len>: must be a class with build": lambda: register_algorithm(
-        "new", PpoRecipe, len
+    "algorithm 'new': algorithm = <built-in function len>: must be a class with the method build, or its": lambda: (
+        register_algorithm("new", PpoRecipe, len)
     ),
     "recipe 'ppo': total_steps = 0: must be greater than or equal to 1": lambda: train(
         "ppo", "paper-random", Path("run"), steps=0
     ),
-    "scenario 'cooperation-3-pair': no vehicle learns; give at least one the role learner": lambda: train(
+    "scenario 'cooperation-3-pair' has no learner; give at least one vehicle the role learner": lambda: train(
         TINY_PPO, PAIR.with_learners([]), Path("run")
     ),
-    "scheme single: scenario 'cooperation-3-pair' has 2 learners; use shared, independent or centralised": lambda: (
-        train(TINY_PPO, PAIR, Path("run"), scheme="single")
+    "scheme single: scenario 'cooperation-3-pair' has 2 learners; use the scheme shared, independent or": lambda: train(
+        TINY_PPO, PAIR, Path("run"), scheme="single"
     ),
-    "scheme independent: scenario 'paper-random' has one learner; use single": lambda: train(
+    "scheme independent: scenario 'paper-random' has one learner; use the scheme single": lambda: train(
         TINY_PPO, PAPER, Path("run"), scheme="independent"
     ),
-    "scheme independent: recipe 'sac' is for sac, which cannot train so; use a recipe": lambda: train(
-        "sac", PAIR, Path("run"), scheme="independent"
+    "scheme independent: the algorithm sac of recipe 'sac' does not support this scheme; use a recipe for": lambda: (
+        train("sac", PAIR, Path("run"), scheme="independent")
     ),
-    "scheme centralised: recipe 'sac' is for sac, which cannot train so; use a recipe": lambda: train(
-        "sac", PAIR, Path("run"), scheme="centralised"
+    "scheme centralised: the algorithm sac of recipe 'sac' does not support this scheme; use a recipe for": lambda: (
+        train("sac", PAIR, Path("run"), scheme="centralised")
     ),
-    "recipe 'ppo': turns = 3: is for scheme: independent only; leave it out": lambda: train(
+    "recipe 'ppo': turns = 3: is allowed with scheme: independent only; remove the key turns": lambda: train(
         TINY_PPO, PAIR, Path("run"), scheme="shared", turns=3
     ),
-    "recipe 'ppo': turns = 5: 2 learners need 10 updates, total_steps = 2048 are 8": lambda: train(
-        TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5
+    "recipe 'ppo': turns = 5: 2 learners need at least 10 updates, but total_steps = 2048 gives 8; raise": lambda: (
+        train(TINY_PPO, PAIR, Path("run"), scheme="independent", steps=2048, turns=5)
     ),
-    ".: contains no training; give the folder of a run": lambda: resume(Path()),
-    ".: holds no team (team.json); give the folder of a run, or a bundle as ppo@.": lambda: load_team(Path(), PAIR),
+    ".: is not the folder of a run; name the folder of a run, for instance": lambda: resume(Path()),
+    ".: has no team.json, so it is not a team; name the folder of a run, or write ppo@. for a policy": lambda: (
+        load_team(Path(), PAIR)
+    ),
 }
 
 
@@ -205,7 +207,10 @@ def test_algorithm__has_a_name_of_its_own() -> None:
         ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
         ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
         ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
-        ({"scheme": "independent"}, "scheme independent: recipe 'mine' is for a2c, which cannot train so"),
+        (
+            {"scheme": "independent"},
+            "scheme independent: the algorithm a2c of recipe 'mine' does not support this scheme; use a",
+        ),
     ],
     ids=lambda value: str(value)[:30],
 )
@@ -228,14 +233,14 @@ def run(empty_folder: Path) -> RunDirectory:
 
 def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> None:
     with refused(
-        "run: exists already; give another folder (--output), resume it (ethbrake train --resume)", AlreadyExists
+        "run: this run already exists; choose another folder (--output), resume the run (ethbrake train", AlreadyExists
     ):
         RunDirectory(run.path).create({})
     Path("thesis").mkdir()
     Path("thesis/chapter-1").touch()
-    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
+    with refused("thesis: already exists and is not the folder of a run; choose another name", AlreadyExists):
         RunDirectory(Path("thesis")).create({}, force=True)
-    with refused("thesis: exists already and is not a run; give another name", AlreadyExists):
+    with refused("thesis: already exists and is not the folder of a run; choose another name", AlreadyExists):
         train(TINY_PPO, PAPER, Path("thesis"))
 
 
@@ -255,7 +260,7 @@ def test_folder__that_is_there_is_not_replaced_unasked(run: RunDirectory) -> Non
 def test_folder__of_another_training_is_refused(
     training: Callable[[], Training], other: str, run: RunDirectory
 ) -> None:
-    with refused(f"run: holds another training (here other: {other}); give another folder (--output)"):
+    with refused(f"run: this folder contains another training, which differs in {other}; choose another folder"):
         check_same_training(run, training())
 
 
@@ -266,13 +271,13 @@ def test_folder__of_another_training_is_refused(
             '{"format": "ethbrake',
             "run/run.json: is damaged: Unterminated string starting at: line 1 column 12 (char 11)",
         ),
-        ("[]", "run/run.json: is damaged: holds no JSON object"),
+        ("[]", "run/run.json: is damaged: the content is not a JSON object"),
         ("{}", "run/run.json: format = None: must be ethbrake-run"),
         (
             '{"format": "ethbrake-run", "status": "done"}',
             "run/run.json: status = 'done': must be running or finished or",
         ),
-        (None, "run/run.json: is missing; nothing goes on without it"),
+        (None, "run/run.json: is missing, but the run cannot be used without it"),
     ],
     ids=["cut off", "a list", "empty", "other status", "missing"],
 )
@@ -285,10 +290,10 @@ def test_status_of_a_run__is_refused(status: str | None, message: str, run: RunD
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"recipe": None}, "run/config.json: is not the configuration of a training: 'recipe' is missing"),
+        ({"recipe": None}, "run/config.json: does not describe a training, because 'recipe' is missing"),
         ({"recipe": 3}, "run/config.json: recipe: must be a mapping of keys to values, for instance algorithm: ppo"),
         ({"scenario": {"name": "paper-random"}}, "run/config.json: scenario: braking_capacity_mps2: missing"),
-        ({"library": "benchmarl"}, "run: was trained by benchmarl, which cannot be resumed; train again"),
+        ({"library": "benchmarl"}, "run: this run was trained by benchmarl and cannot be resumed; train again"),
     ],
     ids=lambda value: str(value)[:30],
 )
@@ -301,21 +306,22 @@ def test_configuration_of_a_run__is_refused(changes: dict[str, Any], message: st
 
 def test_training_that_has_finished__says_how_to_measure_it(run: RunDirectory) -> None:
     run.write_status("finished")
-    with refused(
-        "finished; measure what it has learned with: ethbrake evaluate --scenario paper-random --agents full_brake,ppo@"
-    ):
+    with refused("evaluate its policy with: ethbrake evaluate --scenario paper-random --agents full_brake,ppo@"):
         resume(run.path)
     team = RunDirectory(Path("team")).create(Training.of(TINY_PPO, PAIR, scheme="independent").config())
     team.write_status("finished")
     with refused(
-        "what it has learned with: ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@team"
+        "evaluate its policy with: ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@team"
     ):
         resume(team.path)
 
 
 def test_lock__is_held_by_one_and_is_a_file(empty_folder: Path) -> None:
     Path("some.lock").mkdir()
-    with refused("some.lock: cannot be used as a lock (Is a directory); delete it"), hold_lock(Path("some.lock"), ""):
+    with (
+        refused("some.lock: cannot be used as a lock (Is a directory); delete this file"),
+        hold_lock(Path("some.lock"), ""),
+    ):
         pass
     with (
         hold_lock(Path("other.lock"), "somebody works here"),
@@ -351,13 +357,17 @@ def team(empty_folder: Path) -> RunDirectory:
 def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDirectory) -> None:
     assert sorted(load_team(team.path, PAIR).drivers) == [1, 2]
     assert sorted(load_team(team.path, PAIR.with_learners(["vehicle_3"])).drivers) == [2]
-    with refused("team: is a team for a line of 3 vehicles, scenario 'cooperation-3-pair' has 4; only a shared policy"):
+    with refused(
+        "team: this team is for a line of 3 vehicles, but scenario 'cooperation-3-pair' has 4 vehicles; choose a"
+    ):
         load_team(team.path, FOUR)
-    with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has nobody to drive"):
+    with refused("team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has no learner"):
         load_team(team.path, PAIR.with_learners([]))
-    with refused("team: each of its learners has a policy of its own; name one, for instance team/policy/vehicle_2"):
+    with refused("team: has one policy for each learner; give the path of one, for instance team/policy/vehicle_2"):
         load_policy(TEAM.parent)
-    with refused("team: drives vehicle_2, vehicle_3; scenario 'cooperation-3-pair' has vehicle_1 to drive"):
+    with refused(
+        "team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has learner vehicle_1"
+    ):
         script_agents(PAIR.replace(roles={"vehicle_1": "team@team", "vehicle_2": "team@team", "vehicle_3": "learner"}))
 
 

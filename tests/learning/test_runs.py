@@ -331,7 +331,7 @@ def test_new_folder__is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "a" / "bad") as partial:
         (partial / "x").touch()
         raise KeyboardInterrupt
-    with pytest.raises(AlreadyExists, match="taken: is there already"), new_folder(tmp_path / "a" / "taken"):
+    with pytest.raises(AlreadyExists, match="taken: already exists"), new_folder(tmp_path / "a" / "taken"):
         (tmp_path / "a" / "taken").mkdir()  # meanwhile, by somebody else
     assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*")) == ["a", "a/good", "a/good/x", "a/taken"]
 
@@ -582,7 +582,7 @@ def test_resume__a_damaged_checkpoint_is_found_and_the_one_before_is_used(
 ) -> None:
     notes: list[str] = []
     damage(newest(run) / file)
-    told = f"a damaged checkpoint was left aside: {newest(run)}"
+    told = f"deleted a damaged checkpoint: {newest(run)}"
     resume(run, measure=measure, on_progress=lambda p: notes.append(p.note) if p.note else None)
     assert len(notes) == 1 and notes[0].startswith(told)
     assert_same(run, whole("ppo")[0])
@@ -601,7 +601,9 @@ def test_resume__with_other_versions_is_refused_unless_it_is_asked_for(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(train_module, "installed_versions", lambda: {"torch": "99.0"})
-    with pytest.raises(InvalidInput, match=r"was trained with ethbrake-marl .*: the numbers would differ"):
+    with pytest.raises(
+        InvalidInput, match=r"this training began with ethbrake-marl .*, which may compute other numbers"
+    ):
         resume(run)
     assert json.loads((run / "run.json").read_text())["status"] == "interrupted"
     assert resume(run, other_versions=True).status == "finished"
@@ -625,7 +627,7 @@ def test_resume__an_edited_configuration_is_another_training(
     config = json.loads((run / "config.json").read_text())
     edited = {part: config[part] | change for part, change in changes.items()}
     (run / "config.json").write_text(json.dumps(config | edited))
-    told = r"config.json: was changed after the checkpoint step_\d+ of this training"
+    told = r"config.json: this file was changed after the checkpoint step_\d+ was written"
     with nullcontext() if same else pytest.raises(InvalidInput, match=told):
         assert resume(run, measure=measure).status == "finished"
 
@@ -636,7 +638,7 @@ def test_resume__one_process_at_a_time(run: Path, monkeypatch: pytest.MonkeyPatc
     def second(step: int, answer: Answer) -> Answer:
         if step == 5:
             asked.append(step)
-            with pytest.raises(InvalidInput, match="another process is training here"):
+            with pytest.raises(InvalidInput, match="another process is training in this folder"):
                 resume(run, measure=measure)
         return answer
 
@@ -652,13 +654,13 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
     place = newest(run)
     if change == "lost":  # as of another version
         (place / NUMBERS).unlink()
-        told = rf"{place}: has no numbers.json, so another version of this package wrote it"
+        told = rf"{place}: the checkpoint has no numbers.json, so another version of this package wrote it"
     elif change == "arrays":
         monkeypatch.setattr(safetensors.numpy, "save_file", lambda arrays, file: file.write_bytes(b"forged"))
         state = read_checkpoint(place)
         shutil.rmtree(place)
         write_checkpoint(place, state)
-        told = rf"{place / ARRAYS}: .*; delete the checkpoint to resume from the one before"
+        told = rf"{place / ARRAYS}: .*; delete this checkpoint to resume from an earlier one"
     elif change != "forged":
         state = read_checkpoint(place)
         shutil.rmtree(place)
@@ -669,7 +671,7 @@ def test_resume__a_checkpoint_that_does_not_fit_is_refused_and_stays(
         shutil.rmtree(place)
         arrays = state.arrays | {"policy.log_std": np.zeros(2, np.float32)}
         write_checkpoint(place, TrainingState(state.numbers, arrays))
-        told = rf"the checkpoint of step {state.steps} is not of this training: .*log_std.*; delete it to resume from"
+        told = rf"the checkpoint of step {state.steps} does not belong to this training: .*log_std.*; delete this"
     before = {file: file.read_bytes() for file in run.rglob("*") if file.is_file() and file.name != "run.lock"}
     with pytest.raises(EthBrakeError, match=told) as error:
         resume(run, measure=measure)
@@ -703,7 +705,9 @@ def test_resume__a_forged_checkpoint_is_refused_in_one_line(run: Path, name: str
     else:
         del arrays[name]
     write_checkpoint(place, TrainingState(numbers, arrays))
-    with pytest.raises(EthBrakeError, match=rf"is not of this training: .*{told}.*; delete it to resume") as error:
+    with pytest.raises(
+        EthBrakeError, match=rf"does not belong to this training: .*{told}.*; delete this checkpoint to resume"
+    ) as error:
         resume(run, measure=measure)
     assert "\n" not in str(error.value)
 
@@ -719,9 +723,9 @@ def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
         restore = partial(model_state.restore_model, model, algorithm)
         restore(TrainingState(numbers, arrays))
         for forged in ([-1, False], [1.5, False], [1 << 40, True], [0, 1]):
-            with pytest.raises(ValueError, match=r"replay = .*: is no place in its memory"):
+            with pytest.raises(ValueError, match=r"replay = .*: must be .position, full., with a position below 50"):
                 restore(TrainingState(numbers | {"replay": forged}, arrays))
-        with pytest.raises(ValueError, match=r"replay.observations: .* are needed"):
+        with pytest.raises(ValueError, match=r"replay.observations: must be finite numbers"):
             restore(TrainingState(numbers | {"replay": [3, False]}, arrays))
 
 
@@ -729,7 +733,7 @@ def test_restore__a_forged_replay_memory_of_sac_is_refused() -> None:
 def test_resume__a_policy_that_cannot_be_replaced_is_refused_at_once(run: Path, name: str) -> None:
     shutil.rmtree(run / name)
     (run / name).touch()
-    with pytest.raises(InvalidInput, match=rf"{name}: is not a plain folder; a training deletes in it, or replaces it"):
+    with pytest.raises(InvalidInput, match=rf"{name}: must be a plain folder, not a link or a file"):
         resume(run, measure=measure)
 
 

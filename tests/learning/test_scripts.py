@@ -119,9 +119,9 @@ def test_single_file__advantages_by_hand(script: str) -> None:
         (["--copies", "0"], "copies = 0: must be a whole number, at least 1"),
         (["--minibatch", "0"], "minibatch = 0: must be a whole number, at least 1"),
         (["--seed", "-1"], "seed"),
-        (["--output", "there"], "there: is there already"),
+        (["--output", "there"], "there: already exists"),
         (["--harm-count", "all"], "harm_count"),
-        (["--scenario", "cooperation-0-sensors"], "nobody learns"),
+        (["--scenario", "cooperation-0-sensors"], "has no learner"),
     ],
 )
 def test_single_file__refuses_what_cannot_be_before_it_trains(
@@ -194,6 +194,6 @@ def test_save_team__acts_as_the_actors_do(between: torch.nn.Module, shared: bool
 
 
 def test_save_team__refuses_layers_that_a_bundle_cannot_hold(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match="must be linear layers, with ReLU or with Tanh between them"):
+    with pytest.raises(InvalidInput, match="must be linear layers with ReLU between them, or with Tanh between them"):
         save_team(tmp_path / "a", {"vehicle_2": OwnActor(torch.nn.GELU())}, eb.parallel_env(), seed=0, steps=1)
     assert not (tmp_path / "a").exists()

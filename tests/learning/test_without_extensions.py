@@ -23,7 +23,7 @@ def test_algorithm__of_an_absent_extension_is_refused_by_name() -> None:
     with pytest.raises(InvalidInput) as error:
         load_recipe("vine")
     told = "vine.yaml, line 11: algorithm = vine: must be one of ppo, sac"
-    assert f"{told}; the extension learners, which gives it, is not installed" in str(error.value)
+    assert f"{told}; this algorithm belongs to the extension learners, which is not installed" in str(error.value)
     with pytest.raises(
         InvalidInput, match=r"recipe 'ppo': algorithm = rollout-classification: must be one of ppo, sac$"
     ):

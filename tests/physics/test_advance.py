@@ -301,7 +301,7 @@ def test_bounces__more_than_any_segment_holds_are_reported(monkeypatch: pytest.M
         monkeypatch.setattr(segment, "BOUND", motion.BOUND._replace(MOST_EVENTS=50))
     wall = line([0.0], [0.0, 0.2], mass_t=[2.0**60, 1.0], restitution=1.0)
     most = motion.BOUND.MOST_EVENTS
-    with pytest.raises(PhysicsError, match=f"world 0: more than {most} events between 0 s and 50000 s"):
+    with pytest.raises(PhysicsError, match=f"world 0: there were more than {most:,} events between 0 s and 50000 s"):
         advance(wall, [-10.0, 10.0], 50_000.0)
 
 

@@ -26,15 +26,15 @@ WORLDS: dict[str, Callable[[], object]] = {
     "gaps_m[0, 1] = -0.5: must be finite and in [0, inf]": lambda: line([5.0, -0.5], [9.0, 9.0, 9.0]),
     "gaps_m[0, 1] = inf: must be finite and in [0, inf]": lambda: line([5.0, inf], [9.0, 9.0, 9.0]),
     "speeds_mps[0, 1] = nan: must be finite and in [0, inf]": lambda: line([5.0, 6.0], [10.0, nan, 1.0]),
-    "speeds_mps[1, 2] = 65: above this vehicle's speed_limit_mps 64": lambda: line(
+    "speeds_mps[1, 2] = 65: must be at most this vehicle's speed_limit_mps 64": lambda: line(
         [5.0, 6.0], [[1.0, 2.0, 3.0], [1.0, 2.0, 65.0]]
     ),
     "restitution[0] = 1.5: must be finite and in [0, 1]": lambda: line([5.0], [9.0, 9.0], restitution=1.5),
     "obstacle_gap_m[0] = -0.5: must be finite and in [0, inf]": lambda: line([5.0], [9.0, 9.0], obstacle_gap_m=-0.5),
     "obstacle_gap_m[0] = inf: must be finite and in [0, inf]": lambda: line([5.0], [9.0, 9.0], obstacle_gap_m=inf),
-    "mass_t: shape (2,) does not fit (1, 3)": lambda: line([5.0, 6.0], [9.0, 9.0, 9.0], mass_t=[1.0, 2.0]),
-    "speeds_mps: shape (1, 1); a line needs at least 2 vehicles, as [n, N]": lambda: line([5.0, 6.0], [10.0]),
-    "speeds_mps: shape (2, 3) does not fit (3, 3)": lambda: line(np.ones((3, 2)), np.zeros((2, 3))),
+    "mass_t: shape (2,); must be (1, 3)": lambda: line([5.0, 6.0], [9.0, 9.0, 9.0], mass_t=[1.0, 2.0]),
+    "speeds_mps: shape (1, 1); must be [n, N] with at least 2 vehicles": lambda: line([5.0, 6.0], [10.0]),
+    "speeds_mps: shape (2, 3); must be (3, 3)": lambda: line(np.ones((3, 2)), np.zeros((2, 3))),
     "brake_rate_mps3[0, 1] = 0: must be in (0, inf]": lambda: line([5.0], [9.0, 9.0], brake_rate_mps3=[9.0, 0.0]),
     "release_rate_mps3[0, 0] = nan: must be in (0, inf]": lambda: line([5.0], [9.0, 9.0], release_rate_mps3=nan),
 }
@@ -52,23 +52,21 @@ ADVANCES: dict[str, Callable[[], object]] = {
         line([5.0], [[9.0, 9.0], [9.0, 9.0]], obstacle_gap_m=9.0), [[0.0, 0.0], [0.0, -17.0]], 1.0, threads=2
     ),
     "command_mps2[0, 0] = nan: must be in [-10, 10] m/s2": lambda: advance(PAIR, [nan, 0.0], 1.0),
-    "command_mps2: shape (3,) does not fit (1, 2)": lambda: advance(PAIR, [0.0, 0.0, 0.0], 1.0),
-    "advance: world 0 is at 0 s and cannot be advanced to -1 s": lambda: advance(PAIR, 0.0, -1.0),
-    "advance: world 1 is at 0 s and cannot be advanced to -1 s": lambda: advance(
-        FOUR, 0.0, until_s=[1.0, -1.0, 1.0, 1.0]
-    ),
-    "advance: world 0 is at 0 s and cannot be advanced to inf s": lambda: advance(PAIR, 0.0, until_s=inf),
-    "advance: give either duration_s or until_s": lambda: advance(PAIR, 0.0),
+    "command_mps2: shape (3,); must be (1, 2)": lambda: advance(PAIR, [0.0, 0.0, 0.0], 1.0),
+    "advance: world 0 is at 0 s; its end time -1 s must be": lambda: advance(PAIR, 0.0, -1.0),
+    "advance: world 1 is at 0 s; its end time -1 s must be": lambda: advance(FOUR, 0.0, until_s=[1.0, -1.0, 1.0, 1.0]),
+    "advance: world 0 is at 0 s; its end time inf s must be": lambda: advance(PAIR, 0.0, until_s=inf),
+    "advance: pass either duration_s or until_s": lambda: advance(PAIR, 0.0),
     "threads = 0: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=0),
     "threads = True: must be a whole number, at least 1": lambda: advance(PAIR, 0.0, 1.0, threads=True),
-    "forecast: commands (1, 2) and candidates (1, 1); (1, 3) and (1, K) are needed": lambda: forecast(
-        THREE, np.zeros((1, 2)), 1, np.zeros((1, 1)), 8.0
+    "command_mps2 has the shape (1, 2) and candidates_mps2 (1, 1); the shapes must be (1, 3) and (1, K)": lambda: (
+        forecast(THREE, np.zeros((1, 2)), 1, np.zeros((1, 1)), 8.0)
     ),
-    "forecast: vehicle index 3; must be in 0..2": lambda: forecast(THREE, np.zeros((1, 3)), 3, np.zeros((1, 1)), 8.0),
-    "forecast: candidate -7.5 m/s2 is beyond vehicle_2's capacity": lambda: forecast(
+    "forecast: vehicle = 3: must be an index": lambda: forecast(THREE, np.zeros((1, 3)), 3, np.zeros((1, 1)), 8.0),
+    "forecast: the candidate command -7.5 m/s2 is beyond the capacity of vehicle_2": lambda: forecast(
         THREE, np.zeros((1, 3)), 1, np.full((1, 1), -7.5), 8.0
     ),
-    "forecast: candidate nan m/s2 is beyond vehicle_2's capacity": lambda: forecast(
+    "forecast: the candidate command nan m/s2 is beyond the capacity of vehicle_2": lambda: forecast(
         THREE, np.zeros((1, 3)), 1, np.full((1, 1), nan), 8.0
     ),
 }
@@ -82,19 +80,19 @@ def test_advance_and_forecast__are_refused(message: str) -> None:
 
 SAMPLED: dict[str, Callable[[], object]] = {
     "command_mps2[0, 2] = -9: must be in [-6, 16] m/s2": lambda: advance_sampled(FOUR, [0.0, 0.0, -9.0], until_s=1.0),
-    "command_mps2: shape (2,) does not fit (4, 3)": lambda: advance_sampled(FOUR, [0.0, 0.0], until_s=1.0),
-    "advance_sampled: world 0 is at 0 s and cannot be advanced to -1 s in 0 to 1,000,000,000 steps of 0.1": lambda: (
-        advance_sampled(FOUR, 0.0, until_s=-1.0)
+    "command_mps2: shape (2,); must be (4, 3)": lambda: advance_sampled(FOUR, [0.0, 0.0], until_s=1.0),
+    "advance_sampled: world 0 cannot be advanced from 0 s to -1 s; this must take 0 to 1,000": lambda: advance_sampled(
+        FOUR, 0.0, until_s=-1.0
     ),
-    "advance_sampled: world 2 is at 0 s and cannot be advanced to nan s in 0 to 1,000,000,000 steps": lambda: (
+    "advance_sampled: world 2 cannot be advanced from 0 s to nan s; this must take 0 to 1,000,000,000 steps": lambda: (
         advance_sampled(FOUR, 0.0, until_s=[1.0, 1.0, nan, 1.0])
     ),
-    "cannot be advanced to 1907.35 s in 0 to 1,000,000,000 steps of 1.90735e-06 s": lambda: advance_sampled(
+    "to 1907.35 s; this must take 0 to 1,000,000,000 steps of 1.90735e-06 s": lambda: advance_sampled(
         PAIR, 0.0, until_s=np.nextafter(1e9 * 2.0**-19, inf), step_s=2.0**-19
     ),
     "step_s = 0: must be finite and at least 1e-06 s": lambda: advance_sampled(FOUR, 0.0, until_s=1.0, step_s=0.0),
     "step_s = nan: must be finite and at least 1e-06 s": lambda: advance_sampled(FOUR, 0.0, until_s=1.0, step_s=nan),
-    "advance_sampled: world 0 is at 0.53 s, between two of its samples 0.5 s + n * 0.1 s; begin at": lambda: (
+    "advance_sampled: world 0 is at 0.53 s, between two of its samples 0.5 s + n * 0.1 s; start at": lambda: (
         advance_sampled(advance(FOUR, 0.0, until_s=0.53)[0], 0.0, until_s=1.0)
     ),
     "world 0 is at 1 s, between two of its samples 0 s + n * 1 s": lambda: advance_sampled(
@@ -109,7 +107,7 @@ SAMPLED: dict[str, Callable[[], object]] = {
     "advance_sampled: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3)": lambda: advance_sampled(
         line([5.0], [9.0, 9.0], brake_rate_mps3=9.0), [[0.0, 0.0]], until_s=1.0
     ),
-    "advance_sampled: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known": lambda: (
+    "advance_sampled: a vehicle of world 0 brakes in pieces (profile), and the result would not be exact": lambda: (
         advance_sampled(line([5.0], [9.0, 9.0]).play_pieces({1: [(0, 3), (1, 5)]}), [[0.0, 0.0]], until_s=1.0)
     ),
 }
@@ -130,7 +128,7 @@ def test_sampled_map__knows_no_impact_before_its_first_sample() -> None:
 def test_contact_that_was_missed__is_a_defect_with_the_world_and_the_time() -> None:
     with refused("world 0: a contact was missed between 0 s and 1 s", PhysicsError):
         advance(OVERLAPPING, 0.0, 1.0)
-    with refused("world 0: a forecast could not reach 2 s", PhysicsError):
+    with refused("world 0: the forecast to 2 s failed", PhysicsError):
         forecast(OVERLAPPING, np.zeros((1, 3)), 1, np.zeros((1, 1)), 2.0)
 
 

@@ -31,20 +31,20 @@ def actor() -> Actor:
 
 
 POLICIES: dict[str, Callable[[], object]] = {
-    "/dev/zero: is not a folder; give a policy bundle (manifest.json": lambda: load_policy("/dev/zero"),
-    "nothing: is not a folder; give a policy bundle (manifest.json": lambda: load_policy("nothing"),
-    "policy None: must be the path of a run or of a policy bundle": lambda: load_policy(None),
-    "observation: float32 of shape (3, 5); this policy takes float32 [n, 4]": lambda: actor()(
+    "/dev/zero: is not a folder; give the folder of a policy bundle (manifest.json": lambda: load_policy("/dev/zero"),
+    "nothing: is not a folder; give the folder of a policy bundle (manifest.json": lambda: load_policy("nothing"),
+    "policy = None: must be the path of a run or of a policy bundle": lambda: load_policy(None),
+    "observation: is float32 of shape (3, 5); must be float32 of shape (n, 4)": lambda: actor()(
         np.zeros((3, 5), np.float32)
     ),
-    "observation: float32 of shape (4,); this policy takes float32 [n, 4]": lambda: actor()(np.zeros(4, np.float32)),
-    "observation: float64 of shape (3, 4); this policy takes float32 [n, 4]": lambda: actor()(np.zeros((3, 4))),
+    "observation: is float32 of shape (4,); must be float32 of shape (n, 4)": lambda: actor()(np.zeros(4, np.float32)),
+    "observation: is float64 of shape (3, 4); must be float32 of shape (n, 4)": lambda: actor()(np.zeros((3, 4))),
     "observation[1, 2] = nan: must be finite": lambda: actor()(np.array([[0, 0, 0, 0], [0, 0, np.nan, 0]], np.float32)),
     "observation[0, 1] = inf: must be finite": lambda: actor()(np.array([[0, np.inf, 0, 0]], np.float32)),
     "agent 'universal@runs/x': universal takes no policy": lambda: make_lineup(["universal@runs/x"], PAPER),
-    "': that policy was trained by sac; write sac@": lambda: make_lineup([f"ppo@{shipped_policies()['sac']}"], PAPER),
-    "agent 'ppo@': a path is needed after '@'": lambda: make_lineup(["ppo@"], PAPER),
-    "agent 'policy': a policy is needed: policy@PATH, where PATH is a run": lambda: make_lineup(["policy"], PAPER),
+    "': the policy was trained by sac; write sac@": lambda: make_lineup([f"ppo@{shipped_policies()['sac']}"], PAPER),
+    "agent 'ppo@': a path must follow '@'": lambda: make_lineup(["ppo@"], PAPER),
+    "agent 'policy' needs a policy: write policy@PATH": lambda: make_lineup(["policy"], PAPER),
     "unknown shipped policy 'ppo-paper-random-obstacle'; it is now called 'ppo-obstacle'": lambda: load_shipped(
         "ppo-paper-random-obstacle"
     ),
@@ -72,7 +72,7 @@ def listen(path: Path) -> None:
 def test_folder_of_a_policy__is_a_plain_folder(make: Callable[[Path], None], empty_folder: Path) -> None:
     make(Path("door"))
     with refused(
-        "door: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run that finished"
+        "door: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors) or of a"
     ):
         load_policy("door")
 
@@ -80,15 +80,15 @@ def test_folder_of_a_policy__is_a_plain_folder(make: Callable[[Path], None], emp
 def test_files_of_a_policy__are_plain_files(empty_folder: Path) -> None:
     listen(Path("manifest.json"))
     Path("weights.safetensors").touch()
-    with refused("manifest.json: is not a plain file but a device, a pipe or a socket", CorruptBundle):
+    with refused("manifest.json: is a device, a pipe or a socket; must be a plain file", CorruptBundle):
         load_policy(".")
 
 
 def test_folder_of_a_policy__holds_one_and_replaces_none(empty_folder: Path) -> None:
     Path("empty").mkdir()
-    with refused("empty: holds no policy; give a policy bundle"):
+    with refused("empty: contains no policy; give the folder of a policy bundle"):
         load_policy("empty")
-    with refused("empty: is there already; give another name", AlreadyExists):
+    with refused("empty: already exists; give another name", AlreadyExists):
         SHIPPED.save(Path("empty"))
 
 
@@ -97,7 +97,7 @@ def test_folder_of_a_policy__is_no_link(link: str, empty_folder: Path) -> None:
     SHIPPED.save(Path("elsewhere"))
     Path("run").mkdir()
     Path(link).symlink_to(Path("elsewhere").absolute())
-    with refused(f"{link}: is a symbolic link; give the folder it points to", CorruptBundle):
+    with refused(f"{link}: is a symbolic link; give the folder to which the link points", CorruptBundle):
         load_policy(link.removesuffix("/policy"))
 
 
@@ -107,7 +107,7 @@ def test_policy__is_made_of_finite_numbers_and_possible_fields() -> None:
     with refused("policy: steps: must be greater than or equal to 0"):
         Policy.make(SHIPPED.tensors, **{**fields, "steps": -1})
     bias = np.full_like(SHIPPED.tensors["policy.0.bias"], np.nan)
-    with refused("policy: tensor 'policy.0.bias' holds a number that is not finite"):
+    with refused("policy: tensor 'policy.0.bias': contains a number that is not finite"):
         Policy.make({**SHIPPED.tensors, "policy.0.bias": bias}, **fields)
 
 

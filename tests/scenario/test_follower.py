@@ -67,13 +67,13 @@ MISTAKES: dict[str, Callable[[], object]] = {
     "bad.yaml, line 9: follower.gap: unknown key": lambda: written("follower: {gap: 5}"),
     "bad.yaml, line 9: follower = 3": lambda: written("follower: 3"),
     "bad.yaml, line 3: gaps_m = -1": lambda: written("follower: {}", gaps_m=-1),
-    "bad.yaml, line 9: follower: the speed of vehicle_2 is drawn; it must be a number, or stand in the table": (
+    "bad.yaml, line 9: follower: the speed of vehicle_2 is random; it must be a fixed number or a column of the": (
         lambda: written("follower: {}", speeds_mps="{uniform: [18, 22]}")
     ),
-    "mixture[0] (stress-wide): follower: the speed of vehicle_3 is drawn": (
+    "mixture[0] (stress-wide): follower: the speed of vehicle_3 is random; it must": (
         lambda: eb.load_scenario("mixture-paper").replace(follower={})
     ),
-    "follower: cannot stand beside vehicle_types; write out the line of 4 instead": (
+    "follower: cannot be combined with vehicle_types; set vehicles: 4 and declare the last": (
         lambda: eb.load_scenario("realistic-mixed").replace(follower={})
     ),
 }

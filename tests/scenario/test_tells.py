@@ -209,7 +209,7 @@ def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_piece
     lacks = Messages.of(mixture.sample(60, 7).worlds).withhold_from(1)
     assert lacks.any() and not lacks.all()
     entries[1]["scenario"] = PAPER.replace(name="part-1").declared()
-    with pytest.raises(InvalidInput, match=r"mixture: part-0 has v2x\.tells and part-1 has none: give it in each"):
+    with pytest.raises(InvalidInput, match=r"mixture: part-0 has v2x\.tells, but part-1 does not; write"):
         eb.Scenario(name="both", mixture=entries)
 
 
@@ -223,14 +223,17 @@ def test_tells__a_mixture_holds_scenarios_whose_messages_contain_different_piece
         ),
         (
             {"tells": {}},
-            "v2x.tells = {}: must be a list of place, speed, acceleration, braking_capacity, latency, mass",
+            "v2x.tells = {}: must be a list of items from place, speed, acceleration, braking_capacity, latency",
         ),
-        ({"tells": ["mass", "mass"]}, "v2x.tells = [mass, mass]: names a piece twice"),
-        ({"tells": {"vehicle_2": "mass"}}, "v2x.tells.vehicle_2 = mass: must be a list of place"),
-        ({"preset": "sensors-only", "tells": ["mass"]}, "v2x.tells = [mass]: hears none has no messages; leave it out"),
+        ({"tells": ["mass", "mass"]}, "v2x.tells = [mass, mass]: must not list an item twice"),
+        ({"tells": {"vehicle_2": "mass"}}, "v2x.tells.vehicle_2 = mass: must be a list of items from place, speed"),
+        (
+            {"preset": "sensors-only", "tells": ["mass"]},
+            "v2x.tells = [mass]: has no effect, because hears: none means that no",
+        ),
         (
             {"preset": "nominal", "tells": {"vehicle_3": []}, "vehicles": {"vehicle_3": {"sends": False}}},
-            "v2x.tells.vehicle_3: sends no messages (v2x.vehicles)",
+            "v2x.tells.vehicle_3: has no effect, because vehicle_3 sends no messages",
         ),
     ],
 )
@@ -258,7 +261,7 @@ def test_agents__who_looks_ahead_refuses_to_do_without_a_piece(spec: str, refuse
         assert evaluation().hidden.all()  # as over a channel that hides something
         return
     with pytest.raises(
-        InvalidInput, match=r"vehicle_3 does not tell its mass \(v2x: tells\), .*latency, mass of others are needed"
+        InvalidInput, match=r"vehicle_3 do not contain its mass \(v2x: tells\), .*, mass of the other vehicles are"
     ):
         evaluation()
 
@@ -273,14 +276,14 @@ def test_agents__of_its_own_vehicle_nobody_needs_a_message() -> None:
 def test_e_v2x_bm_pairwise__needs_no_mass_and_every_other_piece() -> None:
     for piece in ("place", "speed", "braking_capacity", "latency"):
         lacking = PAPER.replace(v2x={"tells": [each for each in USUAL_PIECES if each != piece]})
-        with pytest.raises(InvalidInput, match=f"vehicle_1 does not tell its {piece}"):
+        with pytest.raises(InvalidInput, match=f"vehicle_1 do not contain its {piece}"):
             eb.evaluate(lacking.sample(2, 7), {"e": eb.make_agent("e_v2x_bm:pairwise")}, scenario=lacking)
 
 
 def test_shield__stands_before_a_team_only_if_all_its_vehicles_tell_all() -> None:
     team = eb.load_scenario("cooperation-3-pair")
     lacking = team.replace(v2x={**team.v2x.model_dump(exclude_none=True), "tells": {"vehicle_2": ["place", "speed"]}})
-    with pytest.raises(InvalidInput, match="shield: vehicle_2 does not tell its braking_capacity"):
+    with pytest.raises(InvalidInput, match="shield: messages of vehicle_2 do not contain its braking_capacity"):
         eb.shield(eb.parallel_env(lacking)).reset(seed=7)
     alone = lacking.with_learners(["vehicle_2"])  # what it tells, its own shield does not need
     eb.shield(eb.parallel_env(alone)).reset(seed=7)
@@ -305,9 +308,9 @@ def test_own_features__say_what_they_read_or_are_refused() -> None:
         assert seen_by(engine_of(LINE, unsaid), 1) == pytest.approx({unsaid[0]: 1.18, unsaid[1]: 0.9})
         lacking = LINE.replace(v2x={"tells": {"vehicle_3": ["place"]}})
         assert seen_by(engine_of(lacking, said), 1) == pytest.approx({said[0]: 0.0, said[1]: 0.9})
-        with pytest.raises(InvalidInput, match=r"feature .double_mass.: vehicle_3 does not tell its speed .*reads="):
+        with pytest.raises(InvalidInput, match=r"feature 'double_mass': the messages of vehicle_3 do not contain its"):
             seen_by(engine_of(lacking, unsaid), 1)
-        with pytest.raises(InvalidInput, match="reads = 'mass': a neighbour's feature names some of place, speed"):
+        with pytest.raises(InvalidInput, match="reads = 'mass': must be a list of names from place, speed"):
             register_feature("double_mass_3", double_mass, **limits, reads="mass")
     finally:
         for name in ("double_mass", "double_mass_read"):
@@ -315,7 +318,7 @@ def test_own_features__say_what_they_read_or_are_refused() -> None:
 
 
 def test_run__refuses_before_it_trains_because_its_baseline_and_its_shield_would(tmp_path: Path) -> None:
-    where = r"run, with the baseline e_v2x_bm and a shield: vehicle_3 does not tell its mass \(v2x: tells\)"
+    where = r"run, with the baseline e_v2x_bm and a shield: messages of vehicle_3 do not contain its mass"
     with pytest.raises(InvalidInput, match=where):
         run_experiment(LIGHT, tmp_path / "run", recipe=eb.load_recipe("ppo"), episodes=5)
     assert not (tmp_path / "run").exists()

@@ -39,7 +39,7 @@ def test_list__has_no_variants() -> None:
 
 @pytest.mark.parametrize("setting", [{"allowance": 5.0}, {"logging": True}, {"shares": True}], ids=str)
 def test_episode__takes_none_of_what_step_takes(setting: dict[str, object]) -> None:
-    with refused("mode episode takes none; step does"):
+    with refused("not a setting of mode episode; use mode step"):
         eb.ShieldOptions(mode="episode", **setting)
 
 
@@ -68,5 +68,5 @@ def test_what_an_extension_has__is_refused_in_one_line(message: str) -> None:
 
 
 def test_variant__of_an_agent_is_an_argument_that_it_does_not_take() -> None:
-    with refused("agent 'e_v2x_bm:estimated': the argument must be 'coupled' or 'pairwise'"):
+    with refused("agent 'e_v2x_bm:estimated': argument: must be 'coupled' or 'pairwise'"):
         make_agent("e_v2x_bm:estimated", scenario=PAPER)

@@ -63,10 +63,10 @@ def cheat(engine, what, last_only):
 
 
 CHEATS = {
-    "a step": "is at step 2 of its episode, certified was step 1",
-    "first-impact harm": "first-impact harm of pair 1 is .* certified was",
-    "total harm": "total harm of pair 1 is .* certified was",
-    "speed": "speed of vehicle 1 of the line is .* certified was",
+    "a step": "is at step 2 of its episode, but the shield predicted step 1",
+    "first-impact harm": "first-impact harm of pair 1 is .* but the shield predicted",
+    "total harm": "total harm of pair 1 is .* but the shield predicted",
+    "speed": "speed of vehicle 1 of the line is .* but the shield predicted",
 }
 
 
@@ -177,7 +177,7 @@ def drives_off(worlds, vehicle):
 
 def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
     env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=PAPER.replace(horizon_s=3.0)).unwrapped)
-    with pytest.warns(MovingAtHorizon, match="in 1 of 1 worlds something still moves at the horizon, 3 s") as told:
+    with pytest.warns(MovingAtHorizon, match="in 1 of 1 worlds a vehicle still moves at the horizon .3 s.") as told:
         env.reset(seed=0)
         env.reset(seed=1)
     assert len(told) == 1

@@ -53,37 +53,45 @@ def team() -> StepShield:
 STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: vehicle = 9: must be an index from 0 to 2": lambda: StepShield(PAPER, 9),
     "shield: allowance = -1.0: must be a number, at least 0 m2/s2": lambda: StepShield(PAPER, 1, allowance=-1.0),
-    "shield: decide, but no episode has begun; call begin first": lambda: StepShield(PAPER, 1).decide(np.zeros(3)),
-    "shield: proposed (3,); (5,) is needed": lambda: started().decide(np.zeros(3)),
-    "shield: begin in row 7 of a batch of 5: a larger batch begins with all of its rows at once": lambda: (
+    "shield: decide() was called before any episode began; call begin first": lambda: StepShield(PAPER, 1).decide(
+        np.zeros(3)
+    ),
+    "shield: shape of proposed = (3,): must be (5,)": lambda: started().decide(np.zeros(3)),
+    "shield: begin in row 7, but the batch has 5 rows; to enlarge it, begin in all of its rows at once": lambda: (
         started().begin(WORLDS.take([0, 1]), np.array([3, 7]))
     ),
-    "certify: proposed (2,), backup's harm (5,), budget (5,); (5,), and twice (5,) needed": lambda: certify(
+    "certify: shape of proposed = (2,), of backup.harm = (5,), of budget = (5,): must be (5,), (5,)": lambda: certify(
         started().memory.running, np.zeros(2), started().memory.backup, started().bound
     ),
-    "certify: a budget is below the backup's harm; nothing could be guaranteed": lambda: certify(
+    "certify: budget: must be at least backup.harm in every world": lambda: certify(
         started().memory.running, np.zeros(5), started().memory.backup, started().bound - 1.0
     ),
-    "shield: plan (5, 3); (5, at least 75) is needed": lambda: plan_harm(started().memory.running, np.zeros((5, 3))),
-    "certify: proposed (1,), backup's harm (1,), budget (1,); (1, 2), and twice (1,) needed": lambda: certify(
+    "shield: shape of plan = (5, 3): must be (5, at least 75)": lambda: plan_harm(
+        started().memory.running, np.zeros((5, 3))
+    ),
+    "certify: shape of proposed = (1,), of backup.harm = (1,), of budget = (1,): must be (1, 2), (1,)": lambda: certify(
         team().memory.running, np.zeros(1), team().memory.backup, team().bound
     ),
-    "shield: plan (1, 81); (1, at least 75, 2) is needed": lambda: plan_harm(team().memory.running, np.zeros((1, 81))),
-    "shield: vehicle = (2, 1): several are named front to rear, each once": lambda: StepShield(PAIR, (2, 1)),
-    "shield: vehicle = (): must be an index from 0 to 2": lambda: StepShield(PAIR, ()),
-    "shield: cap 'baseline' and 5 possible worlds: give one of the two": lambda: StepShield(
-        PAPER, 1, cap="baseline"
-    ).begin(WORLDS.take([0]), np.arange(1), BRAKE, possible=WORLDS),
-    "shield: policies for vehicles [1], shielded are [1, 2]": lambda: StepShield(PAIR, (1, 2)).begin(
-        PAIR.sample(1, 0).worlds, np.arange(1), COAST
+    "shield: shape of plan = (1, 81): must be (1, at least 75, 2)": lambda: plan_harm(
+        team().memory.running, np.zeros((1, 81))
     ),
-    "shield: told of 2 worlds, but row 4 begins": lambda: drive(
+    "shield: vehicle = (2, 1): several indices must be in increasing order, each once": lambda: StepShield(
+        PAIR, (2, 1)
+    ),
+    "shield: vehicle = (): must be an index from 0 to 2": lambda: StepShield(PAIR, ()),
+    "shield: cap = 'baseline': must be None with 5 possible worlds": lambda: StepShield(PAPER, 1, cap="baseline").begin(
+        WORLDS.take([0]), np.arange(1), BRAKE, possible=WORLDS
+    ),
+    "shield: policy: has vehicles [1]; must have exactly the shielded vehicles, [1, 2]": lambda: StepShield(
+        PAIR, (1, 2)
+    ).begin(PAIR.sample(1, 0).worlds, np.arange(1), COAST),
+    "shield: told: has 2 worlds, but an episode begins in row 4; must have a world for every": lambda: drive(
         WORLDS, ShieldedDriver(COAST, PAPER, told=WORLDS.take([0, 1])), PAPER, 1
     ),
-    "review: nothing was logged; make the shield with logging=True, and drive behind it": lambda: review(
+    "review: the shield has no log; make it with logging=True, and run episodes behind it": lambda: review(
         drive(WORLDS, ShieldedDriver(COAST, PAPER), PAPER, 1).guarded.shield, COAST, WORLDS
     ),
-    "review: 5 worlds, but 1 were driven last": lambda: review(
+    "review: worlds: has 5 worlds; must be the 1 of the shield's last episodes": lambda: review(
         drive(WORLDS.take([0]), ShieldedDriver(COAST, PAPER, logging=True), PAPER, 1).guarded.shield, COAST, WORLDS
     ),
 }
@@ -97,20 +105,22 @@ def test_step_shield__refuses(message: str) -> None:
 
 AGENTS: dict[str, Callable[[], object]] = {
     "must be a Scenario; eb.load_scenario(name) loads one": lambda: ShieldedDriver(COAST, "paper-random"),
-    "step: told = 3: must be worlds at the alert, or None": lambda: ShieldedDriver(COAST, PAPER, told=3),
-    "shield: mode = 'episode': HybridAgent is that of mode episode": lambda: ShieldedDriver(
+    "step: told = 3: must be a Worlds object (the worlds at the alert) or None": lambda: ShieldedDriver(
+        COAST, PAPER, told=3
+    ),
+    "shield: mode = 'episode': use HybridAgent, the agent of this mode": lambda: ShieldedDriver(
         COAST, PAPER, mode="episode"
     ),
     "agent 'coast+step' drives vehicle_2, but vehicle_3 of scenario 'cooperation-3-pair'": lambda: drive(
         PAIR.sample(1, 0).worlds, ShieldedDriver(COAST, PAIR), PAIR, 1
     ),
-    "team 'half': does not drive vehicle_3; beside a shielded vehicle every other one is shielded too": lambda: (
-        ShieldedDriver(Team({1: COAST}, "half"), PAIR)
+    "team 'half': does not drive vehicle_3; behind a shield, a team must drive every learner": lambda: ShieldedDriver(
+        Team({1: COAST}, "half"), PAIR
     ),
-    "e_v2x_bm mode 'couple': must be 'coupled' or 'pairwise'": lambda: HybridAgent(BRAKE, PAPER, bound="couple"),
+    "e_v2x_bm: mode = 'couple': must be 'coupled' or 'pairwise'": lambda: HybridAgent(BRAKE, PAPER, bound="couple"),
     "harm_count 'both': must be 'first' or 'total'": lambda: HybridAgent(BRAKE, PAPER, harm_count="both"),
-    "shield: agent 'coast' needs scenario=, in which to certify, and takes no policy": lambda: eb.shield(COAST),
-    "shield: agent 'coast+step' is behind a shield already": lambda: eb.shield(
+    "shield: agent 'coast': pass scenario= (the scenario for certification) and no policy=": lambda: eb.shield(COAST),
+    "shield: agent 'coast+step' already has a shield": lambda: eb.shield(
         make_agent("coast+step", scenario=PAPER), scenario=PAPER
     ),
 }
@@ -123,8 +133,8 @@ def test_agent_behind_a_shield__is_refused(message: str) -> None:
 
 
 OPTIONS: dict[str, Callable[[], object]] = {
-    "shield: cap = 'baseline': mode step alone takes one": lambda: ShieldOptions(mode="episode", cap="baseline"),
-    "shield: bound = 'pairwise': mode step takes none; episode does": lambda: ShieldOptions(
+    "shield: cap = 'baseline': only mode step has a cap": lambda: ShieldOptions(mode="episode", cap="baseline"),
+    "shield: bound = 'pairwise': not a setting of mode step; use mode episode": lambda: ShieldOptions(
         mode="step", bound="pairwise"
     ),
     "shield: cap = 'mine': must be baseline or None": lambda: ShieldOptions(cap="mine"),
@@ -144,36 +154,38 @@ def test_options__are_refused(message: str) -> None:
 
 
 AROUND: dict[str, Callable[[], object]] = {
-    "ShieldedVecEnv: bound = 'pairwise': mode step takes none; episode does": lambda: ShieldedVecEnv(
+    "ShieldedVecEnv: bound = 'pairwise': not a setting of mode step; use mode episode": lambda: ShieldedVecEnv(
         make_sb3_vec_env(PAPER, 2), mode="step", bound="pairwise"
     ),
-    "HybridShield: goes around eb.parallel_env, not None; eb.shield(env) chooses the one": lambda: HybridShield(
-        None, BRAKE
+    "HybridShield: None: must be an environment made by eb.parallel_env; eb.shield(env) chooses the": lambda: (
+        HybridShield(None, BRAKE)
     ),
-    "ShieldedEnv: goes around gymnasium.make('EthBrake-v0')": lambda: ShieldedEnv(gymnasium.make("CartPole-v1")),
-    "policy = 'ppo': must be an agent or a policy (eb.load_policy); wrap a function by eb.policy_agent": lambda: (
+    "must be an environment made by gymnasium.make('EthBrake-v0')": lambda: ShieldedEnv(gymnasium.make("CartPole-v1")),
+    "policy = 'ppo': must be an agent or a policy (eb.load_policy); eb.policy_agent(function) makes": lambda: (
         HybridShield(parallel_env(), "ppo")
     ),
-    "HybridShield: agents = 5: must be a list of names": lambda: HybridShield(parallel_env(), BRAKE, agents=5),
-    "HybridShield: shields every learner, ('vehicle_2',), and nobody else; got ('vehicle_1',). What": lambda: (
+    "HybridShield: agents = 5: must be a list of vehicle names": lambda: HybridShield(parallel_env(), BRAKE, agents=5),
+    "HybridShield: agents = ('vehicle_1',): must be all learners, ('vehicle_2',), since the bound": lambda: (
         HybridShield(parallel_env(), BRAKE, agents=["vehicle_1"])
     ),
-    "HybridShield: policy: one for each of vehicle_2, vehicle_3 is needed, and for nobody else": lambda: HybridShield(
-        parallel_env(PAIR), {"vehicle_2": COAST}, mode="step"
+    "HybridShield: policy: must have one policy for each of vehicle_2, vehicle_3, and for no other": lambda: (
+        HybridShield(parallel_env(PAIR), {"vehicle_2": COAST}, mode="step")
     ),
     "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3); HybridShield needs exactly one": lambda: (
         HybridShield(parallel_env(PAIR), COAST, mode="episode")
     ),
-    "no vehicle of scenario 'paper-random' learns, so there is nobody to shield; pass": lambda: HybridShield(
+    "no vehicle of scenario 'paper-random' learns, and only learners can be shielded; make": lambda: HybridShield(
         parallel_env(learners=[]), BRAKE, mode="step"
     ),
-    "HybridShield: goes around eb.parallel_env, not ethbrake_v0; eb.shield(env) chooses the one": lambda: HybridShield(
-        aec_env(), mode="step"
+    "HybridShield: ethbrake_v0: must be an environment made by eb.parallel_env; eb.shield(env) chooses": lambda: (
+        HybridShield(aec_env(), mode="step")
     ),
-    "shield: BaseWrapper<ethbrake_v0> acts in turns: put the shield inside it": lambda: eb.shield(
+    "shield: in BaseWrapper<ethbrake_v0> the agents act in turn; shield the parallel": lambda: eb.shield(
         BaseWrapper(aec_env())
     ),
-    "shield: None has none of the interfaces: parallel_env, env (agents in turn), EthBrakeEnv": lambda: eb.shield(None),
+    "shield: None: must be an agent, a team, or an environment made by eb.parallel_env, eb.env": lambda: eb.shield(
+        None
+    ),
 }
 
 
@@ -212,17 +224,17 @@ ALREADY: dict[str, Callable[[], object]] = {
 
 @pytest.mark.parametrize("interface", ALREADY)
 def test_second_shield__is_refused_because_a_bound_holds_for_one_alone(interface: str) -> None:
-    with refused("(mode step) shields this environment already, and its bound holds for one shield alone"):
+    with refused("(mode step), and can have only one; give that shield other options"):
         ALREADY[interface]()
 
 
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        ({}, "shield: no action was given, and there is no policy that could propose one"),
-        ([0.0], "step: actions = [0.0]: must be a mapping such as {'vehicle_2': [-1.0]}"),
-        ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2: nan; must be in [-1, 1]"),
-        ({"vehicle_2": np.array([1.5])}, "action of vehicle_2: 1.5; must be in [-1, 1]"),
+        ({}, "shield: an action is missing, and no policy can propose it; pass an action or policy="),
+        ([0.0], "step: actions = [0.0]: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}"),
+        ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full"),
+        ({"vehicle_2": np.array([1.5])}, "action of vehicle_2: 1.5; must be from -1 (full braking) to 1 (full"),
         ({"vehicle_2": np.array([1j])}, "action of vehicle_2: array([0.+1.j]) is not a number"),
     ],
     ids=["none", "no mapping", "nan", "beyond 1", "complex"],
@@ -238,7 +250,7 @@ def test_action__of_agents_in_turn_is_refused() -> None:
     env = shielded_aec(parallel_env(), mode="step")
     env.reset(seed=7)
     env.step(None)
-    with refused("action of vehicle_2: 3.0; must be in [-1, 1], from full braking to full driving"):
+    with refused("action of vehicle_2: 3.0; must be from -1 (full braking) to 1 (full driving)"):
         env.step([3.0])
 
 
@@ -256,14 +268,14 @@ def test_closed_shield__is_refused_and_cannot_be_used() -> None:
         eb.shield(env)
     many = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
     many.close()
-    with refused("ShieldedVecEnv: this shield was closed; put a new one around the environment"):
+    with refused("ShieldedVecEnv: this shield was closed; put a new shield around the environment"):
         many.reset()
 
 
 def test_snapshot__is_restored_before_the_shield_is_put_around() -> None:
     env = ShieldedVecEnv(make_sb3_vec_env(PAPER, 2))
     env.reset()
-    with refused("engine snapshot: a shield stands in this engine; restore first, then put the shield around"):
+    with refused("engine snapshot: this engine has a shield, whose memory a snapshot does not contain"):
         env.env_method("restore", env.venv.snapshot())
 
 
@@ -279,7 +291,7 @@ def test_step_wait__needs_a_step() -> None:
 def test_episode_that_began_before_the_shield__is_not_certified() -> None:
     plain = EthBrakeEnv()
     plain.reset(seed=3)
-    with refused("shield: this episode began before the shield was put around it; reset first", UncertifiedStep):
+    with refused("shield: this episode began before the shield was added; call reset first", UncertifiedStep):
         ShieldedEnv(plain).step([1.0])
 
 
@@ -296,5 +308,5 @@ def test_environment_that_was_exchanged_inside__is_noticed() -> None:
     shielded = eb.shield(Fresh(EthBrakeEnv("paper-random")))
     shielded.reset(seed=7)
     shielded.step([1.0])
-    with refused("ShieldedEnv: another environment is inside than the one that is shielded"):
+    with refused("ShieldedEnv: the environment inside this wrapper was replaced"):
         shielded.reset(seed=8)

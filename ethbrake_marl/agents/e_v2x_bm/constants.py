@@ -1,9 +1,10 @@
-"""Simulate many constant decelerations of one vehicle in one world, compiled; used by the coupled search.
+"""Simulate many constant decelerations of one vehicle in one world, for the coupled search. Compiled.
 
-The harm equals that of ``physics.advance`` under constant commands, to the bit; the motion is not kept. Three things
-make it cheap. All candidates share the motion until the vehicle's command takes effect, so it is simulated once. A
-simulation ends as soon as no two vehicles can meet any more (``will_stay_apart``). And it is abandoned once its harm,
-which never decreases, has reached a bound.
+The harm equals the harm from ``physics.advance`` under constant commands to the bit. Three things save time:
+
+- The motion until the vehicle's command takes effect is the same for all decelerations, and is simulated once.
+- A simulation ends as soon as no pair can have another impact (``will_stay_apart``).
+- A simulation ends once its harm, which never decreases, has reached a bound.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ from ethbrake_marl.physics.rows import FLAG, LISTED, ROW, builds_up, place_force
 from ethbrake_marl.physics.segment import move_apart, start_events, to_next_event, to_next_impact
 from ethbrake_marl.physics.state import Bools, Floats
 
-DURATION, RESTITUTION, SHARED_S = range(3)  # entries of a line's clock
+DURATION, RESTITUTION, SHARED_S = range(3)  # indices of ``Line.clock``
 
-CLEAR_M, CLEAR_MPS = 1e-6, 1e-6  # margins, a million times the rounding error of a gap or a speed
+CLEAR_M, CLEAR_MPS = 1e-6, 1e-6  # margins for gaps and speeds, a million times the rounding error
 
 _DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of each pair
 
@@ -34,18 +35,19 @@ _DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of e
 class Line(NamedTuple):
     """One world in which decelerations of one vehicle are simulated, as tables of ``physics.rows``.
 
-    A table has a row per quantity and a column per vehicle, front to rear; an obstacle ahead is column 0.
+    A table has a row for each quantity and a column for each vehicle, front to rear. With an obstacle ahead, column 0
+    is the obstacle.
     """
 
-    start: Floats  # [rows, N or N + 1] table at the start, with all commands but the controlled vehicle's
+    start: Floats  # [rows, N or N + 1] table at the start, with the commands of all other vehicles
     shared: Floats  # same shape: table at the time when the controlled vehicle's command takes effect
-    table: Floats  # same shape: workspace, in which each simulation runs
-    clock: Floats  # [3] length of a simulation (s), restitution, time from ``start`` to ``shared`` (s)
+    table: Floats  # same shape: workspace of each simulation
+    clock: Floats  # [3] duration of a simulation (s), restitution, time from ``start`` to ``shared`` (s)
     controlled: int  # column of the controlled vehicle
-    vehicles: int  # column of Vehicle 1: 1 behind an obstacle, else 0
+    vehicles: int  # column of Vehicle 1: 1 with an obstacle ahead, otherwise 0
     harm: int  # row of the harm that is minimised: first-impact or total
-    other: int  # row of the other harm, which decides ties
-    no_rows: Floats  # empty list of impacts, so that single impacts are not recorded
+    other: int  # row of the harm under the other count, which decides ties
+    no_rows: Floats  # table of impacts without rows, so that impacts are not recorded
 
 
 @compiled(apart=True)
@@ -54,27 +56,27 @@ def make_line(
     mass: Floats, limit: Floats, in_force: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats,
     time: float, restitution: float, horizon: float, vehicle: int, total: bool,
 ) -> Line:  # fmt: skip
-    """Return the tables of one world of N vehicles, on which ``share_start`` is called next.
+    """Return the tables of one world of N vehicles. Call ``share_start`` next.
 
     Args:
-        gap: [N - 1] m, bumper to bumper.
-        speed: [N] m/s.
-        hit: [N - 1] whether the pair has had an impact.
-        obstacle: distance from Vehicle 1 to an obstacle ahead, m; infinite: none.
-        obstacle_hit: whether Vehicle 1 has had an impact with it.
-        command: [N] commands, m/s2; the controlled vehicle's is ignored.
-        latency: [N] s since the alert.
-        mass: [N] t.
-        limit: [N] speed limits, m/s.
-        in_force: [N] accelerations in force at the start, m/s2.
-        brake_rate: [N] rates at which brakes build up, m/s3.
-        release_rate: [N] rates at which brakes are released, m/s3.
-        pieces: [N, 2 K] braking profiles with K intervals of constant command, as in ``Vehicles``.
+        gap: gap of each pair, [N - 1] m, bumper to bumper.
+        speed: speed of each vehicle, [N] m/s.
+        hit: whether each pair has had an impact, [N - 1].
+        obstacle: distance from Vehicle 1 to an obstacle ahead, m; infinite without an obstacle.
+        obstacle_hit: whether Vehicle 1 has had an impact with the obstacle.
+        command: command of each vehicle, [N] m/s2; the controlled vehicle's command is ignored.
+        latency: latency of each vehicle, [N] s since the alert.
+        mass: mass of each vehicle, [N] t.
+        limit: speed limit of each vehicle, [N] m/s.
+        in_force: acceleration of each vehicle in force at the start, [N] m/s2.
+        brake_rate: rate at which each vehicle's brakes build up, [N] m/s3.
+        release_rate: rate at which each vehicle's brakes are released, [N] m/s3.
+        pieces: braking profiles with K intervals of constant command, as in ``Vehicles``, [N, 2 K].
         time: time of the world, s since the alert.
-        restitution: of every impact, 0 to 1.
+        restitution: restitution of every impact, 0 to 1.
         horizon: end of the simulations, s since the alert.
         vehicle: index of the controlled vehicle, from 0.
-        total: minimise total harm; if False, first-impact harm.
+        total: whether total harm is minimised; if False, first-impact harm.
 
     """
     at = 1 if obstacle < math.inf else 0
@@ -102,8 +104,7 @@ def make_line(
 def share_start(line: Line) -> int:
     """Simulate in ``line.shared`` until the controlled vehicle's command takes effect; return a status.
 
-    That time is written to ``line.clock``. The status is ``FLAG.DONE``, or the code of the check of the physics that
-    failed.
+    ``line.clock`` receives this time. The status is ``FLAG.DONE``, or the code of the physics check that failed.
     """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
@@ -124,17 +125,17 @@ def share_start(line: Line) -> int:
 
 @compiled(apart=True, bare=True)
 def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -> int:
-    """Simulate constant decelerations of the controlled vehicle and write their results into ``samples``.
+    """Simulate constant decelerations of the controlled vehicle, and write the results into ``samples``.
 
     Args:
-        line: the world, after ``share_start``; its ``table`` is overwritten.
-        samples: ``at`` holds the decelerations; the other columns are filled in.
+        line: the world, after ``share_start``; ``line.table`` is overwritten.
+        samples: samples with the decelerations in ``at``; the other columns receive the results.
         first: index of the first sample to simulate.
-        end: index after the last one.
-        bound: harm at which a simulation stops, m2/s2. Its harm is then only known to be at least ``bound``, and its
+        end: index after the last sample to simulate.
+        bound: harm at which a simulation stops, m2/s2. If it stops, the sample's harm is at least ``bound``, and its
             other columns are meaningless.
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
     """
     for s in range(first, end):
@@ -152,9 +153,9 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
 
 @compiled(within=True)
 def _simulate_one(line: Line, command: float, bound: float) -> int:
-    """Simulate one ``command`` (m/s2) in ``line.table``, until the harm reaches ``bound`` at the latest.
+    """Simulate one ``command`` (m/s2) in ``line.table``; stop early if the harm reaches ``bound`` (m2/s2).
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     table, duration = line.table, line.clock[DURATION]
     table[ROW.COMMAND, line.controlled] = command
@@ -176,7 +177,7 @@ def _simulate_one(line: Line, command: float, bound: float) -> int:
 
 @compiled(within=True)
 def _copy_state(of: Floats, table: Floats) -> None:
-    """Copy the state of the vehicles and pairs from table ``of`` to ``table``; masses and other parameters stay."""
+    """Copy the state of all vehicles and pairs from table ``of`` to ``table``, but not masses and other parameters."""
     vehicles = table.shape[1]
     for i in range(vehicles):
         table[ROW.SPEED, i] = of[ROW.SPEED, i]
@@ -205,18 +206,21 @@ def copy_table(one: Floats, other: Floats) -> None:
 
 @compiled(within=True)
 def will_stay_apart(table: Floats) -> bool:
-    """Return whether no pair can have another impact, however long all commands last; False if that is not certain.
+    """Return whether it is certain that no pair has another impact while the present commands last.
 
-    ``table`` is the table of one world (``physics.rows``). Commands must be in full effect, and no vehicle may drive or
-    move backward. Then every vehicle keeps its acceleration until it stands; vehicles that rest against each other have
-    a common one. A pair of a front vehicle f and a rear vehicle r has gap g, closing speed w, speeds v and
-    decelerations d. It has no impact if one of these is true, the last one with margins for rounding:
+    ``table`` is the table of one world (``physics.rows``). The result is False if a command is not yet in full effect,
+    or if a vehicle drives or moves backward. Otherwise every vehicle keeps its acceleration until it stands, and
+    vehicles that press against each other have the same acceleration.
 
-    * r stands, or both move as one body;
-    * ``w <= 0`` and ``d_r >= d_f``: then w stays at most 0 until r stands;
-    * r would stop behind f, ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``; the pair does not touch, or separates; and if r
-      closes and brakes harder, the smallest gap is positive too: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the
-      gap is least at one of its ends: it is concave until f stands, and decreases from then on.)
+    Let a pair of a front vehicle f and a rear vehicle r have the gap g, the closing speed w, the speeds v_f and v_r,
+    and the decelerations d_f and d_r. The pair has no impact under any of these conditions:
+
+    * Vehicle r stands, or both vehicles move as one body.
+    * ``w <= 0`` and ``d_r >= d_f``. Then w stays at most 0 until r stands.
+    * All of the following hold, with margins for rounding. The stopping point of r is behind the stopping point of f:
+      ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``. The vehicles do not touch, or they separate. If r closes in and brakes
+      harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the gap is
+      smallest now or at the end, because it is a concave function of time until f stands, and decreases afterwards.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):
@@ -255,16 +259,16 @@ def will_stay_apart(table: Floats) -> bool:
 
 @compiled(within=True)
 def _way_to_stop(speed: float, acceleration: float) -> float:
-    """Return the distance in which a vehicle with this speed (m/s) stops, m; ``acceleration`` (m/s2) <= 0.
+    """Return the distance in which a vehicle with ``speed`` (m/s) and ``acceleration`` (m/s2, at most 0) stops, m.
 
-    It is infinite for a moving vehicle with acceleration 0.
+    The distance is infinite for a moving vehicle with acceleration 0.
     """
     return speed * speed / (2.0 * abs(acceleration)) if speed > 0.0 else 0.0
 
 
 @compiled(within=True)
 def _course(line: Line) -> float:
-    """Return a number that encodes how many impacts each pair, and the obstacle, had in ``line.table``."""
+    """Return a number that encodes the numbers of impacts of each pair, and with the obstacle, in ``line.table``."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
         course += table[ROW.COUNT, p] * digit
@@ -274,7 +278,7 @@ def _course(line: Line) -> float:
 
 @compiled(within=True)
 def _sum_row(line: Line, row: int) -> float:
-    """Sum a row of ``line.table`` over the pairs and the obstacle, in the order in which NumPy sums a row."""
+    """Return the sum of a row of ``line.table`` over the pairs and the obstacle, in NumPy's order of summation."""
     table, first, total = line.table, line.vehicles, 0.0
     eights = (table.shape[1] - 1 - first) // 8
     if eights > 0:
@@ -286,9 +290,9 @@ def _sum_row(line: Line, row: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
-    """Sum ``table[row, first:end]``, a multiple of eight entries, in NumPy's order.
+    """Return the sum of ``table[row, first:end]``, a multiple of eight entries, in NumPy's order of summation.
 
-    Each of the eight positions in a block is summed separately, then the eight sums are added pairwise.
+    Eight partial sums, each of every eighth entry, are added pairwise.
     """
     return (
         (_sum_place(table, row, first, end) + _sum_place(table, row, first + 1, end))
@@ -301,7 +305,7 @@ def _sum_eights(table: Floats, row: int, first: int, end: int) -> float:
 
 @compiled(apart=True, bare=True)
 def _sum_place(table: Floats, row: int, first: int, end: int) -> float:
-    """Sum every eighth entry of ``table[row, first:end]``, beginning with the first."""
+    """Return the sum of every eighth entry of ``table[row, first:end]``, from index ``first`` on."""
     total = table[row, first]
     for p in range(first + 8, end, 8):
         total += table[row, p]

@@ -1,19 +1,19 @@
 """First contact of a single pair in closed form, and the decelerations that avoid it.
 
-Symbols, for a pair on its own (docs/internals/proofs/constant-deceleration.md derives every formula):
+The symbols for a pair follow; docs/internals/proofs/constant-deceleration.md derives every formula.
 
 =============  ===============================================================
 l, f           leader (front vehicle), follower (rear vehicle)
 gap            bumper to bumper at the start [m], >= 0
 v_l, v_f       speeds at the start [m/s], >= 0
 a_l, a_f       decelerations [m/s2], >= 0, held to standstill
-onset_l/_f     start of braking after the start [s]; before it a vehicle coasts
+onset_l/_f     time from the start until the vehicle brakes [s]; before, it coasts
 tau            time from the leader's onset to the follower's [s], >= 0
 lead           time from the follower's onset to the leader's [s], > 0
 w              closing speed ``v_f - v_l`` [m/s]
 =============  ===============================================================
 
-Only + - * / and sqrt are used, so a world gives the same bits in any batch.
+Only + - * / and sqrt are used, so the result for a world has the same bits in any batch.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NONE = -1.0
 def stopping_time(speed: float, deceleration: float) -> float:
     """Return the time in which a vehicle stops, s; 0 at rest, inf without braking.
 
-    It is ``speed / deceleration``, in m/s and m/s2.
+    The time is ``speed / deceleration``, with the speed in m/s and the deceleration in m/s2.
     """
     if speed == 0.0:
         return 0.0
@@ -45,7 +45,7 @@ def stopping_time(speed: float, deceleration: float) -> float:
 def stopping_distance(speed: float, deceleration: float) -> float:
     """Return the distance in which a vehicle stops, m; 0 at rest, inf without braking.
 
-    It is ``speed^2 / (2 deceleration)``, in m/s and m/s2.
+    The distance is ``speed^2 / (2 deceleration)``, with the speed in m/s and the deceleration in m/s2.
     """
     if speed == 0.0:
         return 0.0
@@ -56,12 +56,13 @@ def stopping_distance(speed: float, deceleration: float) -> float:
 def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
     """Return the squared closing speed if the pair meets while the follower coasts, else -1. [m2/s2]
 
-    Regimes A (the leader still moves) and A' (it stands) of docs/internals/proofs/constant-deceleration.md.
+    These are the regimes A (the leader still moves) and A' (the leader stands) of
+    docs/internals/proofs/constant-deceleration.md.
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
         tau: time until which the follower coasts, s.
 
@@ -83,16 +84,16 @@ def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: 
 
 @compiled
 def contact_while_both_brake(gap: float, v_l: float, a_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the squared closing speed if the pair meets while both brake and move, else -1. [m2/s2]
+    """Return the squared closing speed if the pair meets while both vehicles brake and move, else -1. [m2/s2]
 
-    Regime B of docs/internals/proofs/constant-deceleration.md.
+    This is regime B of docs/internals/proofs/constant-deceleration.md.
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
         tau: time until which the follower coasts, s.
 
     """
@@ -121,9 +122,9 @@ def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: fl
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, >= 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, >= 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``tau`` to standstill, m/s2, >= 0.
+        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, >= 0.
         tau: time until which the follower coasts, s.
 
     """
@@ -143,7 +144,8 @@ def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: fl
 def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) -> float:
     """Return the squared closing speed if a braking follower meets a leader that still coasts; else -1. [m2/s2]
 
-    The pair meets at ``s = 2 gap / (w + sqrt(w^2 - 2 a_f gap)) <= lead``. A touch is ignored: the pair separates again.
+    The pair meets at the time ``2 gap / (w + sqrt(w^2 - 2 a_f gap)) <= lead``. A touch without impact is ignored,
+    because the pair then separates again.
 
     Args:
         gap: gap at the start, m.
@@ -162,16 +164,16 @@ def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) 
 def closing_speed_squared(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float
 ) -> float:
-    """Return the squared closing speed at the pair's first impact; 0 without one, or for a mere touch. [m2/s2]
+    """Return the squared closing speed at the pair's first impact; 0 without an impact. [m2/s2]
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
-        onset_l: time until which it coasts, s.
+        a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, >= 0.
+        onset_l: time until which the leader coasts, s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
-        onset_f: time until which it coasts, s.
+        a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, >= 0.
+        onset_f: time until which the follower coasts, s.
 
     """
     w = v_f - v_l
@@ -194,14 +196,14 @@ def closing_speed_squared(
 
 @compiled
 def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
-    """Return the smallest deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+    """Return the smallest deceleration of the follower that avoids an impact; inf if none does. [m/s2]
 
-    The case of ``least_to_spare_front`` in which the leader brakes first.
+    This is the case of ``least_to_spare_front`` in which the leader brakes first.
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from the start to standstill, m/s2, > 0.
+        a_l: the leader's deceleration, held from the start to standstill, m/s2, > 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
         tau: time until which the follower coasts, s, >= 0.
 
@@ -224,14 +226,14 @@ def least_behind_braking(gap: float, v_l: float, a_l: float, v_f: float, tau: fl
 
 @compiled
 def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: float) -> float:
-    """Return the smallest deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+    """Return the smallest deceleration of the follower that avoids an impact; inf if none does. [m/s2]
 
-    The case of ``least_to_spare_front`` in which the follower brakes first, from the start.
+    This is the case of ``least_to_spare_front`` in which the follower brakes first, from the start on.
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from ``lead`` to standstill, m/s2, > 0.
+        a_l: the leader's deceleration, held from ``lead`` to standstill, m/s2, > 0.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
         lead: time until which the leader coasts, s, > 0.
 
@@ -252,19 +254,19 @@ def least_behind_coasting(gap: float, v_l: float, a_l: float, v_f: float, lead: 
 
 @compiled
 def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, onset_f: float) -> float:
-    """Return the smallest constant deceleration of the follower that avoids the leader; inf if none does. [m/s2]
+    """Return the smallest constant deceleration of the follower that avoids an impact; inf if none does. [m/s2]
 
-    At any time the follower's position decreases with its deceleration, so every larger deceleration avoids the leader
-    too. The limit is either the stopping distance or, if the follower would stop first, a grazing contact of two moving
-    vehicles.
+    With a larger deceleration the follower is further back at any time, so every larger deceleration avoids the impact
+    as well. At the smallest deceleration, the follower stops directly behind the leader, or the two vehicles touch with
+    equal speeds while both move.
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        a_l: its deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
-        onset_l: time until which it coasts, s.
+        a_l: the leader's deceleration, held from ``onset_l`` to standstill, m/s2, > 0.
+        onset_l: time until which the leader coasts, s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        onset_f: time until which it coasts, s.
+        onset_f: time until which the follower coasts, s.
 
     """
     w = v_f - v_l
@@ -279,20 +281,20 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the largest deceleration of the leader that avoids the follower; inf: all do, -inf: none does. [m/s2]
+    """Return the largest deceleration of the leader that avoids an impact; inf: all do, -inf: none does. [m/s2]
 
-    The case of ``most_to_spare_rear`` in which the leader brakes first, from the start.
+    This is the case of ``most_to_spare_rear`` in which the leader brakes first, from the start on.
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``tau`` to standstill, m/s2, > 0.
+        a_f: the follower's deceleration, held from ``tau`` to standstill, m/s2, > 0.
         tau: time until which the follower coasts, s, >= 0.
 
     """
     reach = v_f * tau + stopping_distance(v_f, a_f)
-    touching = gap == 0.0 and v_f == v_l  # pressed together from the start: no impact
+    touching = gap == 0.0 and v_f == v_l  # in contact from the start: no impact
     if reach <= gap or touching:
         return math.inf
     if v_l == 0.0:
@@ -307,19 +309,19 @@ def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: 
 
 @compiled
 def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float) -> float:
-    """Return the leader's largest constant deceleration that avoids the follower; inf: all do, -inf: none does. [m/s2]
+    """Return the leader's largest constant deceleration that avoids an impact; inf: all do, -inf: none does. [m/s2]
 
-    At any time the leader's position decreases with its deceleration, so every smaller deceleration avoids the follower
-    too. A follower that brakes first is advanced to the leader's onset, because until then nothing depends on the
-    leader's deceleration.
+    With a smaller deceleration the leader is further ahead at any time, so every smaller deceleration avoids the impact
+    as well. If the follower brakes first, the motion until the leader's onset is computed first, because it does not
+    depend on the leader's deceleration.
 
     Args:
         gap: gap at the start, m.
         v_l: speed of the leader (front vehicle) at the start, m/s.
-        onset_l: time until which it coasts, s.
+        onset_l: time until which the leader coasts, s.
         v_f: speed of the follower (rear vehicle) at the start, m/s.
-        a_f: its deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
-        onset_f: time until which it coasts, s.
+        a_f: the follower's deceleration, held from ``onset_f`` to standstill, m/s2, > 0.
+        onset_f: time until which the follower coasts, s.
 
     """
     w = v_f - v_l

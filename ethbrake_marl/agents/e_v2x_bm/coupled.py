@@ -1,8 +1,9 @@
-"""E-V2X-BM coupled: the best constant deceleration of one vehicle in the engine's own physics.
+"""Coupled E-V2X-BM: the best constant deceleration of one vehicle in the engine's physics.
 
-The closed form of ``pairwise`` treats the pairs as independent. Here every candidate is simulated to the horizon with
-velocity exchange, second impacts and resting contact, so the predicted harm is the harm that occurs. Of the three
-baselines only this one may bound a shield. docs/evaluate.md says how close the search comes to the true minimum.
+The closed form in ``pairwise`` treats the pairs as independent. In this module every candidate is simulated to the
+horizon, with velocity exchange, second impacts and resting contact. The predicted harm is therefore the harm that the
+engine produces, and the shield uses it as a bound. docs/evaluate.md says how close the search comes to the true
+minimum.
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 _MANY = 200  # smallest number of worlds for which a search is cached and uses several threads
 
-_REMEMBERED = 32  # cached searches; a shield around another agent repeats the baseline's search
+_REMEMBERED = 32  # number of cached searches; every shield in the same worlds repeats the search of the baseline
 
-_FOUND: dict[bytes, Floats] = {}  # SHA-256 of a search's arguments -> its result
+_FOUND: dict[bytes, Floats] = {}  # cache: SHA-256 of the arguments of a search -> result of the search
 
 
 class CoupledOptimum(NamedTuple):
     """The best constant deceleration of one vehicle found in each of n worlds."""
 
     deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
-    harm: Floats  # [n] the harm that was minimised, with a*: one of the two below (m2/s2)
-    first_impact_harm: Floats  # [n] harm of each pair's first impact, with a* (m2/s2)
-    total_harm: Floats  # [n] harm of all impacts, with a* (m2/s2)
+    harm: Floats  # [n] harm with a* under the harm count that was minimised (m2/s2)
+    first_impact_harm: Floats  # [n] first-impact harm with a* (m2/s2)
+    total_harm: Floats  # [n] total harm with a* (m2/s2)
 
 
 def optimise_coupled(
@@ -57,29 +58,30 @@ def optimise_coupled(
 ) -> CoupledOptimum:
     """Return the constant deceleration of ``vehicle`` with the least simulated harm until ``horizon_s``.
 
-    If the closed form (``optimise_pairwise``) finds decelerations that avoid both neighbours, and the middle one is
-    harmless in the simulation, it is taken. Otherwise an even grid of decelerations, and those at which the closed
-    form's harm has a kink, are simulated. The harm may jump where the number of impacts changes; these places and the
-    best local minima are located to 1e-9 m/s2. At a jump the result lies on the side of less harm. Among equals the
-    other harm decides, then the middle one is taken. The result of a world does not depend on its batch.
+    The closed form (``optimise_pairwise``) may find an interval of decelerations that avoid both neighbours. If the
+    middle of this interval does no harm in the simulation, it is the result. Otherwise an even grid of decelerations,
+    and the breakpoints of the closed form, are simulated. The harm may jump where the number of impacts changes. These
+    jumps and the best local minima are located to 1e-9 m/s2; at a jump the result lies on the side of less harm. Of
+    decelerations with equal harm, those with the least harm under the other count remain, and the middle one of them is
+    the result. The result of a world does not depend on the other worlds of the batch.
 
     Args:
         worlds: n worlds of N vehicles.
         vehicle: index of the controlled vehicle, from 0.
         harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
-        horizon_s: end of the simulations, s.
+        horizon_s: end of the simulations, s since the alert.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2; the controlled vehicle's column is ignored.
-            None: all brake fully.
+            None: all other vehicles brake fully.
 
-    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count`` or commands beyond capacity; ``PhysicsError``
-    with the worlds in which some candidate could not be simulated.
+    Raises ``InvalidInput`` for an unknown ``vehicle`` or ``harm_count``, and for commands beyond the capacity. Raises
+    ``PhysicsError`` naming the worlds in which a candidate could not be simulated.
 
     """
     check_harm_count(harm_count)
     capacity = worlds.vehicles.braking_capacity_mps2
     command = -capacity if others_mps2 is None else np.array(others_mps2, dtype=np.float64)
-    # The closed form assumes that the others brake with full capacity, so their capacity is set to their command. The
-    # closed form cannot represent a vehicle that coasts or drives; it keeps its capacity.
+    # The closed form assumes that the other vehicles brake with full capacity, so their capacity is set to their
+    # command. It cannot represent a vehicle that coasts or drives; the capacity of such a vehicle is not changed.
     braking = np.where(command < 0.0, -command, capacity)
     braking[:, vehicle] = capacity[:, vehicle]
     closed_form_worlds = replace(worlds, vehicles=replace(worlds.vehicles, braking_capacity_mps2=braking))
@@ -100,14 +102,14 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Search the best deceleration in some worlds; return it, its harm and its harm under the other count, [3, m].
+    """Search for the best deceleration in m worlds; return it, its harm and its harm under the other count, [3, m].
 
     Args:
         worlds: n worlds.
         told: the same worlds for the closed form, with the capacities of other vehicles set to their braking commands.
-        command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's is ignored.
+        command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's command is ignored.
         vehicle: index of the controlled vehicle, from 0.
-        rows: [m] indices of the worlds to search.
+        rows: indices of the worlds to search, [m].
         harm_count: impacts whose harm is minimised.
         horizon_s: end of the simulations, s.
 
@@ -150,12 +152,12 @@ def _search_worlds(
     release_rate: Floats, pieces: Floats, restitution: Floats, vehicle: int, rows: Ints, total: bool, horizon: float,
     found: Floats, status: Ints,
 ) -> None:  # fmt: skip
-    """Search the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
+    """Search for the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
 
-    Writes the deceleration, its harm and its harm under the other count to ``found`` [3, m], and the status of the
-    physics (``FLAG.DONE`` if sound) to ``status`` [m]. ``capacity`` and ``onset`` [n, N] are braking capacities (m/s2)
-    and times until a vehicle may brake (s). The other arguments are those of ``make_line``, for n worlds along a new
-    first axis.
+    ``found`` [3, m] receives the deceleration, its harm, and its harm under the other count. ``status`` [m] receives
+    ``FLAG.DONE``, or the code of the physics check that failed. ``capacity`` [n, N] are braking capacities (m/s2),
+    ``onset`` [n, N] times until a vehicle may brake (s). The other arguments are those of ``make_line``, for n worlds
+    along a new first axis.
     """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
@@ -174,19 +176,24 @@ Mode = Literal["coupled", "pairwise"]
 
 
 class EV2XBM:
-    """Agent that brakes with the constant deceleration of least harm.
+    """Agent that brakes with the constant deceleration of least harm, called a*.
 
-    Mode ``coupled`` minimises the harm in the engine's physics until ``horizon_s`` under ``harm_count``. It assumes
-    that the others follow their scripts, and that vehicles without a script (learners) brake fully. Mode ``pairwise``
-    is the paper's closed form: all others brake fully, and no velocities are exchanged. The memory holds
-    ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2). Raises ``InvalidInput`` for an unknown
-    mode or count, and, when an episode begins in mode ``coupled``, for another vehicle's script whose command is not
-    fixed at the alert.
+    Args:
+        mode: ``coupled`` minimises the harm in the engine's physics. It assumes that the other vehicles follow their
+            scripts, and that vehicles without a script (learners) brake fully. ``pairwise`` is the paper's closed form,
+            which assumes that all other vehicles brake fully and that impacts change no speed.
+        harm_count: harm that mode ``coupled`` minimises: ``first`` (each pair's first impact) or ``total`` (all).
+        horizon_s: end of the simulations in mode ``coupled``, s since the alert.
+
+    The memory contains ``deceleration_mps2`` [n], which is a*, and ``predicted_harm`` [n] (m2/s2). Raises
+    ``InvalidInput`` for an unknown mode or harm count. In mode ``coupled``, ``begin`` raises ``InvalidInput`` if the
+    script of another vehicle has a command that is not fixed at the alert.
+
     """
 
     def __init__(self, mode: Mode = "coupled", *, harm_count: HarmCount = "first", horizon_s: float = 8.0) -> None:
         if mode not in ("coupled", "pairwise"):
-            raise InvalidInput(f"e_v2x_bm mode {mode!r}: must be 'coupled' or 'pairwise'")
+            raise InvalidInput(f"e_v2x_bm: mode = {mode!r}: must be 'coupled' or 'pairwise'")
         check_harm_count(harm_count)
         self.name = "e_v2x_bm" if mode == "coupled" else "e_v2x_bm:pairwise"
         self.knows = Source.MODEL if mode == "coupled" else Source.STATE
@@ -202,19 +209,19 @@ class EV2XBM:
 
         """
         if self._mode == "pairwise":
-            refuse_untold(alert, [vehicle], f"agent {self.name!r}", LOOK_AHEAD[:-1])  # masses play no part in it
+            refuse_untold(alert, [vehicle], f"agent {self.name!r}", LOOK_AHEAD[:-1])  # needs no masses
             closed = optimise_pairwise(alert, vehicle)
             return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
 
         def is_fixed(script: Script) -> bool:
-            """Return whether the script's command is fixed at the alert without knowing the choice of ``vehicle``."""
+            """Return whether the script's command is fixed at the alert, whatever ``vehicle`` chooses."""
             chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
             return is_state_free(script) or chooses_first
 
         others = fixed_commands(
             scripts, alert, f"agent {self.name!r}", vehicle=vehicle, is_fixed=is_fixed,
-            advice=f" before vehicle_{vehicle + 1} chooses; take e_v2x_bm:pairwise, which needs nobody's command, for"
-            " one of the two",
+            advice=f" before vehicle_{vehicle + 1} chooses; use e_v2x_bm:pairwise, which does not need the other"
+            " vehicles' commands, for one of the two vehicles",
         )  # fmt: skip
         coupled = optimise_coupled(
             alert, vehicle, harm_count=self._harm_count, horizon_s=self._horizon_s, others_mps2=others
@@ -222,7 +229,7 @@ class EV2XBM:
         return {"deceleration_mps2": coupled.deceleration_mps2, "predicted_harm": coupled.harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the command ``-a*`` chosen at the alert, [n] m/s2, and the unchanged memory."""
+        """Return the command ``-a*``, which was chosen at the alert, [n] m/s2, and the unchanged memory."""
         return -memory["deceleration_mps2"], memory
 
 
@@ -233,6 +240,6 @@ def make_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """
     if argument not in (None, "coupled", "pairwise"):
         then = "".join(f", then {variant!r}" for variant in variants_of("e_v2x_bm"))
-        raise InvalidInput(f"agent {settings.spec!r}: the argument must be 'coupled' or 'pairwise'{then}")
+        raise InvalidInput(f"agent {settings.spec!r}: argument: must be 'coupled' or 'pairwise'{then}")
     mode: Mode = "pairwise" if argument == "pairwise" else "coupled"
     return EV2XBM(mode, harm_count=settings.harm_count, horizon_s=settings.horizon_s)

@@ -1,9 +1,10 @@
 """E-V2X-BM in closed form: the constant deceleration of one vehicle that minimises the predicted harm of its pairs.
 
-The neighbours of the controlled vehicle brake at full capacity from their own latencies on. Its front and rear pair are
-treated as independent, so each counts its first contact only and no velocity is exchanged. The predicted harm is
-``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2). It is concave in ``a`` between a few closed-form breakpoints, so its
-minimum is at one of them and no grid is needed. docs/internals/proofs/constant-deceleration.md has the derivation.
+The neighbours of the controlled vehicle brake with full capacity after their own latencies. The pair in front and the
+pair behind are treated as independent: only the first contact of each pair counts, and impacts change no speed. The
+predicted harm is ``H(a) = c_front(a)^2 + c_rear(a)^2`` (m2/s2), where ``a`` is the deceleration (m/s2) and ``c_front``
+and ``c_rear`` are the closing speeds at the first contacts (m/s). Between a few breakpoints, which have a closed form,
+H(a) is concave, so the minimum is at a breakpoint. docs/internals/proofs/constant-deceleration.md has the derivation.
 """
 
 from __future__ import annotations
@@ -30,25 +31,26 @@ _TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
 
 
 class PairwiseOptimum(NamedTuple):
-    """The closed-form best constant deceleration of one vehicle in each of n worlds."""
+    """The best constant deceleration of one vehicle in closed form, in each of n worlds."""
 
     deceleration_mps2: Floats  # [n] best deceleration a*, in [0, braking capacity]
     harm: Floats  # [n] predicted harm with a*, called H* (m2/s2)
-    spares_front_mps2: Floats  # [n] smallest deceleration that avoids the vehicle in front; inf if none does
-    spares_rear_mps2: Floats  # [n] largest deceleration that avoids the vehicle behind; inf if all do, -inf if none
-    breakpoints_mps2: Floats  # [n, 6] every deceleration at which the harm may have its minimum, unordered
+    spares_front_mps2: Floats  # [n] smallest deceleration without an impact in front (m/s2); inf if there is none
+    spares_rear_mps2: Floats  # [n] largest deceleration without an impact behind (m/s2); inf: all, -inf: none
+    breakpoints_mps2: Floats  # [n, 6] decelerations at which the harm may have its minimum, unordered (m/s2)
 
 
 @compiled
 def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> tuple[float, float]:
-    """Return two decelerations of the follower at which the harm of the pair has a kink, and a jump. [m/s2]
+    """Return two decelerations of the follower: where the harm of the pair has a kink, and where it jumps. [m/s2]
 
-    Both are 0 unless the follower may brake before the leader (front vehicle) does. ``lead`` is the time in between.
+    Both results are 0 unless the follower may brake before the leader (front vehicle). ``lead`` is the time from the
+    follower's onset to the leader's, and ``gap`` in the formulas is the gap at the follower's onset.
 
-    - Kink: contact exactly when the leader begins to brake, at ``2 (w lead - gap) / lead^2``.
-    - Jump: below ``w^2 / (2 gap)`` the follower strikes the coasting leader lightly. Above, it does not reach it, and
-      may strike harder once the leader brakes. The result is the deceleration just below, with the lightest contact
-      that counts as an impact.
+    - Kink, at ``2 (w lead - gap) / lead^2``: the pair meets exactly when the leader begins to brake.
+    - Jump, at ``w^2 / (2 gap)``: with a smaller deceleration the follower strikes the coasting leader lightly. With a
+      larger one it does not reach the coasting leader, and may strike harder once the leader brakes. The result is the
+      deceleration just below the jump that gives the lightest impact.
 
     Args:
         gap: gap at the present time, m.
@@ -66,10 +68,10 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
 
 @compiled
 def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Return the predicted harm of vehicle ``i`` with the vehicle in front, m2/s2; 0 for the first vehicle.
+    """Return the predicted harm of an impact of vehicle ``i`` with the vehicle in front, m2/s2; 0 for Vehicle 1.
 
-    Vehicle ``i`` brakes with ``a``, the one in front with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
-    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    Vehicle ``i`` brakes with ``a`` m/s2, the vehicle in front with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, the
+    braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may brake) describe the world.
     """
     if i == 0:
         return 0.0
@@ -78,10 +80,10 @@ def front_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, o
 
 @compiled
 def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats) -> float:
-    """Return the predicted harm of vehicle ``i`` with the vehicle behind, m2/s2; 0 for the last vehicle.
+    """Return the predicted harm of an impact of vehicle ``i`` with the vehicle behind, m2/s2; 0 for the last vehicle.
 
-    Vehicle ``i`` brakes with ``a``, the one behind with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity``
-    [N] m/s2 and ``onset`` [N] s (time until a vehicle may brake) describe one world.
+    Vehicle ``i`` brakes with ``a`` m/s2, the vehicle behind with its capacity. ``gap`` [P] m, ``speed`` [N] m/s, the
+    braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may brake) describe the world.
     """
     if i == gap.shape[0]:
         return 0.0
@@ -94,9 +96,9 @@ def find_breakpoints(
 ) -> tuple[float, float]:
     """Write the decelerations of vehicle ``i`` at which its harm may be least to ``at`` [6], all in [0, capacity].
 
-    Returns the smallest deceleration that avoids the vehicle in front, and the largest one that avoids the vehicle
-    behind (may be infinite). ``gap`` [P] m, ``speed`` [N] m/s, ``capacity`` [N] m/s2 and ``onset`` [N] s (time until a
-    vehicle may brake) describe one world.
+    Returns the smallest deceleration without an impact in front, and the largest without an impact behind, both m/s2
+    and possibly infinite. ``gap`` [P] m, ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and ``onset``
+    [N] s (time until each vehicle may brake) describe the world.
     """
     low, high = 0.0, math.inf
     at[:] = 0.0
@@ -122,9 +124,10 @@ def minimise_over(
 ) -> tuple[float, float]:
     """Return the deceleration of least predicted harm of vehicle ``i``, and this harm (m2/s2).
 
-    Only the candidates ``at`` [6] (m/s2) are compared. If two of them, and the middle between them, have the least
-    harm, the middle is returned. ``gap`` [P] m, ``speed`` [N] m/s, ``capacity`` [N] m/s2 and ``onset`` [N] s (time
-    until a vehicle may brake) describe one world.
+    Only the candidates ``at`` [6] (m/s2) are compared. If several candidates have the least harm, the middle between
+    the smallest and the largest of them is returned, provided that it has the least harm as well. ``gap`` [P] m,
+    ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may
+    brake) describe the world.
     """
     best, first, last = math.inf, 0.0, 0.0
     for k in range(at.shape[0]):
@@ -148,11 +151,11 @@ def minimise_over(
 def optimise_worlds(
     gaps: Floats, speeds: Floats, capacity: Floats, onset: Floats, i: int, at: Floats, out: Floats
 ) -> None:
-    """Optimise the deceleration of vehicle ``i`` in n worlds, in closed form.
+    """Find the best constant deceleration of vehicle ``i`` in n worlds, in closed form.
 
-    Writes the candidates to ``at`` [n, 6], and to ``out`` [4, n]: the best deceleration, its predicted harm, and the
-    two thresholds that ``find_breakpoints`` returns. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, ``capacity`` [n, N] m/s2
-    and ``onset`` [n, N] s (time until a vehicle may brake) are read.
+    ``at`` [n, 6] receives the candidates. ``out`` [4, n] receives the best deceleration, its predicted harm, and the
+    two decelerations that ``find_breakpoints`` returns. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, the braking
+    capacities ``capacity`` [n, N] m/s2 and ``onset`` [n, N] s (time until each vehicle may brake) describe the worlds.
     """
     for k in range(gaps.shape[0]):
         low, high = find_breakpoints(at[k], i, gaps[k], speeds[k], capacity[k], onset[k])
@@ -166,10 +169,10 @@ def optimise_worlds(
 
 @compiled
 def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset: Floats, out: Floats) -> None:
-    """Write the squared closing speed at each pair's first impact, or 0, to ``out`` [n, P] m2/s2.
+    """Write the squared closing speed at each pair's first impact to ``out`` [n, P] m2/s2; 0 without an impact.
 
-    Each pair is treated on its own. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, constant ``deceleration`` [n, N] m/s2 and
-    ``onset`` [n, N] s (time until a vehicle may brake) are read.
+    All pairs are treated as independent. ``gaps`` [n, P] m, ``speeds`` [n, N] m/s, the constant ``deceleration`` [n, N]
+    m/s2 and ``onset`` [n, N] s (time until each vehicle may brake) describe the worlds.
     """
     for k in range(gaps.shape[0]):
         for p in range(gaps.shape[1]):
@@ -180,21 +183,22 @@ def contacts_of_worlds(gaps: Floats, speeds: Floats, deceleration: Floats, onset
 
 
 def optimise_pairwise(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """Return E-V2X-BM's optimum for ``vehicle`` (index from 0) in every world, in closed form.
+    """Return the best constant deceleration a* of ``vehicle`` (index from 0) in every world, in closed form.
 
-    Minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity]. If some decelerations avoid both neighbours,
+    ``a*`` minimises ``H(a) = c_front^2 + c_rear^2`` over ``a`` in [0, capacity], where ``c_front`` and ``c_rear`` are
+    the closing speeds (m/s) at the first contacts with the two neighbours. If some decelerations avoid both impacts,
     ``a*`` is the middle of their interval, otherwise the best breakpoint. The first and the last vehicle of a line have
-    one pair; pairs further away (N > 3) are ignored. Uses only the gaps, speeds, capacities and latencies of the
-    vehicle and its two neighbours.
+    one neighbour. Only gaps, speeds, capacities and latencies of the vehicle and its neighbours are used.
 
-    Raises ``InvalidInput`` if ``vehicle`` is not in the line, a vehicle moves backward or brakes build up.
+    Raises ``InvalidInput`` if ``vehicle`` is not in the line, if a vehicle moves backward, or if brakes build up at a
+    finite rate.
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
     return closed_form(worlds, vehicle)
 
 
 def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
-    """Version of ``optimise_pairwise`` that also accepts brakes that build up, and treats them as acting at once."""
+    """Return the result of ``optimise_pairwise``; brakes that build up at a finite rate are assumed to act at once."""
     onset, capacity = onset_s(worlds, vehicle), worlds.vehicles.braking_capacity_mps2
     at, out = np.empty((worlds.n, CANDIDATES)), np.empty((4, worlds.n))
     optimise_worlds(worlds.gaps_m, worlds.speeds_mps, capacity, onset, vehicle, at, out)
@@ -203,16 +207,16 @@ def closed_form(worlds: Worlds, vehicle: int) -> PairwiseOptimum:
 
 
 def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
-    """Return the predicted harm of each pair on its own, [n, P] m2/s2.
+    """Return the predicted harm of each pair, [n, P] m2/s2; all pairs are treated as independent.
 
-    Every vehicle coasts until its latency has elapsed and then brakes to rest. E-V2X-BM's prediction is the sum over
-    the controlled vehicle's pairs.
+    Every vehicle coasts until its latency has elapsed and then brakes to rest. The harm that E-V2X-BM predicts is the
+    sum over the pairs of the controlled vehicle.
 
     Args:
         worlds: n worlds.
-        deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2 or a shape that broadcasts to it.
+        deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2, or a shape that broadcasts to [n, N].
 
-    Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if brakes build up.
+    Raises ``InvalidInput`` for a deceleration that is negative or not finite, and if brakes build up at a finite rate.
 
     """
     worlds.refuse_build_up("the closed form of E-V2X-BM and planner")
@@ -230,13 +234,15 @@ def pairwise_harm(worlds: Worlds, deceleration_mps2: ArrayLike) -> Floats:
 def onset_s(worlds: Worlds, vehicle: int) -> Floats:
     """Return the time from the worlds' present time until each vehicle may brake, [n, N] s; 0 if it may brake now.
 
-    Raises ``InvalidInput`` if the closed form does not apply: no vehicle has the index ``vehicle``, or a speed is
-    negative.
+    Raises ``InvalidInput`` if no vehicle has the index ``vehicle``, or if a speed is negative, because the closed form
+    then does not apply.
     """
     if not 0 <= vehicle < worlds.N:
-        raise InvalidInput(f"vehicle {vehicle}: must be an index in 0..{worlds.N - 1}")
+        raise InvalidInput(f"vehicle = {vehicle}: must be an index from 0 to {worlds.N - 1}")
     if not np.all(worlds.speeds_mps >= 0.0):
         k, i = (int(x) for x in np.argwhere(~(worlds.speeds_mps >= 0.0))[0])
-        raise InvalidInput(f"speeds_mps[{k}, {i}] = {worlds.speeds_mps[k, i]:g}: the closed form needs speeds >= 0")
+        raise InvalidInput(
+            f"speeds_mps[{k}, {i}] = {worlds.speeds_mps[k, i]:g}: must be at least 0 for the closed form"
+        )
     onset: Floats = np.maximum(worlds.vehicles.latency_s - worlds.time_s[:, None], 0.0)
     return onset

@@ -1,6 +1,6 @@
-"""Samples of one world's harm at several decelerations, compiled: sort, merge, bound in between, select.
+"""Operations on samples of one world's harm at several decelerations: sort, merge, bound and select. Compiled.
 
-A world has about 560 samples, in increasing order of the deceleration.
+The search uses about 560 samples per world, in increasing order of the deceleration.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Ints
 
-STEEPER = 2.0  # assumed factor by which harm may fall faster between samples than next to them
+STEEPER = 2.0  # assumption: between two samples, harm falls at most this many times as fast as beside them
 
 NARROWEST_MPS2 = 1e-9  # decelerations closer than this count as equal
 
@@ -21,12 +21,12 @@ TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
 class Samples(NamedTuple):
-    """Decelerations of one vehicle in one world and the harm that a simulation gave for each."""
+    """Decelerations of one vehicle in one world, with the simulated harm of each deceleration."""
 
     at: Floats  # [k] decelerations (m/s2)
-    harm: Floats  # [k] the harm that is minimised, first-impact or total (m2/s2)
-    other: Floats  # [k] the other harm, which decides ties (m2/s2)
-    course: Floats  # [k] code of how many impacts each pair had; the harm may jump where it changes
+    harm: Floats  # [k] harm that is minimised, first-impact or total (m2/s2)
+    other: Floats  # [k] harm under the other count, which decides ties (m2/s2)
+    course: Floats  # [k] code of the number of impacts of each pair; where the code changes, the harm may jump
 
 
 @compiled
@@ -37,7 +37,7 @@ def make_samples(most: int) -> Samples:
 
 @compiled(bare=True)
 def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
-    """Write sample number ``k`` of ``one`` to place ``to`` of ``other``."""
+    """Copy sample ``k`` (index) of ``one`` to index ``to`` of ``other``."""
     other.at[to] = one.at[k]
     other.harm[to] = one.harm[k]
     other.other[to] = one.other[k]
@@ -46,9 +46,9 @@ def copy_sample(one: Samples, k: int, other: Samples, to: int) -> None:
 
 @compiled(bare=True)
 def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
-    """Merge two lists sorted by deceleration into one: the first ``n`` of ``one``, the first ``m`` of ``other``.
+    """Merge the first ``n`` samples of ``one`` and the first ``m`` of ``other``, both sorted by deceleration.
 
-    The result is written to the first ``n + m`` places of ``into``.
+    The first ``n + m`` entries of ``into`` receive the sorted result.
     """
     i, j = 0, 0
     for to in range(n + m):
@@ -62,7 +62,7 @@ def merge(one: Samples, n: int, other: Samples, m: int, into: Samples) -> None:
 
 @compiled(bare=True)
 def put_in_order(samples: Samples, n: int) -> None:
-    """Sort the first ``n`` samples in place by deceleration; fast if they are few or nearly sorted."""
+    """Sort the first ``n`` samples by deceleration, in place. This is fast for few or nearly sorted samples."""
     for k in range(1, n):
         at, harm, other, course = samples.at[k], samples.harm[k], samples.other[k], samples.course[k]
         to = k
@@ -74,10 +74,10 @@ def put_in_order(samples: Samples, n: int) -> None:
 
 @compiled(bare=True)
 def bound_cells(samples: Samples, n: int, bounds: Floats) -> None:
-    """Write an estimate of the least harm between each two neighbouring samples to ``bounds`` [n - 1], m2/s2.
+    """Estimate the least harm between each two neighbouring samples; write it to ``bounds`` [n - 1], m2/s2.
 
-    The first ``n`` samples are used; they must be sorted by deceleration. If the harm falls towards an interval, from
-    the sample before it or from the sample after it, it is assumed to go on falling inside, ``STEEPER`` times as steep.
+    The first ``n`` samples are used; they must be sorted by deceleration. Where the harm falls towards an interval, it
+    is assumed to continue to fall inside the interval, with at most ``STEEPER`` times the slope.
     """
     before, slope = 0.0, _slope(samples, 0)
     for k in range(n - 1):
@@ -109,7 +109,7 @@ def least_harm(samples: Samples, n: int) -> float:
 def find_smallest(values: Floats, n: int, places: Ints) -> None:
     """Write the indices of the smallest of the first ``n`` values to ``places``, in increasing order of value.
 
-    As many as ``places`` is long, which must be at most ``n``. Equal values keep their order.
+    The length of ``places``, at most ``n``, is the number of values to find. Equal values keep their order.
     """
     count = 0
     for k in range(n):
@@ -127,8 +127,8 @@ def find_smallest(values: Floats, n: int, places: Ints) -> None:
 def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
     """Write the indices of the lowest local minima of the first ``n`` samples to ``places``, lowest harm first.
 
-    ``depth`` [n or more] is filled with the harm at a local minimum, infinity elsewhere. If there are fewer minima than
-    places, the remaining places get the first other samples.
+    ``depth`` [n or more] receives the harm at each local minimum, and infinity at other samples. If there are fewer
+    minima than entries in ``places``, the remaining entries are indices of other samples.
     """
     for k in range(n):
         falls = k == 0 or samples.harm[k] < samples.harm[k - 1]
@@ -141,8 +141,8 @@ def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
 def choose(samples: Samples, n: int, room: Floats) -> float:
     """Return the deceleration of least harm among the first ``n`` samples, m/s2.
 
-    Among equals, the least ``other`` harm decides, then the middle one of the rest is taken. ``room`` [n or more] is a
-    workspace, overwritten. Sorted samples make it faster.
+    Of samples with equal harm, those with the least ``other`` harm remain; the middle one of them is returned. ``room``
+    [n or more] is a workspace. The function is faster if the samples are sorted.
     """
     least, rest = least_harm(samples, n) + TIE, math.inf
     for k in range(n):

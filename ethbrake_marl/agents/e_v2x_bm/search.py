@@ -1,6 +1,7 @@
-"""The coupled search in one world, compiled: even grid, finer grid, borders, local minima, one safety step.
+"""The coupled search for the best constant deceleration in one world, in five steps. Compiled.
 
-``coupled`` says what is searched for; docs/evaluate.md gives the reasons for these steps.
+The steps are an even grid, a finer grid, borders, local minima, and a step away from jumps. docs/evaluate.md gives
+the reasons for these steps.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import FLAG
 from ethbrake_marl.physics.state import Floats, Ints
 
-GRID = 161  # first step: number of evenly spaced decelerations from 0 to the capacity
+GRID = 161  # number of evenly spaced decelerations from 0 to the capacity in the first step
 
-CELLS = 24  # largest number of grid cells (intervals between two neighbours of the grid) that are refined
+CELLS = 24  # largest number of grid cells (intervals between neighbouring grid points) that are refined
 
-INSIDE = 16  # samples inside a refined cell
+INSIDE = 16  # number of samples inside a refined cell
 
 BORDERS = 6  # largest number of borders (decelerations at which the number of impacts changes) that are located
 
 MINIMA = 6  # number of local minima that are refined
 
-_JUMP = 1e-6  # change of harm (m2/s2) within 1e-9 m/s2 that only a jump explains
+_JUMP = 1e-6  # a change of harm (m2/s2) above this within 1e-9 m/s2 is a jump
 
 _LOOKED = GRID + CANDIDATES + CELLS * INSIDE
 
@@ -66,14 +67,14 @@ class Room(NamedTuple):
     the number of impacts changes.
     """
 
-    one: Samples  # the grid; later all samples so far
-    two: Samples  # all samples so far; at the end with borders and minima
-    new: Samples  # the samples that a step adds
-    few: Samples  # a handful of samples around one place
-    values: Floats  # one number per sample: bounds or depths
-    cells: Ints  # [CELLS] index of the sample at the left end of each refined cell
+    one: Samples  # samples of the grid; after step 2 all samples
+    two: Samples  # all samples after step 1; after step 4 all samples with borders and minima
+    new: Samples  # samples that a step adds
+    few: Samples  # few samples around one deceleration
+    values: Floats  # one number per sample: bound of the harm, or harm at a local minimum (m2/s2)
+    cells: Ints  # [CELLS] index of the sample at the lower end of each refined cell
     borders: Ints  # [BORDERS] index of the sample before each border
-    minima: Ints  # [MINIMA] index of each local minimum among the samples
+    minima: Ints  # [MINIMA] index of the sample at each local minimum
 
 
 @compiled
@@ -87,16 +88,16 @@ def make_room() -> Room:
 
 @compiled(apart=True, bare=True)
 def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, out: Floats) -> int:
-    """Find the best constant deceleration of a line's controlled vehicle.
+    """Find the best constant deceleration of the controlled vehicle in one world.
 
     Args:
         line: the world, from ``make_line``.
-        room: workspace, overwritten.
-        breakpoints: [CANDIDATES] decelerations that are simulated in addition to an even grid, m/s2.
+        room: workspace.
+        breakpoints: decelerations that are simulated in addition to an even grid, [CANDIDATES] m/s2.
         capacity: braking capacity of the vehicle, m/s2.
-        out: [3] receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2).
+        out: receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2), [3].
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
     """
     status = share_start(line)
@@ -117,8 +118,8 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
 def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) -> int:
     """Step 1: simulate an even grid of decelerations and the ``breakpoints`` [CANDIDATES] (m/s2) in the world ``line``.
 
-    The grid is left in ``room.one``, grid and breakpoints sorted in ``room.two``. ``capacity`` is the largest
-    deceleration, m/s2. Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    ``room.one`` receives the grid, ``room.two`` grid and breakpoints, sorted. ``capacity`` is the largest deceleration,
+    m/s2. Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     grid, new = room.one, room.few
     for k in range(GRID):
@@ -135,11 +136,11 @@ def look_evenly(line: Line, room: Room, breakpoints: Floats, capacity: float) ->
 
 @compiled(apart=True, bare=True)
 def look_inside(line: Line, room: Room) -> int:
-    """Step 2: simulate more decelerations in the intervals of the grid that may contain the least harm.
+    """Step 2: simulate more decelerations in the cells of the grid that may contain the least harm.
 
-    These are intervals in which the number of impacts changes, or whose estimated harm is below every sample so far.
-    Leaves ``_LOOKED`` samples in ``room.one``; if there are fewer, the last one is repeated. Returns a status:
-    ``FLAG.DONE``, or the code of the check of the physics that failed.
+    A cell is refined if the number of impacts changes in it, or if its estimated harm is below the harm of all samples
+    so far. ``room.one`` receives ``_LOOKED`` samples; if there are fewer, the last sample is repeated. Returns a
+    status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     grid, looked, new, cells, bounds = room.one, room.two, room.new, room.cells, room.values
     best = least_harm(looked, GRID + CANDIDATES)
@@ -178,11 +179,11 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Step 3: locate the decelerations at which the number of impacts changes, if less harm may be found there.
+    """Step 3: locate borders (decelerations at which the number of impacts changes) where harm may be less.
 
-    Between two such borders the harm is smooth, so harm that falls towards a border is least there. Each located border
-    ends up between two samples 1e-9 m/s2 apart. Leaves all samples in ``room.two``. Returns a status: ``FLAG.DONE``, or
-    the code of the check of the physics that failed.
+    Between two borders the harm is smooth, so harm that falls towards a border is least directly at the border. Each
+    border is enclosed between two samples 1e-9 m/s2 apart. ``room.two`` receives all samples. Returns a status:
+    ``FLAG.DONE``, or the code of the physics check that failed.
     """
     looked, new, few, places, bounds = room.one, room.new, room.few, room.borders, room.values
     best = least_harm(looked, _LOOKED)
@@ -207,10 +208,10 @@ def locate_borders(line: Line, room: Room) -> int:
 
 @compiled(bare=True)
 def _cut(line: Line, few: Samples) -> int:
-    """Bring samples 0 and 5 of ``few``, on the two sides of a border, to a distance of 1e-9 m/s2.
+    """Enclose a border between samples 0 and 5 of ``few``, at most 1e-9 m/s2 apart.
 
-    A border is a deceleration at which the number of impacts changes. Each round divides the distance by five. Returns
-    a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    A border is a deceleration at which the number of impacts changes. Each round divides the distance of the samples by
+    five. Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     while few.at[5] - few.at[0] > NARROWEST_MPS2:
         low, width = few.at[0], few.at[5] - few.at[0]
@@ -224,7 +225,7 @@ def _cut(line: Line, few: Samples) -> int:
             lower = min(few.harm[k], few.harm[k + 1])
             if few.course[k] != few.course[k + 1] and lower < least:
                 border, least = k, lower
-        copy_sample(few, border + 1, few, 5)  # copy this one first: sample 1 may move to 0
+        copy_sample(few, border + 1, few, 5)  # before sample 0 is overwritten
         copy_sample(few, border, few, 0)
     return FLAG.DONE
 
@@ -233,7 +234,7 @@ def _cut(line: Line, few: Samples) -> int:
 def narrow_minima(line: Line, room: Room) -> int:
     """Step 4: locate the lowest local minima of the harm to 1e-9 m/s2, and append them to ``room.two``.
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
     """
     inner, minima, last = room.two, room.minima, _NARROWED - 1
     find_minima(inner, _NARROWED, room.values, minima)
@@ -252,15 +253,15 @@ def narrow_minima(line: Line, room: Room) -> int:
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
     """Narrow an interval around a local minimum of the harm to 1e-9 m/s2; return a status.
 
-    Both sides are divided in three in each round. If no new sample is lower, the middle stays.
+    Each round divides the intervals on both sides of the minimum in three.
 
     Args:
         line: the world.
         few: workspace.
         low: lower end of the interval, m/s2.
-        high: upper end, m/s2.
-        found: samples; number ``to`` is the minimum inside the interval, and is replaced by better ones.
-        to: index of this sample.
+        high: upper end of the interval, m/s2.
+        found: samples; sample ``to`` is the minimum in the interval, and is replaced by samples with less harm.
+        to: index of the sample of the minimum.
 
     """
     while high - low > NARROWEST_MPS2:
@@ -288,19 +289,19 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Step 5: if ``best`` (m/s2) lies within 1e-9 m/s2 of a jump of the harm, move it to the lower side.
+    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move it away from the jump, to less harm.
 
-    An engine advances the same motion step by step, which changes its last bits. Directly at a jump these bits would
-    decide on which side the harm is.
+    The engine simulates the same motion step by step, with other rounding errors. Directly at a jump, rounding errors
+    would decide between less and more harm.
 
     Args:
         line: the world.
         around: workspace.
         best: best deceleration found, m/s2.
         capacity: braking capacity of the vehicle, m/s2.
-        out: [3] receives the deceleration, its harm, and its harm under the other count.
+        out: receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2), [3].
 
-    Returns a status: ``FLAG.DONE``, or the code of the check of the physics that failed.
+    Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
     """
     for k in range(5):

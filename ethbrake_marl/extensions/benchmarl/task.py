@@ -1,9 +1,9 @@
 """A scenario as a TorchRL environment and as a BenchMARL task. Needs the extra ``marl``.
 
-The environment runs ``n`` worlds in one engine. All learners of a world form one group and end together, because
-``done`` belongs to the world. The critic's ``state`` is the full state of the line (``game.full_state.full_state``).
+The environment runs ``n`` worlds in one engine. All learners of a world form one group, and their episodes end at the
+same time. ``state``, the input of a central critic, is the full state of the line (``game.full_state.full_state``).
 
-Shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
+Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
 """
 
 from __future__ import annotations
@@ -32,19 +32,21 @@ from ethbrake_marl.shields.options import ShieldOptions
 GROUP = "learners"
 
 
-class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is missing
-    """TorchRL environment over ``n`` worlds of ``scenario``.
+class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the extra is not installed
+    """TorchRL environment with ``n`` worlds of one scenario and ``L`` learners.
 
-    Shapes: observation [n, L, F], action and reward [n, L, 1] (a discrete action [n, L]), state [n, S], done [n, 1].
+    Shapes: observation [n, L, F], action [n, L, 1] (discrete action: [n, L]), reward [n, L, 1], state [n, S], done
+    [n, 1]. F is the number of features of an observation, S of the state.
 
     Args:
-        scenario: the scenario, which has at least one learner.
+        scenario: the scenario, which must have at least one learner.
         n: number of worlds.
         seed: seed of the worlds.
-        reward: reward of the learners, as in the other environments: a name such as ``harm``, or weights.
-        horizon_is_end: count an episode that the horizon cuts off as terminated, as in a training recipe.
-        shield: mode of a shield around the learners (``step`` if there are several learners); None: no shield.
-        actions: number of discrete actions, of which an action is the index, as QMIX needs them; None: continuous ones.
+        reward: reward of the learners: a name such as ``harm``, or weights.
+        horizon_is_end: True: an episode that the horizon ends counts as terminated; False: as truncated.
+        shield: mode of a shield for the learners (``step`` if there are several learners); None: no shield.
+        actions: number of discrete actions; an action is then an index (for QMIX, for instance). None: continuous
+            actions.
 
     """
 
@@ -80,7 +82,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start a new episode in every world, or only in the worlds that the tensordict's ``_reset`` mask marks."""
+        """Start a new episode in all worlds, or in the worlds that the mask ``_reset`` of ``tensordict`` marks."""
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is None:
             self.engine.reset()
@@ -104,7 +106,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # untyped where the extra is miss
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start new episodes in all worlds, with worlds drawn from ``seed``; None changes nothing."""
+        """Start new episodes in all worlds, with worlds drawn from ``seed``. None has no effect."""
         if seed is not None:
             self.engine.reset(seed=seed)
 
@@ -120,8 +122,9 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
-        config: ``scenario`` (a shipped name, a YAML file, its content, or a ``Scenario``) and the arguments ``reward``,
-            ``horizon_is_end`` and, optionally, ``shield`` and ``actions`` of ``LineEnv``.
+        config: mapping with the keys ``scenario``, ``reward``, ``horizon_is_end`` and, optionally, ``shield`` and
+            ``actions``. The scenario is the name of a shipped scenario, the path of a YAML file, a mapping with the
+            content of such a file, or a ``Scenario``. All other keys are arguments of ``LineEnv``.
 
     """
 
@@ -129,26 +132,32 @@ class LineTask(TaskClass):  # type: ignore[misc]
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """Return a function without arguments that makes a ``LineEnv`` with ``num_envs`` worlds.
+        """Return a function without arguments that creates a ``LineEnv``.
 
-        ``seed`` is the seed of the worlds (None: 0). BenchMARL also passes ``device``, which is unused, and
-        ``continuous_actions``; raises ``InvalidInput`` if the task has the other kind of actions.
+        Args:
+            num_envs: number of worlds.
+            continuous_actions: whether BenchMARL wants continuous actions.
+            seed: seed of the worlds; None: 0.
+            device: unused.
+
+        Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete ones, or the reverse.
+
         """
         config, actions = self.config, self.config.get("actions")
         if continuous_actions != (actions is None):
             raise InvalidInput(
-                f"task {self.name}: continuous_actions = {continuous_actions}, actions = {actions}: a whole number, at"
-                " least 2, makes actions discrete, None continuous"
+                f"task {self.name}: continuous_actions = {continuous_actions} does not fit to actions = {actions}; for"
+                " continuous actions set actions to None, for discrete actions to a whole number of at least 2"
             )
         settings = config["reward"], config["horizon_is_end"], config.get("shield"), actions
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
 
     def supports_continuous_actions(self) -> bool:
-        """Return whether actions are continuous: without ``actions``."""
+        """Return whether actions are continuous, which is so if the key ``actions`` is None or missing."""
         return self.config.get("actions") is None
 
     def supports_discrete_actions(self) -> bool:
-        """Return whether actions are discrete: with ``actions``."""
+        """Return whether actions are discrete, which is so if the key ``actions`` is a number."""
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
@@ -157,41 +166,41 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
     def has_render(self, env: Any) -> bool:
-        """Return False: the environment draws nothing."""
+        """Return False, because the environment cannot draw itself."""
         return False
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        """Return ``{"learners": names}`` with the names of all learners, which form one group; ``env`` is unused."""
+        """Return ``{"learners": names}``: one group with the names of all learners. ``env`` is unused."""
         scenario = self.config["scenario"]
         return {GROUP: [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the learners' observations in ``env``, without the batch of worlds."""
+        """Return the TorchRL spec of the learners' observations in ``env``, for a single world."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec["state"]
         return spec
 
     def info_spec(self, env: Any) -> Any:
-        """Return None: the environment has no info entries."""
+        """Return None, because the environment has no ``info``."""
         return None
 
     def state_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the critic's state in ``env``, without the batch of worlds."""
+        """Return the TorchRL spec of the state for a central critic in ``env``, for a single world."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec[GROUP]
         return spec
 
     def action_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the learners' actions in ``env``, without the batch of worlds."""
+        """Return the TorchRL spec of the learners' actions in ``env``, for a single world."""
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: Any) -> Any:
-        """Return None: every action is allowed."""
+        """Return None, because all actions are always allowed."""
         return None
 
     @staticmethod
     def env_name() -> str:
-        """Return the name under which BenchMARL lists the tasks."""
+        """Return the name of the group of tasks in BenchMARL."""
         return "ethbrake"
 
 

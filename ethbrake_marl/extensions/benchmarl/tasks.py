@@ -1,8 +1,8 @@
 """Register every shipped scenario that has a learner as a BenchMARL task. Needs the extra ``marl``.
 
-``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is BenchMARL's own
-command line (Hydra overrides included) with these tasks added. BenchMARL looks for tasks only in its own folder, so
-they must be in its tables before it reads the command line.
+``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is the command line of
+BenchMARL, Hydra overrides included, with these tasks. BenchMARL searches tasks in its own folder only. This module
+therefore adds the tasks to BenchMARL's tables before BenchMARL reads the command line.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from ethbrake_marl.extensions.benchmarl.task import LineTask
 from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 
 
-class _Scenarios(Task):  # type: ignore[misc]  # untyped where the extra is missing
+class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra is not installed
     """BenchMARL's enumeration of tasks, one for each shipped scenario that has a learner."""
 
     @staticmethod
     def associated_class() -> type[LineTask]:
-        """Return ``LineTask``, the class that implements all of these tasks."""
+        """Return ``LineTask``, the class of all tasks."""
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return the task of this shipped scenario, or of the scenario file ``path`` unless it is None.
+        """Return the task for the scenario file ``path``; None: for the shipped scenario of this member.
 
-        The reward is minus the harm, and there is no shield.
+        The reward is minus the harm, and the task has no shield.
         """
         return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
 
@@ -49,7 +49,7 @@ EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
 
 
 def register_tasks() -> None:
-    """Add the tasks to BenchMARL's tables as ``ethbrake/paper_random`` and so on. Calling it again changes nothing."""
+    """Add the tasks to BenchMARL's tables, with names such as ``ethbrake/paper_random``. May be called repeatedly."""
     store = ConfigStore.instance()
     for task in EthBrakeTask:
         name = task.name.lower()

@@ -1,4 +1,4 @@
-"""Shields for incomplete knowledge: ``robust`` against an uncertainty, and ``estimated`` on received messages only."""
+"""Shields for incomplete knowledge: ``robust`` for uncertain quantities, ``estimated`` for unknown vehicles."""
 
 from ethbrake_marl.extensions.certified.uncertainty import (
     Uncertainty as Uncertainty,

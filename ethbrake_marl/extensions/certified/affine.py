@@ -1,16 +1,16 @@
-"""Affine arithmetic over a box of worlds, and the motion of single vehicles in it.
+"""Affine arithmetic over a box of worlds, and the motion of single vehicles in the box.
 
-A *box* holds all worlds whose K uncertain numbers lie in given intervals. An *affine form* is an array [W], W = K + 2,
-that stands for ``c + g_1 e_1 + ... + g_K e_K + r e``: a centre, one slope for each uncertain number, and a remainder.
-``e_k`` in [-1, 1] is the position of the world in the box along uncertain number k and is the same in all forms. ``e``
-in [-1, 1] is arbitrary and independent in each form. In a subtraction the common ``e_k`` cancel, which plain intervals
-cannot do.
+A *box* contains all worlds whose K uncertain numbers lie in given intervals. An *affine form* represents a number that
+differs from world to world. It is an array [W], W = K + 2, for ``c + g_1 e_1 + ... + g_K e_K + r e``: a centre c, one
+slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of the world in the interval
+of uncertain number k; it is the same in all forms. ``e`` in [-1, 1] is arbitrary, and independent in each form. In a
+difference of two forms the common ``e_k`` cancel. Plain intervals do not have this advantage.
 
-Every operation is an enclosure: for each world of the box, some value of ``e`` makes the result equal to the exact
-result on the operands. The operations ignore floating-point rounding; ``ROUNDING`` accounts for it once in each piece
-of time.
+Every operation encloses the exact result: for each world of the box, some value of ``e`` makes the form equal to the
+exact result. The operations ignore floating-point rounding; instead, ``ROUNDING`` widens the results once in each
+piece.
 
-A *piece* is an interval of time in which no command changes. Letters: ``N`` vehicles, ``P = N - 1`` pairs, ``J``
+A *piece* is a time interval in which no command changes. Letters for shapes: ``N`` vehicles, ``P = N - 1`` pairs, ``J``
 pieces.
 """
 
@@ -27,8 +27,9 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @compiled(apart=True)
 def radius(x: Floats) -> float:
-    """Return the largest distance of a value of the affine form ``x`` [W] from its centre: the sum of the sizes of its
-    slopes, plus its remainder.
+    """Return the radius of the affine form ``x`` [W]: the largest distance of its values from its centre.
+
+    The radius is the sum of the absolute slopes and the remainder.
     """
     whole: float = x[-1]
     for k in range(1, x.shape[0] - 1):
@@ -38,21 +39,21 @@ def radius(x: Floats) -> float:
 
 @compiled(apart=True)
 def low(x: Floats) -> float:
-    """Return the least value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
+    """Return the smallest value of the affine form ``x`` [W] (centre, slopes, remainder) in the box."""
     return float(x[0] - radius(x))
 
 
 @compiled(apart=True)
 def high(x: Floats) -> float:
-    """Return the largest value that the affine form ``x`` [W] (centre, slopes, remainder) takes in the box."""
+    """Return the largest value of the affine form ``x`` [W] (centre, slopes, remainder) in the box."""
     return float(x[0] + radius(x))
 
 
 @compiled(apart=True)
 def add(out: Floats, share: float, x: Floats) -> None:
-    """Add ``share * x`` to ``out`` in place; exact except for rounding.
+    """Add ``share * x`` to ``out`` in place. The result is exact except for rounding.
 
-    ``x`` and ``out`` are affine forms [W] (centre, slopes, remainder), ``share`` is any number.
+    ``x`` and ``out`` are affine forms [W] (centre, slopes, remainder); ``share`` is any number.
     """
     for k in range(x.shape[0] - 1):
         out[k] += share * x[k]
@@ -61,7 +62,7 @@ def add(out: Floats, share: float, x: Floats) -> None:
 
 @compiled(apart=True)
 def difference(x: Floats, y: Floats) -> Floats:
-    """Return the affine form ``x - y`` [W] (centre, slopes, remainder) of two affine forms."""
+    """Return the difference ``x - y`` of two affine forms [W] (centre, slopes, remainder)."""
     out = x.copy()
     add(out, -1.0, y)
     return out
@@ -69,14 +70,15 @@ def difference(x: Floats, y: Floats) -> Floats:
 
 @compiled(apart=True)
 def negative(x: Floats) -> Floats:
-    """Return the affine form ``-x`` [W] (centre, slopes, remainder) of an affine form."""
+    """Return the affine form ``-x`` [W] (centre, slopes, remainder) for the affine form ``x``."""
     return linear(x, -1.0, 0.0, 0.0)
 
 
 @compiled(apart=True)
 def between(least: float, most: float, width: int) -> Floats:
-    """Return the affine form [width] (centre, slopes, remainder) of an arbitrary number between ``least`` and ``most``.
-    ``width`` is the length W of the form.
+    """Return the affine form of an arbitrary number between ``least`` and ``most``.
+
+    ``width`` is the length W of the form (centre, slopes, remainder).
     """
     out = np.zeros(width)
     out[0], out[-1] = 0.5 * (least + most), 0.5 * (most - least)
@@ -85,9 +87,9 @@ def between(least: float, most: float, width: int) -> Floats:
 
 @compiled(apart=True)
 def product(x: Floats, y: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * y``, for two affine forms.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses the product of two affine forms.
 
-    The second-order part of the product goes to the remainder.
+    The remainder takes up the second-order part of the product.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -101,7 +103,7 @@ def product(x: Floats, y: Floats) -> Floats:
 def square(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``x * x``.
 
-    Its remainder is half of that of ``product(x, x)``, because a square is never negative.
+    Its remainder is smaller than the remainder of ``product(x, x)``, because a square is never negative.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -114,8 +116,8 @@ def square(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
-    """Return the affine form [W] (centre, slopes, remainder) of ``start + slope * x``, widened by ``error`` on either
-    side.
+    """Return the affine form [W] (centre, slopes, remainder) of ``start + slope * x``, widened by ``error`` on both
+    sides.
     """
     out = np.empty_like(x)
     for k in range(x.shape[0] - 1):
@@ -128,10 +130,9 @@ def linear(x: Floats, slope: float, start: float, error: float) -> Floats:
 @compiled(apart=True)
 def square_root(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
-    Needs ``high(x) >= 0``.
 
-    Where ``x`` is negative the result means nothing. On [a, b] the root lies between its chord, with slope 1 / (sqrt a
-    + sqrt b), and the parallel tangent.
+    ``high(x)`` must be at least 0. In worlds with negative ``x`` the result has no meaning. On an interval [a, b] the
+    root lies between its chord, with slope 1 / (sqrt a + sqrt b), and the tangent of the same slope.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -144,9 +145,10 @@ def square_root(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def reciprocal(x: Floats) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. Needs ``low(x) > 0``.
+    """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. ``low(x)`` must be above 0.
 
-    On [a, b] it lies between its chord, with slope -1 / (a b), and the parallel tangent.
+    On an interval [a, b] the reciprocal lies between its chord, with slope -1 / (a b), and the tangent of the same
+    slope.
     """
     least, most = low(x), high(x)
     slope = -1.0 / (least * most)
@@ -159,7 +161,7 @@ def reciprocal(x: Floats) -> Floats:
 def positive_part(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``max(x, 0)``.
 
-    The function lies between its chord and the parallel line through 0.
+    ``max(x, 0)`` lies between its chord and the parallel line through 0.
     """
     least, most = low(x), high(x)
     if least >= 0.0:
@@ -173,10 +175,11 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) of the same number as ``x``, if that number is known to lie
-    between ``least`` and ``most``.
+    """Return an affine form [W] (centre, slopes, remainder) of ``x``, whose value is known to be from ``least`` to
+    ``most``.
 
-    The result is the form of that interval if the interval is tighter than ``x``, else ``x`` itself.
+    The result is an arbitrary number of the remaining interval if this interval is narrower than ``x``, else ``x``
+    itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
@@ -186,32 +189,32 @@ def cut(x: Floats, least: float, most: float) -> Floats:
 
 MOVES, MAY_STOP, STANDS = 0, 1, 2  # state of a vehicle in a piece
 
-FREE, TOUCHES, PARTS = 0, 1, 2  # state of a pair; PARTS: it was in contact when the piece began and opens in it
+FREE, TOUCHES, PARTS = 0, 1, 2  # state of a pair; PARTS: in contact at the start of the piece, then separates
 
 ROUNDING = 1e-12  # relative and absolute allowance for rounding in each piece, far above the engine's own rounding
 
 # Columns of Path.touch, the state of a pair in contact.
-# OPENING, CLOSING: largest speed at which the pair opens and closes (m/s). WIDE: its largest gap (m).
-# SOFTEST, HARDEST: least and largest closing acceleration since the commands press it together (m/s2).
-# SINCE: time since then (s). CREEP: largest speed of the rear vehicle in worlds that creep (m/s; 0: no world creeps).
-# SPREAD, REACH: largest difference of speeds (m/s) and largest gap (m) in the present piece.
+# OPENING, CLOSING: largest speed at which the pair opens and closes (m/s). WIDE: largest gap (m).
+# SOFTEST, HARDEST: smallest and largest closing acceleration (m/s2) since the commands press the pair together.
+# SINCE: time since the commands press the pair together (s).
+# CREEP: largest speed of the rear vehicle in worlds that creep (m/s); 0: no world creeps.
+# SPREAD, REACH: largest difference of the two speeds (m/s) and largest gap (m) in the present piece.
 OPENING, CLOSING, WIDE, SOFTEST, HARDEST, SINCE, CREEP, SPREAD, REACH = range(9)
 
 TOUCH_WIDTH = 9
 
 
 class Forces(NamedTuple):
-    """Accelerations of brakes and engines that build up, as affine forms, for every vehicle and time interval.
+    """Accelerations of vehicles whose brakes or engine build up, as affine forms, for every vehicle and time interval.
 
-    Index 0 of the second axis is the time from the alert to the first piece (time interval of constant command); index
-    j + 1 is piece j. Impacts do not change these accelerations, so they hold for every sequence of impacts.
+    Index 0 of the second axis is the time from the alert to the first piece (time interval of constant command). Index
+    j + 1 is piece j. Impacts do not change these accelerations, so they are the same for every sequence of impacts.
     """
 
     mean: Floats  # [N, J + 1, W] mean acceleration of the piece, m/s2
     rise: Floats  # [N, J + 1, W] change of speed in the piece, m/s
     gain: Floats  # [N, J + 1, W] distance in the piece beyond initial speed times length, m
-    # [N, J + 1, 2] largest deviation from the mean (m/s2): column 0 where the acceleration falls, column 1 where it
-    # rises
+    # [N, J + 1, 2] largest deviation from the mean (m/s2); index 0: the acceleration falls, index 1: it rises
     swing: Floats
     build: Bools  # [N] True where the vehicle's command builds up; the other arrays are 0 for all other vehicles
 
@@ -219,16 +222,15 @@ class Forces(NamedTuple):
 class Cell(NamedTuple):
     """A box of worlds as affine forms [W], with the commands and the pieces (time intervals of constant command).
 
-    An *affine form* stands for a number that depends on the world: a centre, a slope for each uncertain number of the
-    box, and a remainder.
+    An *affine form* represents a number that differs from world to world: a centre, a slope for each uncertain number
+    of the box, and a remainder.
     """
 
     speed: Floats  # [N, W] speeds at the start of the first piece, m/s
     gap: Floats  # [P, W] gaps at the start of the first piece, m
     brake: Floats  # [N, W] braking capacities, m/s2
     drive: Floats  # [W] driving capacity of the shielded vehicle, m/s2
-    # [P, 2, W] fraction of an impact's change of relative speed that the front (0) and the rear (1) vehicle take; both
-    # sum to 1
+    # [P, 2, W] share of an impact's change of relative speed for the front (0) and rear (1) vehicle; their sum is 1
     share: Floats
     onset: Floats  # [N, W] time after the first decision at which a vehicle's command takes effect, s
     constant: Floats  # [N] command of each other vehicle, m/s2; NaN: full braking
@@ -242,26 +244,27 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, with their present state.
+    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, and their present state.
 
-    An affine form [W] is a number that depends on the world: a centre, a slope for each uncertain number of the box,
-    and a remainder.
+    An affine form [W] represents a number that differs from world to world: a centre, a slope for each uncertain number
+    of the box, and a remainder.
     """
 
     forms: Floats  # [N + P + 1, W] affine forms of the speeds (m/s), the gaps (m) and the harm so far (m2/s2)
-    # [P, TOUCH_WIDTH] state of each pair in contact (columns ``OPENING`` to ``REACH``); meaningless for other pairs.
-    # Both speeds of a pair in contact are the speed of its centre of mass, and the gaps to its neighbours are measured
-    # from there.
+    # [P, TOUCH_WIDTH] state of each pair in contact (columns ``OPENING`` to ``REACH``); no meaning for other pairs.
+    # For a pair in contact ``forms`` has the speed of its centre of mass twice; the gaps to its neighbours are measured
+    # from this centre.
     touch: Floats
-    # [2 P + 1] first P: 1 if the pair had an impact, else 0; next P: the pair is FREE (not in contact), TOUCHES (in
-    # contact) or PARTS (it opens in the present piece); last: index of the present piece
+    # [2 P + 1] first P entries: 1 if the pair had an impact, else 0. Next P entries: FREE (not in contact), TOUCHES (in
+    # contact) or PARTS (separates in the present piece). Last entry: index of the present piece
     marks: Ints
 
 
 class Motion(NamedTuple):
-    """Motion of each vehicle, as if alone, through one piece (time interval of constant command).
+    """Motion of each vehicle through one piece (time interval of constant command), as if it were alone on the road.
 
-    Each [W] is an affine form: centre, a slope for each uncertain number of the box, remainder.
+    Every array [N, W] has an affine form for each vehicle: centre, a slope for each uncertain number of the box,
+    remainder.
     """
 
     pull: Floats  # [N, W] acceleration by the command, m/s2
@@ -287,9 +290,8 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
     """Compute the motion of every vehicle through one piece under its command, as if it were alone on the road.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         piece: index of the piece, 0 to J - 1.
         motion: receives the result.
 
@@ -310,7 +312,7 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
             add(onward, length, pull)
             add(reach, 0.5 * length * length, pull)
         if high(motion.pull[i]) + motion.vague[i] > 0.0:
-            # how much faster than its form a vehicle in contact may be within the piece
+            # largest excess of a vehicle's speed over its affine form within the piece, for a vehicle in contact
             P, most = cell.gap.shape[0], 0.0
             for p in range(max(i - 1, 0), min(i + 1, P)):
                 if path.marks[P + p] == TOUCHES:
@@ -340,13 +342,13 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Widen the motion of vehicle ``i``, in place, for brakes that hold it at rest while they are released in a piece.
+    """Widen the motion of vehicle ``i`` in place, because released brakes may still hold the vehicle at rest.
 
-    The vehicle may stand until its force is above 0. It is then faster, and further on, by at most the negative speed
-    that it would have reached.
+    The vehicle may stand until its acceleration is above 0. Its speed is then larger by at most the size of the
+    negative speed that it would have reached, and its distance by at most this speed times the length of the piece.
 
     Args:
-        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        speed: speed at the start of the piece as an affine form [W], m/s.
         i: index of the vehicle.
         length: length of the piece (time interval of constant command), s.
         motion: motion of all vehicles in the piece; ``onward`` and ``reach`` of vehicle ``i`` are changed.
@@ -361,8 +363,9 @@ def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
 
 @compiled(apart=True)
 def between_shifted(x: Floats, shift: float) -> Floats:
-    """Return the affine form [W] (centre, slopes, remainder) of any number between the affine form ``x`` and ``x +
-    shift``.
+    """Return the affine form [W] (centre, slopes, remainder) of an arbitrary number between ``x`` and ``x + shift``.
+
+    ``x`` is an affine form.
     """
     out = x.copy()
     add(out, 1.0, between(min(shift, 0.0), max(shift, 0.0), x.shape[0]))
@@ -374,11 +377,10 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     """Set ``motion.pull`` of vehicle ``i`` to the acceleration by its command in a piece; 0 before its latency has
     elapsed.
 
-    ``motion.rest`` and ``motion.vague`` of the vehicle are set too.
+    The function also sets ``motion.rest`` and ``motion.vague`` of the vehicle.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
         motion: receives the result.
@@ -406,14 +408,12 @@ def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     """Set the motion of vehicle ``i`` in a piece if its command may take effect only within the piece or after it.
 
-    Changes ``onward``, ``reach``, ``pull`` and ``vague`` of the vehicle in ``motion``, in place.
-
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
-        motion: motion of each vehicle in the present piece; changed in place.
+        motion: motion of each vehicle in the piece; ``onward``, ``reach``, ``pull`` and ``vague`` of vehicle ``i`` are
+            changed.
 
     """
     pull = motion.pull[i]
@@ -433,8 +433,8 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def since(cell: Cell, i: int, time: float) -> Floats:
-    """Return for how long the command of vehicle ``i`` has acted at ``time``, as an affine form [W] (centre, slopes,
-    remainder), in s, at least 0.
+    """Return how long the command of vehicle ``i`` has been in effect at ``time``, as an affine form [W], s, at least
+    0.
 
     ``time`` counts from the first decision, in s. ``cell`` is the box of worlds.
     """
@@ -445,14 +445,14 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and then stands.
+    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and stays at rest.
 
     Args:
         moving: True if the command of any vehicle builds up.
-        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
+        speed: speed at the start of the piece as an affine form [W], m/s.
         i: index of the vehicle.
         length: length of the piece (time interval of constant command), s.
-        motion: receives ``rest``, ``speed`` and ``way`` of vehicle ``i``; its other fields are read.
+        motion: motion of all vehicles in the piece; ``rest``, ``speed`` and ``way`` of vehicle ``i`` are set.
 
     """
     pull, vague, width = motion.pull[i], motion.vague[i], speed.shape[0]
@@ -471,10 +471,10 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Return the affine form [W] (centre, slopes, remainder) of the mean deceleration over any part of a piece, m/s2.
+    """Return the mean deceleration over any part of a piece, as an affine form [W] (centre, slopes, remainder), m/s2.
 
     Args:
-        pull: affine form [W] of the mean acceleration in the piece (time interval of constant command), m/s2.
+        pull: mean acceleration in the piece (time interval of constant command) as an affine form [W], m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
 
     """

@@ -1,7 +1,8 @@
-"""Impacts in a box of worlds: when and how fast a pair of vehicles may meet within one piece of time.
+"""First contacts in a box of worlds: when, and at which closing speed, a pair of vehicles may come into contact.
 
-A path is a set of worlds (``affine.Path``). Statements about "the worlds" of a path hold for all worlds that really
-take it; the affine forms may also cover other worlds.
+Each function looks at one piece (time interval of constant command). A *path* is a set of worlds (``affine.Path``).
+Statements about "the worlds" of a path hold for all worlds that really have its impacts. The affine forms of the path
+may also cover other worlds.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possi
 
 
 class Approach(NamedTuple):
-    """The way a pair may come into contact within one piece (time interval of constant command), as affine forms
-    (centre, slopes, remainder).
+    """How a pair may come into contact within one piece (time interval of constant command).
+
+    Every array [W] is an affine form: centre, slopes, remainder.
     """
 
     closing: Floats  # [W] closing speed at the start of the piece, m/s
@@ -54,14 +56,13 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return by how much, at most, bounces of neighbouring pairs may change the relative speed (m/s) or the gap (m) of
-    pair ``p``.
+    """Return how much bounces of neighbouring pairs may change the relative speed (m/s) or the gap (m) of pair ``p`` at
+    most.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         of_gap: True for the gap, False for the relative speed.
 
     """
@@ -75,10 +76,10 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest closing acceleration of pair ``p`` in a piece, m/s2.
+    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2.
 
-    Either vehicle may stop in it. ``motion`` is the motion of all vehicles in the piece (time interval of constant
-    command).
+    Either vehicle may stop within the piece. ``motion`` is the motion of all vehicles in the piece (time interval of
+    constant command).
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
     rear_low, rear_high = low(motion.pull[p + 1]) - motion.vague[p + 1], high(motion.pull[p + 1]) + motion.vague[p + 1]
@@ -91,14 +92,13 @@ def pressing(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> bool:
-    """Return whether pair ``p`` may come into contact in this piece while it closes.
+    """Return whether pair ``p`` may come into contact within this piece while its gap closes.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
     """
@@ -123,21 +123,20 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
-    """Return how a pair meets, and whether it can meet in this piece at all.
+    """Return closing speed and time of a pair's contact in this piece, and whether such a contact is possible.
 
-    With closing speed w, closing acceleration b and gap g, the squared closing speed at contact is ``w^2 + 2 b g``. The
-    time until contact is ``2 g / (w + w')`` with the closing speed w' at contact. If the front vehicle stops first, its
-    stopping distance is added to g.
+    With closing speed w, closing acceleration b and gap g, the squared closing speed at contact is ``w^2 + 2 b g``.
+    With w' as the closing speed at contact, the time until contact is ``2 g / (w + w')``. If the front vehicle stops
+    first, its stopping distance is added to g.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
-        front_stands: True: consider the worlds in which the front vehicle stands at contact; False: those in which it
-            moves.
+        front_stands: True: consider the worlds in which the front vehicle is at rest at contact. False: consider the
+            worlds in which it moves.
 
     """
     N, width = cell.speed.shape[0], cell.speed.shape[1]
@@ -162,7 +161,7 @@ def approach(
         squared[-1] += 2.0 * vague * (max(high(gap), 0.0) + 2.0 * length * opening)
     squared[-1] += NEVER
     there = high(squared) > BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
-    if slack > 0.0:  # at contact
+    if slack > 0.0:  # bounces of neighbouring pairs may change the closing speed at contact
         least = math.sqrt(max(low(squared), 0.0)) - slack
         rough = square_root(cut(squared, 0.0, math.inf))
         rough[-1] += slack
@@ -188,12 +187,12 @@ def approach(
 
 @compiled(apart=True)
 def _stopping_way(moving: bool, speed: Floats, pull: Floats, vague: float, length: float) -> Floats:
-    """Return the stopping distance, an affine form [W] in m, of a braking vehicle that stops within a piece.
+    """Return the stopping distance (m) of a vehicle that stops within a piece, as an affine form [W].
 
     Args:
         moving: True if the command of any vehicle builds up.
-        speed: affine form [W] (centre, slopes, remainder) of the speed at the start of the piece, m/s.
-        pull: affine form [W] of the mean acceleration, m/s2.
+        speed: speed at the start of the piece as an affine form [W], m/s.
+        pull: mean acceleration as an affine form [W], m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         length: length of the piece, s.
 

@@ -1,4 +1,7 @@
-"""Impacts in a box of worlds: how the two vehicles of an impact move until the piece of time ends."""
+"""Motion of the two vehicles of an impact until the piece ends, in a box of worlds.
+
+A *piece* is a time interval of constant command.
+"""
 
 from __future__ import annotations
 
@@ -24,19 +27,17 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def spring_apart(
-    cell: Cell, path: Path, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
+    cell: Cell, motion: Motion, p: int, how: Approach, jump: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Set speed and distance of both vehicles of a pair that separates after an impact, up to the end of the piece.
+    """Set speed and distance, up to the end of the piece, of both vehicles of a pair that separates after an impact.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        jump: affine form [W] (centre, slopes, remainder) of the change of the pair's relative speed by the impact, m/s.
-        left: affine form [W] of the time from the impact to the end of the piece, s.
+        jump: change of the pair's relative speed by the impact, as an affine form [W] (centre, slopes, remainder), m/s.
+        left: time from the impact to the end of the piece, as an affine form [W], s.
         after: receives the speeds at the end of the piece.
         way: [N, W] receives the distances travelled in the piece, m.
 
@@ -66,15 +67,15 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 
     Args:
         cell: the box of worlds.
-        pull: affine form [W] (centre, slopes, remainder) of the mean acceleration after the impact, m/s2.
+        pull: mean acceleration after the impact as an affine form [W] (centre, slopes, remainder), m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         left: longest time from the impact to the end of the piece (time interval of constant command), s.
-        speed: affine form [W] of the speed at the end of the piece, m/s; corrected in place.
-        way: affine form [W] of the distance travelled in the piece, m; corrected in place.
+        speed: speed at the end of the piece as an affine form [W], m/s; corrected in place.
+        way: distance travelled in the piece as an affine form [W], m; corrected in place.
 
     """
     least = low(speed)
-    if cell.moving and low(pull) - vague < 0.0 < high(pull) + vague:  # it may drive off again, as in ``hold``
+    if cell.moving and low(pull) - vague < 0.0 < high(pull) + vague:  # the vehicle may drive off again, as in ``hold``
         least -= (high(pull) + vague) * left
         speed[:] = between_shifted(speed, max(-least, 0.0))
     if least < 0.0:
@@ -89,20 +90,19 @@ def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floa
 def stay(
     cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats, left: Floats, after: Path, way: Floats
 ) -> None:
-    """Set speed and distance of both vehicles of a pair that stays in contact after an impact, up to the end of the
-    piece.
+    """Set speed and distance, up to the end of the piece, of both vehicles of a pair that stays in contact after an
+    impact.
 
     Both vehicles get the speed of the pair's centre of mass.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
-        left: affine form [W] of the time from the impact to the end of the piece, s.
+        speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
+        left: time from the impact to the end of the piece as an affine form [W], s.
         after: receives the speeds at the end of the piece and the state of the pair in contact.
         way: [N, W] receives the distances travelled in the piece, m.
 

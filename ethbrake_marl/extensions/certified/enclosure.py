@@ -1,7 +1,8 @@
-"""Upper bound on the harm of a plan over a box of worlds, by branch and bound.
+"""Compute an upper bound on the harm of a plan over a box of worlds, by branch and bound.
 
-A *plan* holds one action for each decision up to the horizon. The box is halved again and again where its bound is
-largest. ``Q`` numbers describe a box, ``K`` of them are uncertain, ``L`` is the length of a plan.
+A *plan* has one action for each decision up to the horizon. The search halves the part of the box with the largest
+bound, again and again. Letters for shapes: ``Q`` numbers describe a world, ``K`` of them are uncertain, ``L`` is the
+length of a plan.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats, Ints, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 
-# groups of a box's numbers: N numbers in each group, P in the last one
+# groups of the numbers of a box: N numbers in each group, P in the last group
 BRAKING, DRIVING, LATENCY, MASS, BRAKE_RATE, RELEASE_RATE, SPEED, GAP = range(8)
 
-LONGEST_PIECE_S = 0.25  # longest piece of time before the first decision
+LONGEST_PIECE_S = 0.25  # longest piece before the first decision
 
 
 class Known(NamedTuple):
@@ -64,13 +65,13 @@ class Known(NamedTuple):
 
 @compiled(apart=True)
 def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
-    """Return the affine form [K + 2] (centre, slopes, remainder) of one number of a box.
+    """Return one number of a box as an affine form [K + 2] (centre, slopes, remainder).
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         which: index of the number in the box.
-        free: [K] indices of the uncertain numbers, each with a slope of its own.
+        free: [K] indices of the uncertain numbers; each has its own slope.
 
     """
     out = np.zeros(free.shape[0] + 2)
@@ -88,16 +89,16 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
     """Return the cell of a box, and the time from the alert to the first piece (s) as an affine form [W].
 
-    A *cell* is the box as affine forms, with the commands cut into pieces (time intervals of constant command). Time
-    counts from the first decision, because that decision falls at a different time in each world if the shielded
-    vehicle's latency is uncertain. The first piece starts before it by the shortest time that any world needs from the
-    alert to the first decision.
+    A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command).
+    Times count from the first decision. (If the shielded vehicle's latency is uncertain, the first decision falls at a
+    different time in each world.) The first piece starts before the first decision; the time between them is the
+    shortest time that any world needs from the alert to its first decision.
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         free: [K] indices of the uncertain numbers.
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
 
     """
@@ -127,7 +128,7 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
     times, action = pieces(known, onset, earliest, plan)
     first[0] -= earliest
     build = np.zeros(N, np.bool_)
-    for i in range(N):  # another vehicle only brakes or only drives, so only one of its rates matters
+    for i in range(N):  # the other vehicles only brake or only drive, so one of their rates matters
         down, up = low_[BRAKE_RATE * N + i] < math.inf, low_[RELEASE_RATE * N + i] < math.inf
         build[i] = (up and (i == v or known.constant[i] > 0.0)) or (down and not known.constant[i] >= 0.0)
     J, moving = times.shape[0] if build.any() else 0, bool(build.any())
@@ -148,19 +149,19 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
 @compiled(apart=True)
 def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
-    """Compute ``cell.forces`` of vehicle ``i``, in place, for the time before the first piece and for every piece.
+    """Compute ``cell.forces`` of vehicle ``i`` in place, for every piece and for the time before the first piece.
 
-    The force is 0 at the alert. A *piece* is a time interval of constant command.
+    The acceleration is 0 at the alert. A *piece* is a time interval of constant command.
 
     Args:
         cell: the box of worlds; only its ``forces`` change.
         i: index of the vehicle.
-        late: affine form [W] (centre, slopes, remainder) of the time from the alert to the first piece, s.
-        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
+        late: time from the alert to the first piece as an affine form [W] (centre, slopes, remainder), s.
+        rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
 
     """
     forces, own, force, wanted = cell.forces, i == cell.vehicle, np.zeros_like(late), np.zeros_like(late)
-    last, there = 0.0, True  # last action; whether the force has reached it
+    last, there = 0.0, True  # last action, and whether the acceleration has reached its target
     for j in range(cell.times.shape[0]):
         begin, end = cell.times[j - 1], cell.times[j]
         duration = between(end - begin, end - begin, late.shape[0])
@@ -201,23 +202,24 @@ def ramp(
     force: Floats, wanted: Floats, duration: Floats, longest: float, rates: Floats, rise: Floats, gain: Floats,
     swing: Floats,
 ) -> bool:  # fmt: skip
-    """Move a force towards its target during a time, and add its effect on speed and distance.
+    """Move an acceleration towards its target for some time, and add its effect on speed and distance.
 
-    For a difference d to ``wanted`` at the start and e at the end, and a time m during which the force changes, the
-    speed changes by ``m (d + e) / 2`` more than under ``wanted`` alone in the duration t, and the distance by ``m t (d
-    + e) / 2 - m^2 (d + 2 e) / 6``. Returns whether the force has reached ``wanted`` at the end in every world.
+    Let d be the difference to ``wanted`` at the start, e the difference at the end, and m the time in which the
+    acceleration changes. Compared with the acceleration ``wanted`` for the whole duration t, the speed changes by ``m
+    (d + e) / 2`` more, and the distance by ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` more. Returns True if the
+    acceleration has reached ``wanted`` at the end in every world.
 
     Args:
-        force: affine form [W] (centre, slopes, remainder) of the acceleration at the start, m/s2; becomes the
+        force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; becomes the
             acceleration at the end.
-        wanted: affine form [W] of the acceleration that the command asks for, m/s2.
-        duration: affine form [W] of the time for which the command acts, s.
+        wanted: acceleration of the command as an affine form [W], m/s2.
+        duration: time for which the command acts as an affine form [W], s.
         longest: upper limit of ``duration``, s.
-        rates: [2, W] rates at which the brakes build up (0) and release (1), m/s3.
-        rise: affine form [W] of the change of speed, m/s; increased in place.
-        gain: affine form [W] of the distance beyond the starting speed times the time, m; increased in place.
-        swing: [2] receives the largest deviation of the acceleration from its mean where it falls (0) and rises (1),
-            m/s2.
+        rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
+        rise: change of speed as an affine form [W], m/s; increased in place.
+        gain: distance beyond initial speed times duration as an affine form [W], m; increased in place.
+        swing: [2] receives the largest deviation of the acceleration from its mean, m/s2: index 0 for a falling, index
+            1 for a rising acceleration.
 
     """
     start, there = difference(force, wanted), True
@@ -249,11 +251,11 @@ def ramp(
 
 @compiled(apart=True)
 def wait(cell: Cell, late: Floats) -> bool:
-    """Advance the speeds and gaps of a cell, in place, from the alert to the first piece (time interval of constant
+    """Advance the speeds and gaps of a cell in place, from the alert to the first piece (time interval of constant
     command).
 
-    Returns False if something may disturb the motion until then: a contact, a stop, the speed limit, or a command that
-    takes effect on the way. ``late`` [W] is the time from the alert to the first piece, s.
+    Returns False if something may disturb the motion in this time: a contact, a stop, the speed limit, or a command
+    that takes effect. ``late`` [W] is the time from the alert to the first piece, s.
     """
     if high(late) <= 1e-12:
         return True
@@ -285,11 +287,11 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether it is certain.
+    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether this acceleration is certain.
 
-    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. It is
-    not certain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds; ``late`` [W]
-    is the time from the alert to the first piece (time interval of constant command), s.
+    The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. The
+    acceleration is uncertain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds;
+    ``late`` [W] is the time from the alert to the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
     if i == cell.vehicle:
@@ -307,12 +309,13 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Return the J pieces (time intervals of constant command): their limits [J + 1], and the action in each, [J].
+    """Return the limits of the J pieces (time intervals of constant command), [J + 1], and the action in each piece,
+    [J].
 
     The limits are in s after the first decision.
 
     Args:
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
         earliest: earliest possible time of the first decision, s.
         plan: [L] action of the shielded vehicle at each decision.
@@ -350,24 +353,24 @@ def bound_of(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, stack: Stack, motion: Motion, out: Floats,
     most: float,
 ) -> float:  # fmt: skip
-    """Return an upper bound on the harm of a plan over one box, m2/s2.
+    """Return an upper bound (m2/s2) on the harm of a plan over one box.
 
-    A result above ``most`` is no bound; it only says that the harm may exceed ``most``.
+    A result above ``most`` is not a bound: the harm may then be larger than the result.
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         free: [K] indices of the uncertain numbers.
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
-        stack: memory for the sets of worlds that are followed separately.
-        motion: memory for the motion of each vehicle.
+        stack: working memory for the paths (sets of worlds with the same impacts).
+        motion: working memory for the motion of each vehicle.
         out: [K + 2] receives the affine form of the harm that reaches the bound.
         most: harm above which the search stops, m2/s2.
 
     """
     cell, late = cell_of(low_, high_, free, known, plan)
-    # rough bound for all worlds, whose first piece begins ``late`` after the alert
+    # rough bound for all worlds; their first piece begins ``late`` after the alert
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
     path = Path(np.zeros((N + P + 1, width)), np.zeros((P, TOUCH_WIDTH)), np.zeros(2 * P + 1, np.int64))
     for i in range(N):
@@ -388,20 +391,20 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Return an upper bound on the harm of a plan over a box (m2/s2), and the number of parts of the box that were
-    examined.
+    """Return an upper bound (m2/s2) on the harm of a plan over a box, and how many parts of the box were examined.
 
-    The part with the largest bound is halved until the bound is at most ``enough`` or ``cells`` parts were examined.
+    The part with the largest bound is halved until the bound is at most ``enough``, or ``cells`` parts were examined.
 
     Args:
-        low_: [Q] least values of the box.
-        high_: [Q] largest values of the box.
+        low_: [Q] smallest value of each number of the box.
+        high_: [Q] largest value of each number of the box.
         free: [K] indices of the uncertain numbers.
-        known: the certain quantities.
+        known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
-        enough: bound that needs no refinement, m2/s2.
+        enough: bound that is small enough to stop, m2/s2.
         cells: largest number of parts to examine.
-        only_enough: True: stop in a part once its harm is above ``enough``; a result above ``enough`` is then no bound.
+        only_enough: True: stop in a part as soon as its harm is above ``enough``; a result above ``enough`` is then not
+            a bound.
 
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
@@ -430,11 +433,12 @@ def bound_box(
 
 MOST_VEHICLES = 3
 
-CELLS_AT_ALERT, CELLS = 200, 40  # most cells to examine: for the bound at the alert, and for one later certificate
+# largest number of cells to examine: for the bound at the alert, and for each later certificate
+CELLS_AT_ALERT, CELLS = 200, 40
 
 NEAR = 1.02  # a bound below this multiple of the largest harm in a corner is not refined further
 
-NEARLY_NOTHING = 0.1  # m2/s2; added to that limit
+NEARLY_NOTHING = 0.1  # m2/s2; added to this multiple
 
 CORNERS, INTERIOR = "corners", "interior"  # worlds that mode robust certifies: the corners of a box, or the whole box
 
@@ -444,9 +448,11 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """The boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. ``Q = 8 N - 1`` numbers."""
+    """Boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. A world has ``Q = 8 N - 1``
+    numbers.
+    """
 
-    # [n, Q] least values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
+    # [n, Q] smallest values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
     # vehicle, then the gaps
     low: Floats
     high: Floats  # [n, Q] largest values, in the same order
@@ -462,8 +468,8 @@ class Boxes(NamedTuple):
     def check_possible(robust: str, scenario: Scenario, harm_count: HarmCount, others: Mapping[int, Script]) -> None:
         """Raise ``InvalidInput`` for a setting that ``robust="interior"`` cannot certify in any world.
 
-        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle whose script is not
-        to brake fully, to coast, or to hold one deceleration.
+        Such settings are: total harm; more than three vehicles; an obstacle ahead; another vehicle with a script other
+        than full braking, coasting or one constant deceleration.
 
         Args:
             robust: ``corners`` (never raises) or ``interior``.
@@ -485,8 +491,8 @@ class Boxes(NamedTuple):
             name = getattr(script, "name", type(script).__name__)
             if name.split(":")[0] not in SCRIPTS:
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} is controlled by {name!r}, which it cannot enclose;"
-                    " full_brake, coast and constant:A are possible; robust corners takes every script"
+                    f"shield: robust interior: vehicle_{i + 1} follows {name!r}; must be full_brake, coast or"
+                    " constant:A (robust corners accepts every script)"
                 )
 
     @classmethod
@@ -497,7 +503,7 @@ class Boxes(NamedTuple):
 
         Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a braking profile in
         pieces, brakes that began to build up before the alert, or another vehicle whose command differs within the box.
-        ``check_possible`` covers what does not depend on the worlds.
+        ``check_possible`` checks the settings that do not depend on the worlds.
 
         Args:
             possible: [n * M] worlds, M consecutive ones for each box: the reported world and the corners of its box.
@@ -521,9 +527,8 @@ class Boxes(NamedTuple):
                 continue
             if not (command[:, :, i] == command[:, :1, i]).all():
                 raise InvalidInput(
-                    f"shield: robust interior: vehicle_{i + 1} is controlled by {name!r}, whose command is another one"
-                    " in each world of the box; full_brake, coast and constant:A are possible, A being at most every"
-                    " capacity of the box"
+                    f"shield: robust interior: vehicle_{i + 1} follows {name!r}, whose command differs between worlds"
+                    " of the box; must be full_brake, coast, or constant:A with A at most every capacity of the box"
                 )
             constant[:, i] = command[:, 0, i]
         numbers = np.concatenate(
@@ -548,8 +553,8 @@ class Boxes(NamedTuple):
 
         Args:
             old: boxes of all episodes before; None at the first start.
-            rows: [m] indices of the new episodes; this object holds their boxes. If they cover all episodes, ``old`` is
-                unused.
+            rows: [m] indices of the new episodes, whose boxes this object contains. If all episodes are new, ``old`` is
+                not used.
 
         """
         if old is None or len(rows) >= len(old.low):
@@ -564,7 +569,7 @@ class Boxes(NamedTuple):
 
         Args:
             plans: [n, L] action of the shielded vehicle at each decision, for each world.
-            harm: [n] largest harm of the plan in a corner of the box, m2/s2; a bound close to it is not refined.
+            harm: [n] largest harm of the plan in any corner of the box, m2/s2; the search stops at a bound close to it.
 
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
@@ -579,10 +584,10 @@ class Boxes(NamedTuple):
         Args:
             rows: [m] indices of the boxes.
             plans: [m, L] action of the shielded vehicle at each decision, for each box.
-            enough: [m] bound that needs no refinement, m2/s2.
+            enough: [m] bound that is small enough to stop, m2/s2.
             cells: largest number of parts of a box to examine.
-            only_enough: True: a result above ``enough`` is no bound; it only says that no bound of at most ``enough``
-                was established.
+            only_enough: True: a result above ``enough`` is not a bound, because the search stops as soon as the harm
+                may exceed ``enough``.
 
         """
         bounds = np.empty(len(rows))
@@ -599,8 +604,8 @@ class Boxes(NamedTuple):
 
 def _refusal(what: str) -> InvalidInput:
     return InvalidInput(
-        f"shield: robust interior: {what}: it certifies first-impact harm of at most {MOST_VEHICLES} vehicles without"
-        " an obstacle; robust corners takes every scenario"
+        f"shield: robust interior: {what}: cannot be certified; use robust corners, or first-impact harm of at most"
+        f" {MOST_VEHICLES} vehicles without an obstacle"
     )
 
 

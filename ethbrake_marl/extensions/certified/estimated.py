@@ -1,17 +1,19 @@
-"""The estimated world of one vehicle: what it received, extrapolated by the scripts, with ranges for all the rest.
+"""The estimated world of one vehicle: its received information, completed by the scenario's ranges.
 
-A vehicle is *known* if its message has arrived or it is in sight. The estimate takes three sources:
+A vehicle is *known* if its message has arrived or it is in sight. The estimate combines the following information:
 
-* Of a known vehicle: its capacities, mass and own latency, and its newest received state. The script that the vehicle
-  follows extrapolates this state to the present: from the time of the state if a command was in force then, else from
-  the time at which the vehicle is expected to react.
-* Of a vehicle that is not known: what the scenario declares. Each quantity is the median of its distribution, or any
-  value of its range. Its script runs from the alert.
-* Of a known vehicle whose messages lack a piece (``v2x: tells``): the same for that piece. Place and speed count only
-  together, and a command in force only with both. An intent is not used, because the scripts say what follows.
-* Of the vehicle itself: measurements of its own state, its distance since the alert, and impacts with known neighbours.
+* From a known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The
+  vehicle's script extrapolates this state to the present. The extrapolation starts at the time of the state if a
+  command was in force then, otherwise at the time at which the vehicle is expected to react.
+* For a vehicle that is not known: the scenario. Each quantity is the median of its distribution, or a chosen value of
+  its range. The vehicle's script starts at the alert.
+* For a known vehicle whose messages lack a piece (``v2x: tells``): the scenario, for this piece only. Place and speed
+  are used only together. A command in force is used only together with place and speed. A received intent is not used,
+  because the scripts already predict what the vehicle does.
+* From the vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
+  neighbours.
 
-Nothing else of the line is read, so information that was not received cannot change an estimated world.
+The estimate reads nothing else of the true world, so information that was not received cannot change it.
 """
 
 from __future__ import annotations
@@ -46,30 +48,34 @@ OF_OTHERS = (
 
 
 class Told(NamedTuple):
-    """Information that one vehicle has received about the others by now. Columns of unknown vehicles are meaningless.
+    """Information that one vehicle has received about the others by now.
 
-    A vehicle is *known* if its message has arrived or it is in sight.
+    A vehicle is *known* if its message has arrived or it is in sight. Columns of unknown vehicles have no meaning.
     """
 
-    known: Bools  # [n, N] True where place and speed are known; always True for the vehicle itself
-    pieces: Bools  # [n, N, len(PIECES)] True for each known piece; nothing of a vehicle without news
-    at_s: Floats  # [n, N] time of the received state
-    place_m: Floats  # [n, N] position at that time, relative to the receiving vehicle's present position
-    speed_mps: Floats  # [n, N] speed at that time
-    command_mps2: Floats  # [n, N] command in force at that time
-    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position; infinite: none is known
+    known: Bools  # [n, N] True for vehicles with known place and speed, and for the vehicle itself
+    pieces: Bools  # [n, N, len(PIECES)] True for each known piece; all False for a vehicle without news
+    at_s: Floats  # [n, N] time of the received state, s
+    place_m: Floats  # [n, N] position at ``at_s`` relative to the receiving vehicle's present position
+    speed_mps: Floats  # [n, N] speed at ``at_s``
+    command_mps2: Floats  # [n, N] command in force at ``at_s``
+    obstacle_m: Floats  # [n] distance of the obstacle from the vehicle's present position; infinite: no known obstacle
     obstacle_hit: Bools  # [n] True if an impact with the obstacle is known
-    hit: Bools  # [n, P] True for an own pair with a known neighbour that had an impact
+    hit: Bools  # [n, P] True for a pair of the vehicle and a known neighbour that had an impact
 
     @property
     def reacts(self) -> Bools:
-        """True for vehicles that are known to have a command in force, [n, N]."""
+        """Vehicles that are known to have a command in force: boolean mask, [n, N]."""
         reacts: Bools = self.known & self.pieces[..., ACCELERATION] & (self.command_mps2 != 0.0)
         return reacts
 
     @property
     def heard(self) -> Floats:
-        """What is known of whom, [n, N]: 0 nothing, 1 pieces without place and speed, 2 these too."""
+        """Amount of information about each vehicle, [n, N].
+
+        0: nothing is known. 1: some pieces of information, but not both place and speed. 2: place and speed are known
+        as well.
+        """
         return self.pieces.any(axis=2).astype(np.float64) + self.known
 
     @classmethod
@@ -85,24 +91,23 @@ class Told(NamedTuple):
         place = _places_of(worlds, vehicle)
         hit = np.zeros((n, N - 1), np.bool_)
         at_s = np.repeat(worlds.time_s[:, np.newaxis], N, axis=1)
-        told = cls(
+        received = cls(
             known, pieces, at_s, place, worlds.speeds_mps.copy(), worlds.command_mps2.copy(),
             worlds.obstacle_gap_m + place[:, 0], worlds.obstacle_hit.copy(), hit,
         )  # fmt: skip
         if (periodic := Messages.of(worlds).periodic).any():
-            told._hear_messages(worlds, vehicle, periodic)
+            received._hear_messages(worlds, vehicle, periodic)
         pieces &= known[..., np.newaxis]
         known &= pieces[..., PLACE] & pieces[..., SPEED]
         for pair, other in ((vehicle - 1, vehicle - 1), (vehicle, vehicle + 1)):
             if 0 <= pair < N - 1:
                 hit[:, pair] = worlds.pair_hit[:, pair] & known[:, other]
         unheard = ~pieces[:, 0, PLACE]
-        told.obstacle_m[unheard], told.obstacle_hit[unheard] = np.inf, False
-        return told
+        received.obstacle_m[unheard], received.obstacle_hit[unheard] = np.inf, False
+        return received
 
     def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
-        """Replace, in place, the present state of other vehicles by their newest message, except where they are in
-        sight.
+        """Replace the present state of other vehicles in place by their newest message, except for vehicles in sight.
 
         ``periodic`` [n] is True for worlds in which vehicles send messages periodically.
         """
@@ -120,9 +125,9 @@ class Told(NamedTuple):
 
 
 def _places_of(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the position of each vehicle ahead of ``vehicle``, [n, N] m; negative behind it.
+    """Return the position of each vehicle relative to ``vehicle``, [n, N] m, from the gaps of ``worlds``.
 
-    The positions come from the gaps of ``worlds``. Direct neighbours are exactly one gap away.
+    Positions ahead are positive, positions behind negative. Direct neighbours are exactly one gap away.
     """
     ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
     place: Floats = ahead - ahead[:, [vehicle]]
@@ -136,22 +141,23 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 class Ranges:
     """Ranges that a scenario declares for the vehicles that ``vehicle`` does not know.
 
-    Keys of the mappings: ``place`` (position ahead of the vehicle's own position at the alert, m), ``speeds_mps``,
-    ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (a vehicle's own part of the latency) and ``news_s`` (time at
-    which a vehicle has received the alert, before which it does not react; 0 without a channel). Each value is [N].
+    Keys of the mappings: ``place`` (position relative to the estimating vehicle at the alert, m), ``speeds_mps``,
+    ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the alert message, s) and
+    ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a channel). Each value has
+    the shape [N].
     """
 
     vehicle: int  # index of the estimating vehicle
     others: Mapping[int, Script]  # scripts of the other vehicles, by index; a vehicle without a script brakes fully
-    middle: Mapping[str, Floats]  # median of each quantity, [N] each
-    low: Mapping[str, Floats]  # least value of each quantity, [N] each
-    high: Mapping[str, Floats]  # largest value of each quantity, [N] each
+    middle: Mapping[str, Floats]  # median of each quantity, [N]
+    low: Mapping[str, Floats]  # smallest value of each quantity, [N]
+    high: Mapping[str, Floats]  # largest value of each quantity, [N]
     obstacle_gap_m: float  # gap of vehicle_1 to the obstacle, m; infinite without an obstacle
 
     @classmethod
     def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Return the ranges that ``scenario`` declares for all vehicles, as the vehicle with index ``vehicle`` sees
-        them.
+        """Return the ranges that ``scenario`` declares for all vehicles, for the estimates of the vehicle with index
+        ``vehicle``.
 
         ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts. Raises ``InvalidInput``
         for a mixture of scenarios, because an unknown vehicle could belong to any of them.
@@ -159,8 +165,8 @@ class Ranges:
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
             raise InvalidInput(
-                f"scenario {scenario.name!r}: is a mixture, and a vehicle that is not known could be of any of {names};"
-                " estimated agents need one of these"
+                f"scenario {scenario.name!r} is a mixture: an unknown vehicle could belong to any of {names}; estimated"
+                " agents and shields need one of these scenarios"
             )
         world = middle_world(scenario)
         low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
@@ -186,12 +192,11 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return a value of one quantity for every vehicle, [N]: its median, unless ``share`` selects a point of its
-        range.
+        """Return a value of one quantity for every vehicle, [N]: the median, or the selected value of the range.
 
         Args:
-            share: maps (quantity, vehicle index) to a position in the range: 0 is the least value, 1 the largest. None:
-                all medians.
+            share: position in the range for each selected (quantity, vehicle index): 0 is the smallest value, 1 the
+                largest. None: the median of every vehicle.
             key: the quantity, a key of ``middle``.
 
         """
@@ -203,7 +208,10 @@ class Ranges:
 
     @property
     def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """Pairs (quantity, vehicle index) of all numbers of other vehicles that the scenario leaves open."""
+        """Uncertain numbers of the other vehicles, as pairs (quantity, vehicle index).
+
+        A number is uncertain if the scenario declares a range for it, not one value.
+        """
         others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
 
@@ -217,24 +225,24 @@ class Ranges:
         """Return the estimated worlds of the vehicle at the present time, [n].
 
         Args:
-            worlds: the true worlds; only what the vehicle received is read.
+            worlds: the true worlds; only the information that the vehicle received is read.
             way_m: [n] the vehicle's own distance since the alert, m.
-            share: maps (quantity, vehicle index) to a position in its range, 0 to 1; None: the median of every
+            share: position in the range for each selected (quantity, vehicle index), 0 to 1; None: the median of every
                 quantity.
-            foretold: the worlds as they were predicted for now (impacts included), and a mask [n, N] of the vehicles
-                for which this prediction is better than their last message. None: no prediction.
+            foretold: worlds as predicted for the present time, including impacts, and a mask [n, N] of the vehicles
+                whose predicted state replaces their last message. None: no prediction.
 
         """
         worlds.refuse_build_up(":estimated")
         vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
         known, own, v = Told.to(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
-        given = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
-                 "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
+        reported = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
+                    "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
         some, pieces = known.pieces.any(axis=2), known.pieces
         has = {"mass_t": pieces[..., MASS], "speed_limit_mps": some}
         of = {
             key: np.where(has.get(key, pieces[..., BRAKING_CAPACITY]), values, self.at(share, key))
-            for key, values in given.items()
+            for key, values in reported.items()
         }
         at_s = np.where(known.known, known.at_s, 0.0)
         own_part = np.where(pieces[..., LATENCY], v.own_latency_s, self.at(share, "latency_s"))
@@ -281,11 +289,11 @@ class Ranges:
 
 
 def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
-    """Return the position of each vehicle ahead of ``vehicle``, [N] m; negative behind it.
+    """Return the position of each vehicle relative to ``vehicle``, [N] m. Positions behind it are negative.
 
     Args:
-        ahead_m: [P] gaps; used for the pairs in front of the vehicle.
-        behind_m: [P] gaps; used for the pairs behind the vehicle.
+        ahead_m: [P] gaps for the pairs in front of the vehicle, m.
+        behind_m: [P] gaps for the pairs behind the vehicle, m.
         vehicle: index of the vehicle at position 0.
 
     """
@@ -294,19 +302,19 @@ def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
 
 
 def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
-    """Correct positions so that the vehicles stand in line order; return the corrected array, [n, N] m.
+    """Correct positions so that the vehicles are in the order of the line, and return them, [n, N] m.
 
     Args:
-        place: [n, N] position of each vehicle ahead of ``vehicle``, m; changed in place.
-        known: [n, N] True for vehicles whose position is certain; they keep it.
+        place: [n, N] position of each vehicle relative to ``vehicle``, m; changed in place.
+        known: [n, N] True for vehicles whose position is certain; their position is not changed.
         vehicle: index of the vehicle at position 0.
 
     """
     N = place.shape[1]
-    for way in (-1, 1):  # first the vehicles ahead, then those behind
+    for way in (-1, 1):  # first the vehicles ahead, then the vehicles behind
         side = np.arange(vehicle + way, -1 if way < 0 else N, way)
         limit = np.full(len(place), np.inf)
-        for j in side[::-1]:  # from the far end: no farther away than the next known vehicle beyond
+        for j in side[::-1]:  # from the far end: at most as far away as the next known vehicle beyond it
             far = np.where(known[:, j], -way * place[:, j], np.minimum(-way * place[:, j], limit))
             limit = np.where(known[:, j], np.minimum(far, limit), limit)
             place[:, j] = -way * far

@@ -1,10 +1,10 @@
-"""Shields in the estimated world: they certify on what the vehicle received and read nothing else.
+"""Shields in the estimated world: they read only the information that their vehicle received.
 
-*Estimated world*: see ``estimated``. Mode ``step`` certifies every action in the estimated world with the median of
-everything unknown; it promises nothing about the true world. Mode ``robust`` certifies in every corner of the ranges of
-everything unknown. If the true world is such a corner, its harm up to the horizon is at most the first bound: later
-messages only remove corners that contradict them, and the held plan is replaced only by a better plan for the
-remaining corners.
+``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world with the
+median of every unknown quantity. This mode promises nothing about the true world. Mode ``robust`` also certifies in
+every corner of the unknown quantities' ranges. If the true world is one of these corners, its harm up to the horizon is
+at most the first bound. The bound holds because later messages only remove corners that contradict them, and a new plan
+must be better than the present plan in the remaining corners.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ from ethbrake_marl.shields.step import StepShield
 
 PER_WORLD = ("predicted_harm", "interventions", "_heard", "_asked_s", "_wanted", "_impact_s")  # attributes [n, ...]
 
-SURPRISE = 1e-6  # tolerance (m, m/s) between a measurement and its prediction
+SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its prediction that counts as equal
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """After a restart of the shield in ``rows``, restore the harm so far, and keep the old plan where it is no worse.
+    """Restore the harm so far after a restart of the shield in ``rows``, and keep the old plan where it is at least as
+    good.
 
-    ``shield`` was just restarted and is changed; ``before`` is its copy from before the restart.
+    ``shield`` has just been restarted; it is changed in place. ``before`` is its copy from before the restart.
     """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
@@ -64,18 +65,18 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
 class EstimatedShield:
     """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
-    It starts at the first decision, and again whenever another vehicle becomes known, is known to react, or moves
-    otherwise than predicted. The rest of the previous plan is then a candidate for the new plan. After the first
-    decision ``predicted_harm`` [n] is the first bound; it is infinite where the vehicle had an impact before, because
-    its harm is unknown.
+    The shield starts at the first decision. The shield starts again whenever another vehicle becomes known, is known to
+    react, or moves otherwise than predicted. At a restart, the rest of the previous plan is a candidate for the new
+    plan. After the first decision ``predicted_harm`` [n] is the first bound. ``predicted_harm`` is infinite if the
+    vehicle had an impact before, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
         harm_count: ``first`` or ``total`` impacts.
-        robust: worlds to certify. None: the median of everything unknown. ``corners``: also all corners of the ranges;
-            more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the corners,
-            once, at the first decision.
+        robust: worlds to certify. None: the median of every unknown quantity. ``corners``: also all corners of the
+            ranges; more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the
+            corners, once, at the first decision.
         others: scripts of the other vehicles by index; None: the scenario's scripts.
 
     """
@@ -92,12 +93,12 @@ class EstimatedShield:
         self.scenario, self.vehicle = scenario, vehicle
         self.robust = None if robust is None else checked_robust(robust, "estimated")
         self.predicted_harm: Floats = np.zeros(0)
-        self.interventions: Ints = np.zeros(0, np.int64)  # [n] so far in the running episodes
+        self.interventions: Ints = np.zeros(0, np.int64)  # [n] number of interventions so far in the running episodes
         self.decision: Decision | None = None  # last decision
         self._harm_count: HarmCount = harm_count
         self._others = script_agents(scenario, except_for=vehicle) if others is None else others
         self._odometer: tuple[Floats, ...] = ()  # an ``Odometer``
-        self._heard: Floats = np.zeros((0, 0))  # [n, 2 N] news on which the shield began; NaN where it has not begun
+        self._heard: Floats = np.zeros((0, 0))  # [n, 2 N] information at the last start; NaN: not started
         self._asked_s: Floats = np.zeros(0)  # [n] time of the last decision
         self._wanted: Floats = np.zeros(0)  # [n] last certified actions
         self._totals: Floats = np.zeros((0, 0, 0))  # [n, M, pairs] predicted total harm at the last decision (m2/s2)
@@ -106,8 +107,8 @@ class EstimatedShield:
         numbers = len(self._ranges.uncertain)
         if self.robust is not None and 2**numbers > MOST_CORNERS:
             raise InvalidInput(
-                f"robust:estimated: scenario {scenario.name!r} leaves {numbers} numbers of the other vehicles open,"
-                f" which make {2**numbers} corners; at most {MOST_CORNERS} can be certified"
+                f"robust:estimated: scenario {scenario.name!r} has {numbers} uncertain numbers of other vehicles, which"
+                f" make {2**numbers} corners; must be at most {MOST_CORNERS} corners"
             )
         self.shield = self._make()
 
@@ -119,11 +120,11 @@ class EstimatedShield:
 
     @property
     def members(self) -> int:
-        """Number of worlds that are certified for each true world: 1 for the median, plus 1 for each corner."""
+        """Number of worlds that are certified for each true world: 1 for the median, plus the number of corners."""
         return 1 + len(self._corners())
 
     def __copy__(self) -> EstimatedShield:
-        """Return an independent copy: its decisions do not change this shield."""
+        """Return an independent copy. Decisions of the copy do not change this shield."""
         apart = object.__new__(EstimatedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
@@ -142,9 +143,9 @@ class EstimatedShield:
         return apart
 
     def begin(self, worlds: Worlds, rows: Ints) -> None:
-        """Start episodes in the batch at indices ``rows``; ``worlds`` [m] are their worlds at the alert.
+        """Start episodes at the indices ``rows`` of the batch; ``worlds`` [m] are their worlds at the alert.
 
-        The certification itself starts at the first decision, with the information received by then.
+        Certification starts later, at the first decision, with the information received by then.
         """
         if len(rows) >= len(self._wanted):
             self.shield, self._wanted, self._totals = self._make(), np.zeros(0), np.zeros((0, 0, 0))
@@ -166,17 +167,17 @@ class EstimatedShield:
         ``begin``.
 
         Args:
-            worlds: the true worlds; only what the vehicle received is read.
+            worlds: the true worlds; only the information that the vehicle received is read.
             proposed: [n] proposed actions.
-            proposer: the policy and its memory. Where nothing else certifies a proposal, its rollout in the estimated
-                worlds is tried. None: no rollout.
+            proposer: the policy and its memory. If no other plan certifies a proposal, the policy's rollout in the
+                estimated worlds is tried. None: no rollout.
             only: [n] True for worlds that decide now; None: all.
 
         """
         shield, vehicle = self.shield, self.vehicle
         if worlds.n > len(self._heard):
             raise InvalidInput(
-                f"shield: estimated: asked to decide in {count_of(worlds.n, 'world')}, but begin was called for"
+                f"shield: estimated: decide was called for {count_of(worlds.n, 'world')}, but begin for"
                 f" {len(self._heard)}; call begin for each world first"
             )
         self._odometer = odometer = Odometer(*self._odometer).look(worlds, vehicle)
@@ -184,7 +185,7 @@ class EstimatedShield:
         due = past & (worlds.time_s != self._asked_s) & (worlds.time_s < self.scenario.horizon_s)
         due &= True if only is None else only
         if due.any():
-            estimated = self._estimate(worlds, odometer.way_m, None)
+            estimated = self._ranges.estimate(worlds, odometer.way_m)
             self._begin_anew(worlds, estimated, odometer.way_m, due)
             proposer = None if proposer is None else proposer._replace(worlds=estimated)
             self.decision = decision = shield.decide(proposed, only=due, proposer=proposer)
@@ -223,7 +224,7 @@ class EstimatedShield:
         self._begin_shield(worlds.take(rows), estimated.take(rows), way_m[rows], rows, keeps[rows], before)
         if before is not None and (held_before := rows[~fresh[rows]]).size:
             _hold_better(shield, held_before, before)
-        rows = rows[due[rows]]  # the other worlds begin again at their own first decision
+        rows = rows[due[rows]]  # the other worlds start at their own first decision
         first, self._heard[rows] = rows[fresh[rows]], heard[rows]
         felt = worlds.pair_hit[first, max(vehicle - 1, 0) : vehicle + 1].any(axis=1)
         felt |= worlds.obstacle_hit[first] & (vehicle == 0)
@@ -232,15 +233,15 @@ class EstimatedShield:
     def _begin_shield(
         self, worlds: Worlds, estimated: Worlds, way_m: Floats, rows: Ints, keeps: Bools, before: StepShield | None
     ) -> None:
-        """Start the inner shield in ``rows``, with the median of everything unknown and, if robust, the corners of its
+        """Start the inner shield in ``rows``, with the median world and, in mode robust, the corners of the unknown
         ranges.
 
         Args:
             worlds: the true worlds of these rows.
-            estimated: their estimated worlds.
-            way_m: the vehicle's distance since the alert in each of them, m.
+            estimated: the estimated worlds of these rows.
+            way_m: the vehicle's distance since the alert in each of these rows, m.
             rows: indices of the episodes in the batch.
-            keeps: mask of vehicles, [rows, N], whose predicted state is better than their received state.
+            keeps: mask of the vehicles, [rows, N], whose predicted state is better than their received state.
             before: the inner shield before the restart; None at the first start.
 
         """
@@ -253,32 +254,33 @@ class EstimatedShield:
                 expected = worlds_at(estimated, running.states[rows * running.members + m])
                 known = keeps.any(axis=1, keepdims=True)
                 foretold = (replace(expected, pair_hit=expected.pair_hit & known), keeps)
-            parts.append(self._estimate(worlds, way_m, share, foretold))
+            parts.append(self._ranges.estimate(worlds, way_m, share, foretold))
         self.shield.begin(parts[0], rows, possible=Uncertainty.interleaved(parts))
 
-    def _keeps(self, told: Told, time_s: Floats) -> Bools:
+    def _keeps(self, received: Told, time_s: Floats) -> Bools:
         """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
 
-        These are unknown vehicles, and known vehicles without a message since their last predicted impact or contact.
-        ``told`` is the received information, ``time_s`` [n] the present time.
+        These vehicles are unknown, or have sent no message since their last predicted impact or contact. ``received``
+        is the received information, ``time_s`` [n] the present time.
         """
         running = self.shield.memory.running
         if running is None:
-            return np.zeros(told.known.shape, np.bool_)
-        n, N = told.known.shape
+            return np.zeros(received.known.shape, np.bool_)
+        n, N = received.known.shape
         whole = running.problem.mass.shape[1]  # number of vehicles in the columns, counting an obstacle ahead
         gaps = running.states.reshape(n, running.members, -1)[:, :, whole : 2 * whole - 1]
         touching: Bools = np.any(gaps == 0.0, axis=1)
         pressed = np.zeros((n, whole), np.bool_)
         pressed[:, :-1], pressed[:, 1:] = touching, pressed[:, 1:] | touching
-        since = (told.at_s < self._impact_s) | (pressed[:, whole - N :] & (told.at_s < time_s[:, np.newaxis]))
-        keeps: Bools = ~told.known | ((self._heard[:, :N] == 2.0) & since)
+        since = (received.at_s < self._impact_s) | (pressed[:, whole - N :] & (received.at_s < time_s[:, np.newaxis]))
+        keeps: Bools = ~received.known | ((self._heard[:, :N] == 2.0) & since)
         keeps[:, self.vehicle] = False
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time of ``worlds`` for vehicles that had an impact in any certified world since the last
-        decision.
+        """Store the present time for vehicles that had an impact in any certified world since the last decision.
+
+        ``worlds`` are the true worlds now.
         """
         running = self.shield.memory.running
         assert running is not None
@@ -302,7 +304,7 @@ class EstimatedShield:
         running = self.shield.memory.running
         assert running is not None
         seen, wrong = seen_columns(Packed.of(estimated)), np.zeros(estimated.n, np.bool_)
-        first = (seen.shape[1] + 4) // 5 - estimated.N  # 1: an obstacle ahead is vehicle 0 of the columns
+        first = (seen.shape[1] + 4) // 5 - estimated.N  # 1 if an obstacle ahead is vehicle 0 of the columns, else 0
         foretold = running.states[:, : seen.shape[1]].reshape(estimated.n, running.members, -1)
         outside: Bools = (seen < foretold.min(axis=1) - SURPRISE) | (seen > foretold.max(axis=1) + SURPRISE)
         for i in range(estimated.N):
@@ -315,12 +317,3 @@ class EstimatedShield:
         uncertain = self._ranges.uncertain
         shares = [] if self.robust is None else product((0.0, 1.0), repeat=len(uncertain))
         return [dict(zip(uncertain, each, strict=True)) for each in shares]
-
-    def _estimate(
-        self,
-        worlds: Worlds,
-        way_m: Floats,
-        share: dict[tuple[str, int], float] | None,
-        foretold: tuple[Worlds, Bools] | None = None,
-    ) -> Worlds:
-        return self._ranges.estimate(worlds, way_m, share, foretold)

@@ -1,4 +1,4 @@
-"""Agents that decide in the estimated world: what their vehicle received, with the scenario's ranges for the rest."""
+"""Agents that decide in the estimated world: on received information, completed by the scenario's ranges."""
 
 from __future__ import annotations
 
@@ -27,14 +27,16 @@ class Odometer(NamedTuple):
 
     @classmethod
     def begun(cls, alert: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer of vehicle ``vehicle`` (index) at the start of episodes in the worlds ``alert``, [n]."""
+        """Return the odometer of the vehicle with index ``vehicle`` at the start of episodes in the worlds ``alert``,
+        [n].
+        """
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer after the time since the last decision; ``worlds`` [n] are the present ones.
+        """Return the odometer for the present time; ``worlds`` [n] are the present worlds.
 
-        The distance is exact under a constant command, also if the vehicle stops. In other cases the mean speed is
-        used.
+        The added distance is exact under a constant command, even if the vehicle stops. Otherwise the added distance is
+        the mean speed times the time since the last decision.
         """
         speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
         way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
@@ -46,22 +48,24 @@ class Odometer(NamedTuple):
 class Estimating(AgentAround):
     """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
 
-    The policy starts when it is first asked, on the information received by then. It starts again in worlds where
-    another vehicle becomes known, or where a message over a channel says that it reacts. In the estimate, the others
-    follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy expected when it was first asked.
+    The policy starts at its first decision, with the information received by then. The policy starts again in worlds
+    where another vehicle becomes known, or where a message over a channel says that a vehicle reacts. The estimate
+    assumes that the other vehicles follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy
+    expected at its first decision.
 
     Args:
         policy: any agent that reads the state of the line.
-        scenario: declares the ranges of everything unknown; a mixture raises ``InvalidInput``.
-        shows: True: the policy sees the estimated world at every decision. False: only where it starts.
+        scenario: the scenario, which declares the ranges of all unknown quantities; a mixture raises ``InvalidInput``.
+        shows: True: the policy sees the estimated world at every decision. False: the policy sees it only when it
+            starts.
 
     """
 
     def __init__(self, policy: Agent, scenario: Scenario, *, shows: bool = False) -> None:
         super().__init__(policy, f"{policy.name}:estimated")
         self.scenario, self._shows = scenario, shows
-        self._ranges: dict[int, Ranges] = {}  # by the agent's vehicle
-        Ranges.of(scenario, 0, {})  # refuses a mixture at once
+        self._ranges: dict[int, Ranges] = {}  # ranges by the index of the agent's vehicle
+        Ranges.of(scenario, 0, {})  # raises InvalidInput for a mixture
 
     @property
     def knows(self) -> Knowledge:
@@ -69,8 +73,9 @@ class Estimating(AgentAround):
         return Knowledge((Source.ESTIMATES,))
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Return the memory at the start of episodes, as a mapping. The policy has not started, because nothing was
-        received yet.
+        """Return the memory at the start of episodes, as a mapping.
+
+        The policy has not started yet, because nothing has been received.
 
         Args:
             alert: the worlds at the alert, [n].
@@ -80,7 +85,7 @@ class Estimating(AgentAround):
         """
         return {
             "way": Odometer.begun(alert, vehicle),
-            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # news on which the policy began; NaN: not begun
+            "heard": np.full((alert.n, 2 * alert.N), np.nan),  # information at the last start; NaN: not started
             "predicted_harm": np.full(alert.n, np.nan),
             "policy": None,
         }
@@ -89,7 +94,7 @@ class Estimating(AgentAround):
         """Return the policy's command, [n] m/s2, and the new memory.
 
         Args:
-            worlds: the true worlds; only what the vehicle received is read.
+            worlds: the true worlds; only the information that the vehicle received is read.
             memory: memory from ``begin`` or the previous ``act``.
             vehicle: index of the agent's vehicle.
 
@@ -112,13 +117,14 @@ class Estimating(AgentAround):
         return estimated
 
     def _heard(self, worlds: Worlds, vehicle: int) -> Floats:
-        """Return flags [n, 2 N], 0 or 1: whether ``vehicle`` knows each vehicle, and whether a message says that this
-        vehicle reacts already.
+        """Return a summary of what ``vehicle`` has received about each vehicle, [n, 2 N].
 
-        Where a flag changes, the policy starts again. ``worlds`` are the true worlds now.
+        The first N columns are the amount of information (``Told.heard``). The other N columns are 1 if a message says
+        that the vehicle reacts, and this was not predicted. The policy starts again where the summary changes.
+        ``worlds`` are the true worlds now.
         """
         known = Told.to(worlds, vehicle)
-        # a latency that was told predicts the reaction, unless a channel may extend it
+        # a received latency predicts the reaction, unless a channel may delay the reaction
         unforetold = known.reacts & (self.scenario.v2x.delays | ~known.pieces[..., LATENCY])
         return np.concatenate([known.heard, unforetold], axis=1)
 
@@ -129,10 +135,10 @@ class Estimating(AgentAround):
 
 
 class EstimatingHybrid(Estimating):
-    """The paper's Algorithm 1 in the estimated world: the first decision chooses between the policy and E-V2X-BM, the
-    best constant deceleration.
+    """The paper's Algorithm 1 in the estimated world: a choice between the policy and E-V2X-BM at the first decision.
 
-    The one that predicts less harm controls the vehicle for the whole episode.
+    E-V2X-BM is the best constant deceleration. Whichever of the two predicts less harm controls the vehicle for the
+    whole episode.
     """
 
     policy: HybridAgent
@@ -143,8 +149,9 @@ class EstimatingHybrid(Estimating):
         return Knowledge.of(self.policy.policy, also=Source.ESTIMATES)
 
     def _shown_at_first(self, estimated: Worlds) -> Worlds:
-        """Return the estimated worlds with their clock at 0 and without past impacts, because the rollouts that compare
-        the policy with E-V2X-BM start there.
+        """Return the estimated worlds with their clock at 0 and without past impacts.
+
+        The rollouts that compare the policy with E-V2X-BM start in these worlds.
         """
         v, n = estimated.vehicles, estimated.n
         latency = np.maximum(v.latency_s - estimated.time_s[:, np.newaxis], 0.0)

@@ -1,4 +1,4 @@
-"""Registry entries of this extension: the shield ``+robust``, and the variant ``:estimated`` of agents and shields."""
+"""Registry entries of this extension: the shield ``+robust``, and ``:estimated`` for agents and shields."""
 
 from __future__ import annotations
 
@@ -16,13 +16,15 @@ from ethbrake_marl.shields.factories import shield_episodes
 
 
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``: it certifies actions in the corners or the
-    whole interior of an uncertainty (an interval around each quantity).
+    """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``.
+
+    The shield certifies actions against an uncertainty, which is an interval around each uncertain quantity: in the
+    corners of the box of intervals, or in its whole interior.
 
     Args:
         policy: the agent to shield.
         argument: ``corners``, ``interior``, or None for ``corners``.
-        settings: scenario, uncertainty, harm to bound, and the agent's spec for error messages.
+        settings: scenario, uncertainty, harm count, and the agent's spec for error messages.
 
     """
     where = f"agent {settings.spec!r}"
@@ -36,12 +38,12 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
     """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
 
-    It is the same shield, for the ranges of what the vehicle did not receive.
+    The shield certifies actions against the ranges of the quantities that the vehicle did not receive.
 
     Args:
         policy: the agent to shield.
         argument: ``corners``, ``interior``, or None for ``corners``.
-        settings: scenario, harm to bound, and the agent's spec for error messages.
+        settings: scenario, harm count, and the agent's spec for error messages.
 
     """
     where = f"agent {settings.spec!r}"
@@ -52,53 +54,50 @@ def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: 
 
 
 def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: AgentSettings) -> Driver:
-    """Make the shield ``+step:estimated``: every action of ``policy`` is certified in the estimated world.
+    """Make the shield ``+step:estimated``, which certifies every action of ``policy`` in the estimated world.
 
     Raises ``InvalidInput`` for a team or several learners.
 
     Args:
         policy: the agent to shield.
         argument: not used.
-        settings: scenario, harm to bound, and the agent's spec for error messages.
+        settings: scenario, harm count, and the agent's spec for error messages.
 
     """
     scenario = settings.needed_scenario()
     if isinstance(policy, Team) or len(scenario.learners) > 1:
         raise InvalidInput(
-            f"agent {settings.spec!r}: :estimated shields one learner. +step shields several where messages contain"
-            " every piece; without a piece several learners have no shield"
+            f"agent {settings.spec!r}: :estimated shields only one learner; +step shields several learners if messages"
+            " contain every piece"
         )
     return shielded(policy, scenario, "step", harm_count=settings.harm_count, estimated=True)
 
 
 def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``.
+    """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on estimates.
 
-    It is the paper's Algorithm 1 in the estimated world.
-
-    At the first decision it predicts the harm of ``policy`` and of E-V2X-BM (the best constant deceleration) in that
-    world; the better one controls the whole episode.
+    At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
+    constant deceleration). The one with less harm controls the whole episode.
 
     Raises ``InvalidInput`` for an agent that already decides on received information.
 
     Args:
-        policy: the agent that E-V2X-BM is compared with.
+        policy: the agent to compare with E-V2X-BM.
         argument: ``pairwise`` or None.
         settings: scenario, and the agent's spec for error messages.
 
     """
     hybrid = shield_episodes(policy, argument, settings)
     if isinstance(policy, Estimating):
-        raise InvalidInput(f"agent {settings.spec!r}: {policy.name} decides on what was received itself; take +step")
+        raise InvalidInput(f"agent {settings.spec!r}: {policy.name} already decides on received information; use +step")
     return EstimatingHybrid(hybrid, settings.needed_scenario())
 
 
 def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> Agent:
     """Make the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``.
 
-    It is E-V2X-BM (the best constant deceleration) in the estimated world.
-
-    ``argument`` is ``pairwise`` or None; ``settings`` hold the scenario.
+    The agent is E-V2X-BM (the best constant deceleration) in the estimated world. ``argument`` is ``pairwise`` or None;
+    ``settings`` has the scenario.
     """
     return Estimating(make_e_v2x_bm(argument, settings), settings.needed_scenario())
 
@@ -106,18 +105,18 @@ def make_estimating_e_v2x_bm(argument: str | None, settings: AgentSettings) -> A
 ROBUST = Part(
     shield_robustly,
     form="+robust[:interior]",
-    about="as +step where not everything is known: in the corners of an uncertainty, interior: in all of it",
+    about="as +step for uncertain quantities: certified in the corners of their intervals; interior: in all worlds",
     knows=Source.MODEL,
     needs={"uncertainty": UNCERTAINTY_EXAMPLE},
     options=RobustOptions,
 )
 
-ESTIMATED_ROBUST = Part(shield_robustly_as_estimated, about="against all that was not received")
+ESTIMATED_ROBUST = Part(shield_robustly_as_estimated, about="for all quantities that were not received")
 
 ESTIMATED_STEP = Part(shield_steps_as_estimated, about="certified in the estimated world")
 
-ESTIMATED_EPISODE = Part(shield_episodes_as_estimated, about="as far as is received")
+ESTIMATED_EPISODE = Part(shield_episodes_as_estimated, about="predicted in the estimated world")
 
 ESTIMATED_E_V2X_BM = Part(
-    make_estimating_e_v2x_bm, about="on what was received, and the scenario's ranges for the rest"
+    make_estimating_e_v2x_bm, about="computed from received information and the scenario's ranges"
 )

@@ -1,4 +1,4 @@
-"""Guards of the modes for incomplete knowledge: against an uncertainty, or in a world estimated from messages.
+"""Guards of the shields for incomplete knowledge: modes ``robust`` and ``estimated``.
 
 A *guard* connects a shield with a running engine.
 """
@@ -19,16 +19,16 @@ from ethbrake_marl.shields.guard import StepGuard
 
 
 class RobustMode(IntEnum):
-    """Number that stands for mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the other modes."""
+    """Number of mode ``robust`` in the info ``shield_mode``; ``eb.ShieldMode`` has the numbers of the other modes."""
 
     ROBUST = 2
 
 
 class RobustGuard(StepGuard):
-    """Guard of mode ``robust``: lets a ``RobustShield`` decide on the actions in each step of a running engine."""
+    """Guard of mode ``robust``: a ``RobustShield`` decides on the actions in each step of a running engine."""
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step as a mapping, with ``members``: the number of certified worlds for each world.
+        """Return the infos of a step as a mapping. ``members`` is the number of certified worlds for each world.
 
         Args:
             memory: shield and policies after the step.
@@ -41,8 +41,8 @@ class RobustGuard(StepGuard):
 class EstimatedGuard(ShieldGuard):
     """Guard of modes ``step`` and ``robust`` in the estimated world: an ``EstimatedShield`` decides on the actions.
 
-    Its bound on harm exists from the first decision on and holds in the estimated world. The motion is not compared
-    with the prediction, because an estimate may be wrong without a fault of the system.
+    Its bound on harm exists from the first decision on and holds in the estimated world. The guard does not compare the
+    motion with the prediction, because an estimate may be wrong although nothing is broken.
     """
 
     def _started(self, shield: EstimatedShield, alert: Worlds, rows: Ints) -> EstimatedShield:
@@ -50,7 +50,7 @@ class EstimatedGuard(ShieldGuard):
         return shield
 
     def decide(self, running: Engine, memory: Guarded, proposed: Floats) -> Ruling:
-        """Return the proposed actions and the actions to apply, which the shield certifies in the estimated worlds.
+        """Return the proposed actions and the actions to apply, which are certified in the estimated worlds.
 
         Args:
             running: the engine before the step.
@@ -67,10 +67,10 @@ class EstimatedGuard(ShieldGuard):
         return Ruling(proposed, applied, stepped_in, ~running.ended, after.decision, Guarded(after, memories))
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return, as a mapping, the infos of a step that is certified in the estimated worlds.
+        """Return the infos of a step that is certified in the estimated worlds, as a mapping.
 
-        ``trusted`` is true if the mode is ``robust``, so that the bound also says something about the true world.
-        ``memory`` holds the shield after the step, ``ruling`` its decision (None at the reset).
+        ``trusted`` is true in mode ``robust``, whose bound also says something about the true world. ``memory`` has the
+        shield after the step; ``ruling`` is its decision (None at the reset).
         """
         estimated: EstimatedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield

@@ -1,4 +1,4 @@
-"""Checked settings of mode ``robust`` and of ``estimated``, and the shields and guards that they make."""
+"""Checked settings of ``robust`` and ``estimated`` shields; they also make the shields and guards."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ class RobustOptions(ShieldOptions):
     """``eb.ShieldOptions`` with settings for incomplete knowledge.
 
     Args:
-        mode: a mode of ``eb.ShieldOptions``, or ``robust``: ``step`` against an uncertainty. None: ``robust`` with an
-            uncertainty, else ``step``.
+        mode: a mode of ``eb.ShieldOptions``, or ``robust``, which is ``step`` for uncertain worlds. None: ``robust`` if
+            there is an uncertainty, else ``step``.
         uncertainty: uncertainty for mode ``robust``, such as ``"gaps_m=0.5"``.
-        robust: worlds of the uncertainty that mode ``robust`` certifies: its ``corners`` (fast) or whole ``interior``.
-        estimated: certify in the estimated world, on what the vehicle received; in mode ``robust`` against everything
-            that it did not receive. For modes ``step`` and ``robust`` with one learner, and not together with
-            ``uncertainty``, ``allowance``, ``cap``, ``logging`` and ``shares``.
+        robust: worlds that mode ``robust`` certifies: the ``corners`` of the uncertainty (fast) or its whole
+            ``interior``.
+        estimated: True: certify in the estimated world, which uses only the information that the vehicle received.
+            Possible in modes ``step`` and ``robust`` with one learner, and without ``uncertainty``, ``allowance``,
+            ``cap``, ``logging`` and ``shares``.
 
     Raises ``InvalidInput`` and ``UnknownName`` as ``eb.ShieldOptions`` does.
 
@@ -57,8 +58,7 @@ class RobustOptions(ShieldOptions):
             for name, value in without.items():
                 if getattr(self, name) != value:
                     raise InvalidInput(
-                        f"{where}: {name} = {getattr(self, name)!r}: not together with estimated = True, which"
-                        " certifies against what was not received"
+                        f"{where}: {name} = {getattr(self, name)!r}: must be {value!r} if estimated = True"
                     )
         uncertainty = None if self.estimated else mode_uncertainty(mode, self.uncertainty, where)
         object.__setattr__(self, "uncertainty", uncertainty)
@@ -68,8 +68,9 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """Text of the mode in an agent spec, after the ``+``: ``robust:interior:estimated`` in
-        ``ppo+robust:interior:estimated``.
+        """Text of the mode in an agent spec, after the ``+``.
+
+        For instance ``robust:interior:estimated`` in ``ppo+robust:interior:estimated``.
         """
         robust = "" if self.robust == CORNERS else f":{self.robust}"
         return f"{self.mode}{robust}{':estimated' if self.estimated else ''}"
@@ -82,9 +83,10 @@ class RobustOptions(ShieldOptions):
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a new shield for ``vehicle`` (an index; several for modes that shield several), before any episode.
+        """Return a new shield for ``vehicle``, before any episode.
 
-        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts.
+        ``vehicle`` is an index, or several indices for modes that shield several vehicles. ``others`` are the scripts
+        of the other vehicles by index; None: the scenario's scripts.
         """
         if self.estimated:
             assert isinstance(vehicle, int)
@@ -103,7 +105,7 @@ class RobustOptions(ShieldOptions):
         ``several`` is True for one shield of all learners together.
         """
         one = one_learner(scenario)
-        if self.estimated:  # the scenario's scripts apply only if it has exactly one learner
+        if self.estimated:  # the scenario's scripts are used only if the scenario has exactly one learner
             self.shield(scenario, one or 0, {} if one is None else None)
         else:
             super().check_in(scenario, several=several)
@@ -122,8 +124,8 @@ class RobustOptions(ShieldOptions):
         if self.estimated:
             if len(engine.learners) > 1:
                 raise InvalidInput(
-                    f"{where}: estimated = True: shields one learner, not several; pass learners=['vehicle_2'] to the"
-                    " environment"
+                    f"{where}: estimated = True: shields only one learner; pass one, for instance"
+                    " learners=['vehicle_2'], to the environment"
                 )
             mode = RobustMode.ROBUST if self.mode == "robust" else ShieldMode.STEP
             shield = self.shield(scenario, engine.learners[0], scripts)
@@ -136,8 +138,7 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return ``given`` as an ``Uncertainty``: an object, its written form such as ``"gaps_m=0.5"``, or None, which
-    stays None.
+    """Return ``given`` as an ``Uncertainty``, or None if it is None. A text such as ``"gaps_m=0.5"`` is parsed.
 
     Raises ``InvalidInput`` for anything else.
     """
@@ -145,17 +146,20 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
         return given
     if isinstance(given, str):
         return parse_uncertainty(given)
-    raise InvalidInput(f"uncertainty = {given!r}: must be an Uncertainty or text, for instance {UNCERTAINTY_EXAMPLE!r}")
+    raise InvalidInput(
+        f"uncertainty = {given!r}: must be an Uncertainty or a text, for instance {UNCERTAINTY_EXAMPLE!r}"
+    )
 
 
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
     """Return the checked uncertainty for a shield mode, or None if there is none.
 
-    Raises ``InvalidInput`` if mode ``robust`` has none, or another mode has one; ``where`` begins the message.
-    ``given`` is an ``Uncertainty``, its written form, or None.
+    Raises ``InvalidInput`` if mode ``robust`` has no uncertainty, or another mode has one; ``where`` begins the
+    message. ``given`` is an ``Uncertainty``, its text, or None.
     """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
-        what = "needs an uncertainty" if uncertainty is None else "takes no uncertainty; robust does"
-        raise InvalidInput(f"{where}: mode {mode} {what}, for instance {UNCERTAINTY_EXAMPLE}")
+        needed = f"needs an uncertainty, for instance {UNCERTAINTY_EXAMPLE}"
+        what = needed if uncertainty is None else "takes no uncertainty; must be mode robust"
+        raise InvalidInput(f"{where}: mode {mode} {what}")
     return uncertainty

@@ -1,6 +1,6 @@
-"""Paths of a box of worlds: in each piece, the worlds in which a pair has an impact branch off as a path of their own.
+"""Simulate the paths of a box of worlds: a new path branches off wherever a pair may have an impact.
 
-A *path* is a set of worlds with the same sequence of impacts (``affine.Path``); a *cell* is a box with its commands.
+A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box with its commands.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ STACK = 256  # largest number of waiting paths
 
 
 class Stack(NamedTuple):
-    """Stack of paths that wait to be followed. A *path* is a set of worlds with the same impacts so far."""
+    """Stack of paths that are not simulated yet. A *path* is a set of worlds with the same impacts so far."""
 
     forms: Floats  # [STACK, N + P + 1, W] ``Path.forms`` of each path
     touch: Floats  # [STACK, P, TOUCH_WIDTH] ``Path.touch`` of each path
@@ -85,10 +85,9 @@ def new_stack(N: int, width: int) -> Stack:
 
 @compiled(apart=True)
 def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
-    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W] (centre, slopes, remainder),
-    m2/s2.
+    """Return the larger of ``worst`` and the largest value of the affine form ``harm`` [W], m2/s2.
 
-    If ``harm`` reaches a new maximum, it is copied to ``out`` [W].
+    If the value of ``harm`` is the larger one, ``harm`` is copied to ``out`` [W].
     """
     if not high(harm) <= worst:
         out[:] = harm
@@ -98,16 +97,16 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
-    """Record a bound on the harm of a path that is not followed any further; return the largest harm recorded so far.
+    """Record the rough bound on the harm of a path that is not simulated any further, and return the largest recorded
+    harm.
 
-    The bound is ``rough_harm``, which uses only the largest speeds that are still possible.
+    The rough bound (``rough_harm``) uses only the largest speeds that are still possible.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is a new largest one.
+        out: [W] receives the affine form of the harm if it is the largest so far.
 
     """
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
@@ -117,23 +116,21 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Record the harm of the worlds in which pair ``p`` has an impact in the present piece, or follow them as a new
-    path.
+    """Record or branch off the worlds in which pair ``p`` has an impact in this piece; return the largest recorded
+    harm.
 
-    If no other impact can follow, their harm is final and recorded. Else they are put on the stack as a path of their
-    own. Where that path cannot be followed, ``rough_harm`` is recorded instead: a bound from the largest speeds that
-    are still possible. Returns the largest harm recorded so far.
+    If no other impact can follow, the harm of these worlds is final and is recorded. Otherwise the worlds become a new
+    path on the stack. If that path cannot be simulated, a rough bound (``rough_harm``) is recorded instead.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        stack: paths that wait to be followed; new paths are put on top.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        stack: paths that are not simulated yet; new paths are added to it.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is a new largest one.
+        out: [W] receives the affine form of the harm if it is the largest so far.
 
     """
     P = cell.gap.shape[0]
@@ -143,7 +140,7 @@ def branch(
     other = 1 - p
     final = P == 1 or path.marks[other] == 1
     touches = path.marks[p] == 0 and pressing(motion, p)[1] >= 0.0 and may_only_touch(cell, path, motion, p, how)
-    touches = touches and (P == 1 or may_turn(cell, motion, p, path.marks[2 * P]))  # its first impact is then to come
+    touches = touches and (P == 1 or may_turn(cell, motion, p, path.marks[2 * P]))  # the first impact is still to come
     if final:
         worst = keep_worst(harm, worst, out)
         if not touches:
@@ -167,10 +164,10 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """Record the affine form ``harm`` [W] (centre, slopes, remainder), to which at most ``rest`` (m2/s2) will be added;
-    return the largest harm recorded, m2/s2.
+    """Record the affine form ``harm`` [W], increased by ``rest`` (m2/s2), and return the largest recorded harm, m2/s2.
 
-    ``worst`` is the largest harm recorded so far; ``out`` [W] receives the affine form of a new largest harm.
+    ``rest`` is an upper bound on the harm that follows. ``worst`` is the largest harm recorded so far; ``out`` [W]
+    receives the affine form of a new largest harm.
     """
     whole = harm.copy()
     whole[0] += rest
@@ -179,18 +176,19 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed of the other pair of three vehicles if it may meet in the same piece after pair ``p``.
+    """Return the closing speed (m/s) of the other pair if its impact may follow in the same piece after the impact of
+    ``p``.
 
-    The result is an affine form [W] (centre, slopes, remainder) in m/s; it is 0 if that pair cannot meet.
+    The line has three vehicles. The result is an affine form [W] (centre, slopes, remainder); it is 0 if the other pair
+    cannot have contact.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        speed: affine form [W] of the closing speed at the impact of pair ``p``, m/s.
-        time: affine form [W] of the time of that impact, s after the start of the piece.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        speed: closing speed at the impact of pair ``p`` as an affine form [W], m/s.
+        time: time of that impact as an affine form [W], s after the start of the piece.
         length: length of the piece, s.
 
     """
@@ -216,21 +214,20 @@ def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats,
 def strike(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, speed: Floats, harm: Floats
 ) -> bool:
-    """Put the worlds in which pair ``p`` has its impact in the present piece on the stack as a new path.
+    """Put the worlds in which pair ``p`` has an impact in the present piece on the stack as a new path.
 
     Returns False, and puts nothing on the stack, if the stack is full or the rear vehicle may move backwards
     (``thrown_back``).
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        stack: paths that wait to be followed; new paths are put on top.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        stack: paths that are not simulated yet; new paths are added to it.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
-        harm: affine form [W] of the harm including this impact, m2/s2.
+        speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
+        harm: harm including this impact as an affine form [W], m2/s2.
 
     """
     N, P, width = cell.speed.shape[0], cell.gap.shape[0], cell.speed.shape[1]
@@ -261,7 +258,7 @@ def strike(
     if most < 0.0 or -returns * low(speed) + max(most, 0.0) * high(left) < 0.0:
         jump = speed * (1.0 + bounces)
         jump[-1] = abs(jump[-1]) + (bounces - returns) * BOUND.PLASTIC_SPEED_MPS
-        spring_apart(cell, path, motion, p, how, jump, left, after, way)
+        spring_apart(cell, motion, p, how, jump, left, after, way)
     else:
         most_apart, touch = bounces * high(speed), after.touch[p]  # largest opening speed after the impact
         least, hardest = pressing_together(motion, p)
@@ -298,16 +295,16 @@ def strike(
 
 @compiled(apart=True)
 def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach) -> bool:
-    """Return whether pair ``p`` may reach gap 0 with closing speed 0 exactly when it begins to be pressed together.
+    """Return whether pair ``p`` may reach gap 0 at closing speed 0, exactly when its vehicles begin to press on each
+    other.
 
-    This needs a change in how the pair is pressed: a command changes, or a force builds up.
+    This is possible only if a command changes or an acceleration builds up.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
 
     """
@@ -330,15 +327,14 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
 
 @compiled(apart=True)
 def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
-    """Return whether forces that build up may press pair ``p`` together harder within a piece.
+    """Return whether accelerations that build up may press the vehicles of pair ``p`` together harder within a piece.
 
-    That is so if the front vehicle's acceleration may fall or the rear vehicle's may rise.
+    The front vehicle's acceleration may fall, or the rear vehicle's acceleration may rise.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         piece: index of the piece, 0 to J - 1.
 
     """
@@ -350,9 +346,8 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
     """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
         which: 0 or 1.
@@ -365,18 +360,17 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
 
 @compiled(apart=True)
 def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
-    """Push a second path: the worlds in which pair ``p`` met and stayed in contact without an impact.
+    """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed so.
 
-    With brake build-up the pair may open and have its first impact within the piece; the path below on the stack covers
-    these worlds. Returns False if the stack is full.
+    With brake build-up the pair may separate and have its first impact within the piece. The path below this one on the
+    stack covers such worlds. Returns False if the stack is full.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        stack: paths that wait to be followed; new paths are put on top.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        stack: paths that are not simulated yet; new paths are added to it.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
     """
@@ -400,18 +394,18 @@ def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, len
 
 @compiled(apart=True)
 def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, speed: Floats) -> bool:
-    """Return whether the rear vehicle may move backwards after the impact of pair ``p``, so that it could be hit again.
+    """Return whether the rear vehicle may move backwards after the impact of pair ``p`` and be hit again.
 
-    False for the last vehicle of the line if it never drives: nobody is behind it, so it may as well stand.
+    The result is False for the last vehicle of the line if it never drives: no vehicle is behind it, so its backward
+    motion cannot lead to an impact.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
-        speed: affine form [W] (centre, slopes, remainder) of the closing speed at the impact, m/s.
+        speed: closing speed at the impact as an affine form [W] (centre, slopes, remainder), m/s.
 
     """
     P, share = cell.gap.shape[0], (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0
@@ -423,20 +417,19 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
     return share * high(speed) > slowest and not last
 
 
-MOST_PATHS = 4000  # most paths to follow in one cell
+MOST_PATHS = 4000  # largest number of paths to simulate in one cell
 
 
 @compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
     """Return an upper bound on the harm of every world of the cell, m2/s2.
 
-    A result above ``most`` is no bound: the search then stopped early.
+    A result above ``most`` is not a bound, because the search then stopped early.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        stack: memory for paths (sets of worlds with the same impacts).
-        motion: memory for the motion of each vehicle.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        stack: working memory for paths (sets of worlds with the same impacts).
+        motion: working memory for the motion of each vehicle.
         out: [W] receives the affine form of the harm that reaches the bound.
         most: harm above which the search stops, m2/s2.
 
@@ -460,21 +453,23 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
             for k in range(stack.size[0]):
                 worst = keep_rough(cell, Path(stack.forms[k], stack.touch[k], stack.marks[k]), worst, out)
             return worst
-    return worst if worst >= 0.0 else math.inf  # every world takes some path, so no path at all is an error
+    return worst if worst >= 0.0 else math.inf  # every world is on some path; without a path there is no bound
 
 
 @compiled(apart=True)
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
-    """Follow a path to its end. Return the maximum of ``worst``, its harm, and the harm that branches off on the way.
+    """Simulate a path to its end, and return the largest recorded harm, m2/s2.
+
+    The recorded harms include the harm of the path and of the paths that branch off and end at once.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; changed in place.
-        stack: paths that wait to be followed; new paths are put on top.
-        motion: memory for the motion of each vehicle.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
+            place.
+        stack: paths that are not simulated yet; new paths are added to it.
+        motion: working memory for the motion of each vehicle.
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is a new largest one.
+        out: [W] receives the affine form of the harm if it is the largest so far.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -501,15 +496,14 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
 
 @compiled(apart=True)
 def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Return whether a pair in contact, without an impact so far, may have its first impact in the present piece.
+    """Return whether a pair that is in contact without an impact so far may have its first impact in the present piece.
 
-    For this the pair must open first.
+    Such a pair must separate before it can have an impact.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
 
     """
     P = cell.gap.shape[0]
@@ -525,17 +519,17 @@ def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
 def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Move the pairs in contact through the present piece, and branch off the worlds in which a pair has an impact.
 
-    Pairs in contact move as one from here on, or separate. The worlds with an impact are recorded or put on the stack
-    (``branch``). Returns the largest harm recorded so far.
+    The vehicles of a pair in contact move as one body, or separate. Worlds with an impact are recorded or put on the
+    stack (``branch``). Returns the largest recorded harm, m2/s2.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; changed in place.
-        stack: paths that wait to be followed; new paths are put on top.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
+            place.
+        stack: paths that are not simulated yet; new paths are added to it.
         motion: motion of each vehicle in the present piece; changed in place.
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is a new largest one.
+        out: [W] receives the affine form of the harm if it is the largest so far.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -585,10 +579,10 @@ def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
     """Advance the path to the end of the present piece without an impact. Return False if every world has an impact.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; changed in place.
-        motion: motion of each vehicle in the present piece, computed as if it were alone (``move_alone``).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
+            place.
+        motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]

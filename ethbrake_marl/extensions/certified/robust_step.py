@@ -1,8 +1,8 @@
 """Step shield for uncertain worlds: it certifies the corners of an uncertainty, or its whole interior.
 
-The *members* of a world are the worlds in which ``StepShield`` certifies a plan for it. Here they are the corners of an
-``Uncertainty``. With ``robust="interior"`` the harm of every plan is also bounded over the whole box around the corners
-(``enclosure.Boxes``), at the alert and at every decision.
+The *members* of a world are the worlds in which ``StepShield`` certifies a plan. For this shield the members are the
+reported world and the corners of an ``Uncertainty``. With ``robust="interior"`` the shield also bounds the harm of
+every plan over the whole box between the corners (``enclosure.Boxes``), at the alert and at every decision.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ class RobustShield(StepShield):
 
     Args:
         scenario: the scenario of all worlds.
-        vehicle: index of the shielded vehicle. An uncertainty allows only one.
+        vehicle: index of the shielded vehicle; with an uncertainty there may be only one.
         uncertainty: intervals around the reported quantities; None: ``begin`` receives the ``possible`` worlds.
         robust: worlds to certify: ``corners`` or ``interior``.
         harm_count: ``first`` or ``total`` impacts.
         others: scripts of the other vehicles by index; None: the scenario's scripts.
-        settings: further keywords of ``StepShield``.
+        settings: further keyword arguments of ``StepShield``.
 
-    Raises ``InvalidInput`` as ``StepShield`` does, for several vehicles or a cap with an uncertainty, and for settings
-    that ``interior`` cannot certify.
+    Raises ``InvalidInput`` as ``StepShield`` does, for several vehicles or a cap together with an uncertainty, and for
+    settings that ``interior`` cannot certify.
 
     """
 
@@ -58,13 +58,13 @@ class RobustShield(StepShield):
         super().__init__(scenario, vehicle, harm_count=harm_count, others=others, **settings)
         if uncertainty is not None and (len(self.vehicles) > 1 or self.cap is not None):
             what = "several vehicles" if self.cap is None else "a cap"
-            raise InvalidInput(f"shield: uncertainty: {what} with it: not covered; mode robust shields one vehicle")
+            raise InvalidInput(f"shield: uncertainty: not possible with {what}; must be one vehicle without a cap")
         self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
         Boxes.check_possible(self.robust, scenario, harm_count, self._others)
 
     @property
     def possible_are(self) -> str:  # type: ignore[override]  # a constant there
-        """Words for a world's members (possible worlds) in error messages, for instance "uncertainty: gaps_m=0.5"."""
+        """Name of a world's members (possible worlds) in error messages, such as "uncertainty: gaps_m=0.5"."""
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:
@@ -73,25 +73,24 @@ class RobustShield(StepShield):
 
     @property
     def boxes(self) -> Boxes | None:
-        """The boxes of mode ``interior`` (range of every number of each world), once episodes have begun; else None."""
+        """Boxes of mode ``interior`` (range of every number of each world) after episodes began; otherwise None."""
         boxes: Boxes | None = self.memory.enclosure
         return boxes
 
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Boxes | None]:
-        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes (None in
-        corners mode).
+        """Return the bound on the harm of each plan at the alert, [m] m2/s2, and the boxes of all episodes.
 
-        In interior mode the bound covers all worlds of each box, else only its members (the reported world and the
-        corners of its box).
+        In interior mode the bound covers all worlds of each box. In corners mode it covers only the members (the
+        reported world and the corners of its box), and the boxes are None.
 
         Args:
-            possible: [m * M] members of the new worlds, M consecutive ones for each.
+            possible: [m * M] members of the new worlds, M consecutive ones for each world.
             problem: the same worlds as columns of numbers.
             rows: [m] indices of the new episodes.
             plan: [m, L] action at each decision.
-            harm: [m] largest harm of the plan in a member, m2/s2.
+            harm: [m] largest harm of the plan in any member, m2/s2.
 
         """
         if possible.n == len(rows) or self.robust != INTERIOR:
@@ -102,13 +101,15 @@ class RobustShield(StepShield):
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the decision; in interior mode, plans that are not certified for all worlds of their box are replaced.
+        """Return the decision; in interior mode every new plan must be certified for all worlds of its box.
+
+        A plan without this certificate is replaced by the plan from before the decision.
 
         Args:
             now: state of the members (the corners of the boxes) before the decision.
             memory: memory of the shield.
             budget: [n] largest harm that a new plan may have, m2/s2.
-            decision: the decision, certified in the members only.
+            decision: the decision, certified only in the members.
             asked: [n] True for episodes that decide now.
 
         """
@@ -116,12 +117,12 @@ class RobustShield(StepShield):
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return a mask [n] of the worlds that may leave the range spanned by their members (the reported world and the
-        corners of its uncertainty), now in the states ``running``.
+        """Return a mask [n] of the worlds that may leave the range between their members, in the states ``running``.
 
-        Besides the worlds of ``StepShield``: worlds whose own latency is uncertain, because a decision then falls at a
-        different time in each world of the box, and all worlds if one uncertain number moves several quantities
-        (friction).
+        The members are the reported world and the corners of its uncertainty. The mask is True where the mask of
+        ``StepShield`` is, and in worlds in which the shielded vehicle's latency is uncertain, because decisions then
+        fall at different times in the worlds of a box. The mask is True everywhere if one uncertain number (friction)
+        changes several quantities.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:
@@ -135,20 +136,21 @@ class RobustShield(StepShield):
 def certify_inside(
     boxes: Boxes, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
 ) -> Decision:
-    """Replace each plan of a decision that is not certified for every world of its box by the held plan.
+    """Replace plans of a decision that are not certified for every world of their box by the plans from before the
+    decision.
 
     Args:
         boxes: range of every number of each world.
         running: state of the members (corners of the boxes) before the decision.
         held: plans and bounds from before the decision.
         budget: [n] largest harm that a new plan may have, m2/s2.
-        decision: the decision, certified in the corners only.
-        asked: [n] True for episodes that decide now. Such an episode counts as ended only at the horizon, because a box
-            may hold moving worlds when all its corners are at rest.
+        decision: the decision, certified only in the corners.
+        asked: [n] True for episodes that decide now. Such an episode ends only at the horizon, because a box may
+            contain moving worlds when all its corners are at rest.
 
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)
-    bound = np.where(asked & ~other, held.harm, decision.bound)  # an unchanged plan keeps its bound
+    bound = np.where(asked & ~other, held.harm, decision.bound)  # the bound of an unchanged plan does not change
     changed = np.flatnonzero(asked & other)
     bounds = boxes.bound(changed, plan[changed], budget[changed], only_enough=True)
     least = np.where(decision.intervened, held.harm, budget)[changed]
@@ -160,7 +162,7 @@ def certify_inside(
     plan[bad], bound[bad] = held.plan[bad], held.harm[bad]
     decision = decision._replace(bound=bound, backup=decision.backup._replace(plan=plan, harm=bound))
     refused = bad[~decision.intervened[bad]]
-    if refused.size:  # apply the action of the held plan instead
+    if refused.size:  # apply the action of the plan from before the decision
         part, plan = running.take(refused), held.plan[refused]
         action, harm = plan[np.arange(len(plan)), part.steps], held.harm[refused]
         with renumbered(refused):

@@ -1,13 +1,14 @@
-"""Rough bound on harm that follows no path, from the speeds that the vehicles of a line can still reach.
+"""Rough upper bound on harm, from the largest speeds that the vehicles of a line can still reach.
 
-It is used for the worlds of a path that cannot be followed, so no bound is ever infinite.
+The bound applies to worlds whose path cannot be simulated. The bound is always finite.
 
-A vehicle alone is at most as fast as it is now, or as it becomes by driving up to its limit. An impact with closing
-speed w changes each vehicle's speed by its share of (1 + e) w, with restitution e. Let u be the largest speed of any
-vehicle, and let no vehicle move backwards yet. An impact slows the rear vehicle, to no less than -e times its speed;
-a front vehicle at rest gains at most (1 + e) times the rear one's speed. So the middle one of three vehicles stays
-between -e u and (1 + e) u until its second pair meets. (Three vehicles in contact are one cluster: each leaves with
-P + e (P - v) for a weighted mean P of the speeds v, which lies between the same bounds.)
+Without impacts, a vehicle reaches at most its present speed, or the speed that it can reach by driving. An impact with
+closing speed w changes each vehicle's speed by (1 + e) w times the partner's share of the mass; e is the restitution.
+Let u be the largest speed of any vehicle, and assume that no vehicle moves backwards yet. An impact slows the rear
+vehicle, at most to -e times its speed. A front vehicle at rest gains at most (1 + e) times the rear vehicle's speed. So
+the middle vehicle of three stays between -e u and (1 + e) u until its second pair has contact. (Three vehicles in
+contact at once leave with P + e (P - v) each, where v is the vehicle's speed before and P a weighted mean of the
+speeds. These speeds lie between the same bounds.)
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def driven(cell: Cell, i: int, speed: float, since: float) -> float:
-    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if it has at most ``speed`` at time
+    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving, from at most ``speed`` at the time
     ``since``.
 
-    ``since`` counts from the first decision, in s. ``cell`` holds the box of worlds and the commands.
+    ``since`` counts from the first decision, in s. ``cell`` is the box of worlds with its commands.
     """
     drive, rest = 0.0, cell.times[-1] - since
     if i == cell.vehicle:
@@ -41,15 +42,14 @@ def driven(cell: Cell, i: int, speed: float, since: float) -> float:
 
 @compiled(apart=True)
 def rough_harm(cell: Cell, path: Path, hit: int) -> float:
-    """Return an upper bound on the harm of all worlds of a path, from the present piece on, m2/s2.
+    """Return an upper bound (m2/s2) on the harm of all worlds of a path, including the harm so far.
 
-    It uses only the largest speeds that the vehicles can still reach.
+    The bound uses only the largest speeds that the vehicles can still reach.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        hit: index of a pair that counts as hit already; -1: only the pairs marked in the path.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        hit: index of a further pair that counts as hit already; -1: only the pairs marked in the path.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -67,14 +67,14 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
 
 @compiled(apart=True)
 def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Path, hit: int) -> float:
-    """Return the largest sum of squared closing speeds of the first impacts that are still to come, m2/s2.
+    """Return an upper bound (m2/s2) on the sum of squared closing speeds of all first impacts that are still to come.
 
     Args:
         cell: the box of worlds.
         own: [N] largest speed of each vehicle without an impact, m/s.
         backwards: largest backward speed of any vehicle now, m/s.
         since: present time, s after the first decision.
-        path: marks the pairs that had an impact.
+        path: worlds of the box with the same impacts so far; only its marks of pairs that had an impact are read.
         hit: index of a further pair that counts as hit; -1: none.
 
     """

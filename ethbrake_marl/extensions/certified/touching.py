@@ -1,10 +1,12 @@
-"""Pairs that stay in contact in a box of worlds: they bounce a little, then move as one, then separate.
+"""Pairs that stay in contact in a box of worlds: they bounce a little, move as one body, and later separate.
 
-A pair in contact is described by the motion of its centre of mass, as affine forms, and by bounds on the distance of
-both vehicles from it. While both vehicles move forward, only their commands act on the pair, so its centre of mass
-follows the commands alone, however often the two collide. A world *creeps* once one of the two stands or moves
-backwards: its brakes then hold it instead of decelerating it, and only bounds on the speeds are known. A *flight* is
-the time between two impacts of the pair.
+The state of a pair in contact is the motion of its centre of mass, as affine forms, and limits on how far both vehicles
+deviate from it. While both vehicles move forward, only their commands act on the pair. The centre of mass then follows
+the commands alone, no matter how often the two vehicles collide.
+
+A world *creeps* as soon as one of the two vehicles stands or moves backwards: the brakes of that vehicle then hold it
+instead of slowing the pair, and only limits on the speeds are known. A *flight* is the time between two impacts of the
+pair.
 """
 
 from __future__ import annotations
@@ -41,17 +43,16 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND
 from ethbrake_marl.physics.state import Floats
 
-SHARP = 0.1  # m/s; vehicles of an opening pair move alone once their relative speed is known to this
+SHARP = 0.1  # m/s; the vehicles of an opening pair move alone if their relative speed is this certain
 
-UNEVEN = 3.0  # largest ratio of closing to separating speed of a flight for the bound by flights, with brake build-up
+UNEVEN = 3.0  # largest ratio of closing to separating speed in a flight, for bounds by flights with brake build-up
 
 
 @compiled(apart=True)
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
-    """Return the value of the centre of mass of pair ``p`` (speed, acceleration or distance) as an affine form [W]
-    (centre, slopes, remainder).
+    """Return speed, acceleration or distance of the centre of mass of pair ``p``, as an affine form [W].
 
-    ``front`` and ``rear`` are the values of the two vehicles; ``cell`` holds their shares of the mass.
+    ``front`` and ``rear`` are the values of the two vehicles; ``cell`` has their shares of the mass.
     """
     out = product(cell.share[p, 1], front)
     add(out, 1.0, product(cell.share[p, 0], rear))
@@ -60,7 +61,7 @@ def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
 
 @compiled(apart=True)
 def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest closing acceleration of pair ``p`` if both commands act, m/s2.
+    """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if both commands act.
 
     ``motion`` is the motion of all vehicles in the present piece (time interval of constant command).
     """
@@ -71,19 +72,19 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def apart(touch: Floats) -> float:
-    """Return the largest difference of speeds of a pair in contact, m/s.
+    """Return the largest difference between the two speeds of a pair in contact, m/s.
 
-    ``touch`` [TOUCH_WIDTH] is its state, a row of ``Path.touch``.
+    ``touch`` [TOUCH_WIDTH] is the state of the pair, a row of ``Path.touch``.
     """
     return float(max(touch[OPENING], touch[CLOSING], 0.0))
 
 
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
-    """Return by which factor, at least 1, an impact may make the front vehicle of pair ``p`` faster than the rear one
-    was.
+    """Return the largest ratio of the front vehicle's speed after an impact of pair ``p`` to the rear vehicle's speed
+    before.
 
-    ``cell`` holds the coefficient of restitution and the shares of mass.
+    The result is at least 1. ``cell`` has the coefficient of restitution and the shares of mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
@@ -93,24 +94,25 @@ def backwards(cell: Cell, p: int) -> float:
     """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of its speed
     before.
 
-    It is at least 0. ``cell`` holds the coefficient of restitution and the shares of mass.
+    The result is at least 0. ``cell`` has the coefficient of restitution and the shares of mass.
     """
     return float(max(0.0, (1.0 + cell.restitution) * high(cell.share[p, 1]) - 1.0))
 
 
 @compiled(apart=True)
 def stray(cell: Cell, touch: Floats, p: int) -> float:
-    """Return the largest difference between the speed of a pair's centre of mass and the speed in its affine form, m/s.
+    """Return the largest difference (m/s) between the speed of a pair's centre of mass and the speed in its affine
+    form.
 
-    It is above 0 only if one of the two vehicles may stand or move backwards. The form's speed then lies between 0 and
-    ``CREEP``, the rear vehicle's between minus ``backwards`` and 1 times ``CREEP``, and the front vehicle's between 0
-    and ``faster`` times ``CREEP``: no impact makes a rear vehicle faster.
+    The result is above 0 only if one of the two vehicles may stand or move backwards. The speed in the affine form then
+    lies between 0 and ``CREEP``. The rear vehicle's speed lies between minus ``backwards`` times ``CREEP`` and
+    ``CREEP``. The front vehicle's speed lies between 0 and ``faster`` times ``CREEP``. (No impact makes a rear vehicle
+    faster.)
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 
     """
     return float(max(faster(cell, p), 1.0 + backwards(cell, p)) * touch[CREEP])
@@ -118,13 +120,12 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
 
 @compiled(apart=True)
 def blur(cell: Cell, path: Path, p: int, side: int) -> float:
-    """Return the largest deviation of a vehicle's speed from the affine form of its pair in contact, m/s.
+    """Return the largest difference (m/s) between a vehicle's speed and the affine form of its pair in contact.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; its forms describe the start of the piece.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         side: 0 for the front vehicle of the pair, 1 for the rear one.
 
     """
@@ -133,9 +134,9 @@ def blur(cell: Cell, path: Path, p: int, side: int) -> float:
 
 @compiled(apart=True)
 def begin_touch(touch: Floats) -> None:
-    """Reset the state of a pair in contact, in place; the columns of the present piece (SPREAD, REACH) stay.
+    """Reset the state of a pair in contact, except for the columns SPREAD and REACH of the present piece.
 
-    ``touch`` [TOUCH_WIDTH] is the state, a row of ``Path.touch``.
+    ``touch`` [TOUCH_WIDTH] is the state, a row of ``Path.touch``; it is changed in place.
     """
     spread, reach = touch[SPREAD], touch[REACH]  # columns of the present piece
     touch[:] = 0.0
@@ -146,15 +147,15 @@ def begin_touch(touch: Floats) -> None:
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """Move pair ``p``, which is in contact, through the present piece (time interval of constant command).
 
-    On entry ``motion`` holds both vehicles as if alone. On return it holds them moving as one, or apart if they
-    separate.
+    Before the call ``motion`` has each vehicle as if it were alone. After the call it has the two vehicles as one body,
+    or apart if they separate.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; changed in place.
-        motion: motion of each vehicle in the present piece, as if alone (``move_alone``); changed in place.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
+            place.
+        motion: motion of each vehicle in the present piece; changed in place.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
     """
@@ -175,7 +176,7 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
     slowest = min(low(path.forms[front]), low(motion.onward[front])) - dip_of(cell, vague, length)
     bounce(cell, touch, p, least, most, length, vague)
     creep(cell, touch, p, slowest, weakest, hardest, length)
-    settle(touch, cell.restitution, length)
+    settle(touch, cell.restitution)
     motion.rest[front], motion.vague[front] = MOVES, vague
     if cell.moving:
         hold(path.forms[front], front, length, motion)
@@ -190,19 +191,22 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
-    """Return by how much (m/s) a speed may fall below its values at both ends of a piece.
+    """Return how much (m/s) a speed within a piece may be below its values at both ends of the piece.
 
-    This can happen if the vehicle's force changes sign in it. ``vague`` is the largest deviation of the acceleration
-    from its mean (m/s2), ``length`` the length of the piece (s).
+    The speed falls below them only if the vehicle's acceleration changes its sign within the piece.
 
-    A piece is a time interval of constant command; ``cell`` is the box of worlds.
+    Args:
+        cell: the box of worlds.
+        vague: largest deviation of the acceleration from its mean, m/s2.
+        length: length of the piece (time interval of constant command), s.
+
     """
     return 0.5 * vague * length if cell.moving else 0.0
 
 
 @compiled(apart=True)
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the least and the largest acceleration (m/s2) by the commands of either vehicle of pair ``p`` in a
+    """Return the smallest and the largest acceleration (m/s2) by the commands of both vehicles of pair ``p`` in a
     piece.
 
     ``motion`` is the motion of all vehicles in the piece (time interval of constant command).
@@ -213,15 +217,14 @@ def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, hardest: float, length: float) -> None:
-    """Update the state of a pair in contact for worlds that may creep: one of its vehicles stands or moves backwards.
+    """Update the state of a pair in contact for worlds in which one of its vehicles may stand or move backwards.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        slowest: least speed of the centre of mass in the piece, m/s.
-        weakest: least acceleration by either command, m/s2.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        slowest: smallest speed of the centre of mass in the piece, m/s.
+        weakest: smallest acceleration by either command, m/s2.
         hardest: largest acceleration by either command, m/s2.
         length: length of the piece, s.
 
@@ -245,21 +248,18 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
 
 @compiled(apart=True)
 def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Update pair ``p``, which is in contact, over a piece in which the affine form of its speed stands at 0.
+    """Update pair ``p``, which is in contact, over a piece in which its speed is 0 in the affine form.
 
-    In each world either both vehicles stand, or the world *creeps* and the brakes slow it. A world creeps if one
-    vehicle of the pair stands or moves backwards.
-
-    The brakes b reduce the rear vehicle's speed. The front vehicle's speed is at most ``faster`` times the rear one's.
-
-    The motion of the pair in ``path`` and ``motion`` is changed in place.
+    In each world both vehicles stand, or the world *creeps* (one vehicle stands or moves backwards) and the brakes slow
+    the other vehicle. The brakes reduce the rear vehicle's speed. The front vehicle's speed is at most ``faster`` times
+    the rear vehicle's speed.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; changed in place.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
+            place.
         motion: motion of each vehicle in the present piece; changed in place.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
     """
@@ -277,14 +277,14 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Separate pair ``p``, which was in contact and opens in the present piece: both vehicles move alone from then on.
+    """Separate pair ``p``, which was in contact and opens in the present piece. Afterwards both vehicles move alone.
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
-        path: worlds of the box that had the same impacts so far; changed in place.
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
+            place.
         motion: motion of each vehicle in the present piece; changed in place.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
     """
@@ -295,7 +295,7 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     touch[REACH] = wide + opening * length
     path.forms[N + p] = between(
         0.0, touch[REACH], width
-    )  # from the relative speed alone; the effect of the commands is added later
+    )  # effect of the relative speed; the effect of the commands is added later
     for side in range(2):
         share = (2.0 * side - 1.0) * high(cell.share[p, side])
         speed = between(min(-share * opening, 0.0) - astray, max(-share * opening, 0.0) + astray, width)
@@ -312,21 +312,21 @@ def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
 def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length: float, vague: float) -> None:
     """Update the relative speed and the gap of pair ``p``, which is in contact, over the present piece.
 
-    An impact never increases the relative speed, so it grows at most by what the commands add. While the pair is
-    pressed together by b between b- (``least``) and b+ (``most``), it does not grow: from gap g and relative speed w, a
-    *flight* (the time between two impacts) never exceeds the gap h = g + w^2 / (2 b-) and closes with at most sqrt(2 b+
-    h); the impact leaves the share e (restitution) of that. This is less than before if e sqrt(b+ / b-) < 1. (Where one
-    vehicle stands or moves backwards, its holding brakes make a flight lower and slower.)
+    An impact never increases the relative speed, so this speed grows by at most the closing acceleration of the
+    commands. While the closing acceleration is between b- (``least``) and b+ (``most``), both above 0, the relative
+    speed does not grow. A *flight* (the time between two impacts) with gap g and relative speed w has a gap of at most
+    ``h = g + w^2 / (2 b-)`` and ends with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with e
+    times this speed, where e is the restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ /
+    b-) < 1``. (If one vehicle stands or moves backwards, its brakes hold it, which makes flights shorter and slower.)
 
     Args:
-        cell: the box of worlds (a range for each quantity), with its commands and its pieces (time intervals of
-            constant command).
+        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        least: least closing acceleration, m/s2.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        least: smallest closing acceleration, m/s2.
         most: largest closing acceleration, m/s2.
         length: length of the piece, s.
-        vague: largest deviation of an acceleration from its mean, m/s2.
+        vague: largest deviation of the acceleration from its mean, m/s2.
 
     """
     e, fastest, wide = cell.restitution, apart(touch), touch[WIDE]
@@ -355,17 +355,17 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 
 @compiled(apart=True)
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
-    """Start a new phase of a contact: the pair is now pressed together harder or less hard than in the phase before.
+    """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
-    The new phase covers the accelerations of both if the relative speed then still decays from impact to impact, else
-    its own accelerations alone.
+    The new phase covers the accelerations of the old and the new phase if the relative speed then still decreases from
+    impact to impact. Otherwise the new phase covers only its own accelerations.
 
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
         e: coefficient of restitution.
-        softest: least closing acceleration of both phases, m/s2.
+        softest: smallest closing acceleration of both phases, m/s2.
         hardest: largest closing acceleration of both phases, m/s2.
-        least: least closing acceleration of the new phase, m/s2.
+        least: smallest closing acceleration of the new phase, m/s2.
         most: largest closing acceleration of the new phase, m/s2.
 
     """
@@ -382,18 +382,18 @@ def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: fl
 
 
 @compiled(apart=True)
-def settle(touch: Floats, e: float, length: float) -> None:
-    """Reset the state of a contact if the pair certainly moves as one by the end of the present piece.
+def settle(touch: Floats, e: float) -> None:
+    """Reset the state of a contact if the pair certainly moves as one body by the end of the present piece.
 
-    Suppose that the closing acceleration lies between ``b-`` and ``b+``. A *flight* (the time between two impacts) that
-    begins with separating speed s lasts at most ``2 s / b-`` and ends with a closing speed of at most
-    ``s sqrt(b+ / b-)``. The next flight begins with e times that speed, so the durations add up to at most
-    ``2 s / (b- (1 - e sqrt(b+ / b-)))``. After that time the two move as one, unless one stands or moves backwards.
+    Let the closing acceleration lie between ``b-`` and ``b+``, and let e be the restitution. A *flight* (the time
+    between two impacts) that begins with separating speed s lasts at most ``2 s / b-``. It ends with a closing speed of
+    at most ``s sqrt(b+ / b-)``, and the next flight begins with e times that speed. So all flights together last at
+    most ``2 s / (b- (1 - e sqrt(b+ / b-)))``. Afterwards the two vehicles move as one body, unless one stands or moves
+    backwards.
 
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.
         e: coefficient of restitution.
-        length: length of the piece (time interval of constant command), s.
 
     """
     if touch[SOFTEST] == math.inf or touch[CREEP] > 0.0:
@@ -407,16 +407,16 @@ def settle(touch: Floats, e: float, length: float) -> None:
 
 @compiled(apart=True)
 def is_blurred(path: Path, motion: Motion, N: int, p: int, length: float) -> bool:
-    """Return whether the gap of pair ``p`` is too uncertain for a further impact to be followed in this piece.
+    """Return whether the gap of pair ``p`` is too uncertain to simulate a further impact in this piece.
 
-    The gap is too uncertain if its uncertainty exceeds the largest distance by which it can shrink during this time
-    interval. The pair is then treated as in contact from the start of the interval.
+    The gap is too uncertain if its uncertainty exceeds the largest distance by which it can shrink within the piece.
+    Such a pair is treated as in contact from the start of the piece.
 
     Args:
-        path: worlds of the box that had the same impacts so far.
+        path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece (time interval of constant command).
         N: number of vehicles.
-        p: index of the pair: vehicle ``p`` is in front, vehicle ``p + 1`` behind.
+        p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
 
     """

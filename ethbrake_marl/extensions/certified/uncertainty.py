@@ -1,10 +1,11 @@
-"""Uncertainty: an interval around each quantity of a world, and the members that represent the worlds in it.
+"""Uncertainty: an interval around each quantity of a world, and the members that represent the worlds in these
+intervals.
 
-A quantity of one vehicle (or pair) with the reported value x lies in [x - h, x + h]. The half-width h is a number in
-the quantity's unit or a share of x. The interval is cut to possible values: no latency, speed or gap below 0, no speed
-above the vehicle's limit. The *members* of a world are the reported world and every corner of the box of all these
-intervals: 2^d corners for d uncertain numbers. Mode ``robust`` proves its bound for the members
-(``docs/extensions/certified.md``).
+The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
+quantity's unit, or a share of x. The interval is cut to possible values: no latency, speed or gap below 0, no speed
+above the vehicle's limit. The *box* of a world is the set of all combinations of values in its intervals. The *members*
+of a world are the reported world and every corner of its box: 2^d corners for d uncertain numbers. Mode ``robust``
+proves its bound for the members (``docs/extensions/certified.md``).
 """
 
 from __future__ import annotations
@@ -37,9 +38,18 @@ POSITIVE = (
     "release_rate_mps3",
 )  # quantities that must stay above 0
 
-_OF_FRICTION = (0.0, 0.125, 0.25, 0.375, 0.625, 0.75, 0.875, 1.0)  # shares of the interval; the reported value is 0.5
+_OF_FRICTION = (
+    0.0,
+    0.125,
+    0.25,
+    0.375,
+    0.625,
+    0.75,
+    0.875,
+    1.0,
+)  # positions in the interval; 0.5 is the reported value
 
-MOST_CORNERS = 1024  # most corners of one world; each costs as much as the world itself
+MOST_CORNERS = 1024  # largest number of corners of one world; each takes as much time as the world itself
 
 UNCERTAINTY_EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
 
@@ -54,7 +64,7 @@ _NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Half-width of one quantity's interval, for one vehicle or pair, or for each of them."""
+    """Interval of one quantity, for one vehicle or pair, or for all of them."""
 
     quantity: str  # one of QUANTITIES
     half_width: float  # in the quantity's unit, or a share of its value below 1
@@ -64,11 +74,15 @@ class Interval:
     def __post_init__(self) -> None:
         if self.quantity not in QUANTITIES:
             raise unknown_name("uncertain quantity", self.quantity, QUANTITIES)
-        most, right = (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a number, at least 0")
+        most, right = (
+            (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a finite number, at least 0")
+        )
         if not is_amount(self.half_width, most):
-            raise InvalidInput(f"uncertainty: {self.quantity}: half-width {self.half_width!r}: must be {right}")
+            raise InvalidInput(f"uncertainty: {self.quantity}: half-width = {self.half_width!r}: must be {right}")
         if self.place is not None and not (isinstance(self.place, int | np.integer) and self.place >= 0):
-            raise InvalidInput(f"uncertainty: {self.quantity}: place {self.place!r}: must be an index from 0")
+            raise InvalidInput(
+                f"uncertainty: {self.quantity}: place = {self.place!r}: must be an index of a vehicle or pair, from 0"
+            )
         if self.quantity == "friction" and self.place is not None:
             raise InvalidInput("uncertainty: friction is one number for the whole line; give it without a vehicle")
 
@@ -79,56 +93,58 @@ class Interval:
         return f"{self.quantity}{where}={width}"
 
 
-_Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, place, least and largest value, each [n]
+_Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, index, smallest and largest value [n]
 
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Intervals around the reported quantities of a world. ``parse_uncertainty`` reads the written form.
+    """Intervals around the reported quantities of a world. ``parse_uncertainty`` reads them from a text.
 
     Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
     """
 
-    intervals: tuple[Interval, ...]  # one entry for each uncertain quantity
+    intervals: tuple[Interval, ...]  # intervals of the uncertain quantities
 
     def __post_init__(self) -> None:
         if not isinstance(self.intervals, tuple) or not all(isinstance(each, Interval) for each in self.intervals):
-            raise InvalidInput(
-                f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval; parse_uncertainty reads it"
-            )
+            raise InvalidInput(f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval objects")
         if not self.intervals:
-            raise InvalidInput(f"uncertainty: no interval; one is needed, for instance {UNCERTAINTY_EXAMPLE}")
+            raise InvalidInput(f"uncertainty: no interval; must have at least one, for instance {UNCERTAINTY_EXAMPLE}")
         for k, one in enumerate(self.intervals):
             for other in self.intervals[:k]:
                 same = None in (one.place, other.place) or one.place == other.place
                 if one.quantity == other.quantity and same:
-                    raise InvalidInput(f"uncertainty: {other} and {one} speak of the same quantity; give each once")
+                    raise InvalidInput(
+                        f"uncertainty: {other} and {one} are intervals of the same quantity; give only one"
+                    )
 
     def __str__(self) -> str:
         return ",".join(str(interval) for interval in self.intervals)
 
     @property
     def moves_together(self) -> bool:
-        """True if one uncertain number (friction) changes several quantities; gaps and speeds are then not extreme in
-        corners.
+        """True if one uncertain number (friction) changes several quantities.
+
+        The largest and smallest gaps and speeds are then not always in corners.
         """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
     def members(self, worlds: Worlds) -> Worlds:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
-        The *box* of a world is the set of all values in its intervals. Corners come in the order of binary numbers; the
-        first interval is the lowest bit. Intervals of width 0 add no corners. Friction changes all capacities together
-        and harm is not monotone in it, so it has eight values instead of two ends. Raises ``InvalidInput`` for a
-        vehicle that does not exist, a capacity or mass that may be 0, or more than ``MOST_CORNERS`` corners.
+        The *box* of a world is the set of all combinations of values in its intervals. The corners are in the order of
+        binary numbers, with the first interval as the lowest bit. Intervals of width 0 add no corners. Friction has
+        eight values instead of two ends, because it changes all capacities together and harm is not monotone in it.
+        Raises ``InvalidInput`` for a vehicle that does not exist, a capacity or mass that may be 0, or more than
+        ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
         corners = math.prod(map(len, ends)) if sides else 0
         if corners > MOST_CORNERS:
             raise InvalidInput(
-                f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; at most"
-                f" {MOST_CORNERS} can be certified: name vehicles or pairs, for instance {UNCERTAINTY_EXAMPLE}"
+                f"uncertainty: {len(sides)} uncertain numbers in each world make {corners} corners; must be at"
+                f" most {MOST_CORNERS} corners: limit entries to some vehicles or pairs, as in {UNCERTAINTY_EXAMPLE}"
             )
         every = [shares[::-1] for shares in product(*ends)] if sides else []
         parts = [worlds] + [_placed(worlds, sides, shares.__getitem__) for shares in every]
@@ -136,8 +152,9 @@ class Uncertainty:
 
     @staticmethod
     def interleaved(parts: list[Worlds]) -> Worlds:
-        """Merge M lists of n worlds each into one list [n * M]: world 0 of each list, then world 1 of each list, and so
-        on.
+        """Merge M lists of n worlds each into one list [n * M].
+
+        The merged list begins with world 0 of every list, followed by world 1 of every list, and so on.
         """
         order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
@@ -148,7 +165,7 @@ class Uncertainty:
         Args:
             worlds: the reported worlds, [n].
             rng: source of randomness.
-            corners: True: draw one of the corners; False: draw uniformly from the inside.
+            corners: True: draw a corner; False: draw uniformly from the interior.
 
         """
         sides = self._sides(worlds)
@@ -158,8 +175,9 @@ class Uncertainty:
         return _placed(worlds, sides, lambda k: shares[k])
 
     def _sides(self, worlds: Worlds) -> list[_Side]:
-        """Return the uncertain numbers of ``worlds``: quantity, index of vehicle or pair, least and largest value [n]
-        of each.
+        """Return the uncertain numbers of ``worlds``, each with its smallest and its largest value, [n].
+
+        An uncertain number is one quantity of one vehicle or pair (index from 0).
         """
         sides: list[_Side] = []
         for interval in self.intervals:
@@ -171,7 +189,10 @@ class Uncertainty:
                     f"uncertainty: {interval}: {name} is not known in every world; declare it in the scenario"
                 )
             if interval.place is not None and interval.place >= every.shape[1]:
-                raise InvalidInput(f"uncertainty: {interval}: the line has only {every.shape[1]} of these")
+                raise InvalidInput(
+                    f"uncertainty: {interval}: the line has only {every.shape[1]}"
+                    f" {'pairs' if name == 'gaps_m' else 'vehicles'}"
+                )
             for place in range(every.shape[1]) if interval.place is None else (interval.place,):
                 values = every[:, place]
                 half = interval.half_width * values if interval.relative else np.full(worlds.n, interval.half_width)
@@ -180,7 +201,7 @@ class Uncertainty:
                     k = int(np.argmin(low))
                     raise InvalidInput(
                         f"uncertainty: {interval}: the value {values[k]:g}{_of(name, place)} in world {k} may"
-                        f" be as low as {low[k]:g}; it must stay above 0"
+                        f" be as low as {low[k]:g}; must be above 0: use a smaller half-width"
                     )
                 most = worlds.vehicles.speed_limit_mps[:, place] if name == "speeds_mps" else np.inf
                 high, rule = np.minimum(high, most), QUANTITY.declared[name]
@@ -195,15 +216,15 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Parse a text of ``quantity=half-width`` entries separated by commas, for instance ``UNCERTAINTY_EXAMPLE``.
+    """Parse a text of ``quantity=half-width`` entries with commas between them, for instance ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
     the quantity limits the entry to one vehicle or pair. Blanks around entries and ``=`` are ignored. Raises
-    ``InvalidInput`` for anything else.
+    ``InvalidInput`` for any other text.
     """
     entries = [entry.strip() for entry in text.split(",")]
     if "" in entries:
-        raise InvalidInput(f"uncertainty: {text!r}: entry {entries.index('') + 1} is empty; it {_FORM}")
+        raise InvalidInput(f"uncertainty: {text!r}: entry {entries.index('') + 1} is empty; {_FORM}")
     intervals = []
     for entry in entries:
         match = _ENTRY.fullmatch(entry)
@@ -212,7 +233,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
         name, width = match["name"], float(match["width"])
         if name in QUANTITIES and match["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
             raise InvalidInput(
-                f"uncertainty: {entry!r}: gaps_m is limited by .pair_1, any other quantity by .vehicle_1"
+                f"uncertainty: {entry!r}: only gaps_m takes a pair, as in gaps_m.pair_1; the others take a vehicle"
             )
         place = None if match["number"] is None else int(match["number"]) - 1
         intervals.append(Interval(name, width / 100.0 if match["share"] else width, bool(match["share"]), place))
@@ -222,7 +243,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
 def _values(worlds: Worlds, quantity: str) -> Floats:
     """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1].
 
-    Capacities are those on a dry road.
+    Capacities are the values on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
@@ -235,16 +256,16 @@ def _of(quantity: str, place: int) -> str:
 
 
 def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
-    """Return the worlds with each uncertain number at a position in its interval.
+    """Return the worlds with each uncertain number at a given position in its interval.
 
-    Without a V2X channel an uncertain latency also changes what others receive and when. With a channel, only the
-    reaction is uncertain. Friction limits the capacities of all vehicles together.
+    Without a V2X channel, an uncertain latency also changes when a message arrives. With a channel, an uncertain
+    latency changes only when the vehicle reacts. Friction limits the capacities of all vehicles together.
 
     Args:
         worlds: the reported worlds, [n].
         sides: the uncertain numbers, from ``_sides``.
-        share: maps the index of an uncertain number to its position, a number or [n]: 0 is the least value, 1 the
-            largest.
+        share: returns the position of the uncertain number with a given index, a number or [n]: 0 is the smallest
+            value, 1 the largest.
 
     """
     changed: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Compare levels of cooperation: ``ethbrake study ablate``; equilibria of several learners."""
+"""Comparison of levels of cooperation (``ethbrake study ablate``), and equilibria of several learners."""
 
 from typing import TYPE_CHECKING
 

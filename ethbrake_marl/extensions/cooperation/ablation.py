@@ -1,4 +1,4 @@
-"""Run an ablation, a comparison of trainings at several levels of cooperation, and estimate its cost."""
+"""Run an ablation (a comparison of trainings at several levels of cooperation), and estimate the time it takes."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from ethbrake_marl.training.team import load_team
 def run_ablation(
     plan: Plan, jobs: int = 1, machine: str = "", tell: OnProgress | None = None
 ) -> tuple[Json, list[Path]] | None:
-    """Run all trainings of an ablation, measure the trained policies, and write all files, replacing existing ones.
+    """Run all trainings of an ablation, measure the trained policies, and write all files. Existing files are replaced.
 
     Args:
         plan: settings of the ablation.
-        jobs: number of trainings at once.
-        machine: description of this machine, which is recorded.
-        tell: called with the progress; None: silent.
+        jobs: number of trainings that run at the same time.
+        machine: description of this machine, which is stored with the results.
+        tell: function that receives the progress; None: the progress is not reported.
 
-    Returns the content of ``ablation.json``, and the paths of page, Markdown and figures. Returns None if Ctrl-C
-    stopped the trainings. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
+    Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures. Returns None
+    if Ctrl-C stopped the trainings. Raises the exceptions of ``StudyFolder.work``, ``train_all`` and ``measure``.
 
     """
     with plan.study_folder().work():
@@ -42,28 +42,28 @@ def run_ablation(
 
 
 class Cost(NamedTuple):
-    """Remaining work of an ablation, in CPU seconds of one core."""
+    """Estimate of the remaining work of an ablation. Times are processor time of one core, in s."""
 
-    trainings: int  # unfinished ones
-    decisions: int  # of these trainings
-    training_s: float
-    search_s: float
-    driving_s: float
-    training_folders: int  # finished ones included
-    search_folders: int
-    damaged: tuple[Path, ...]  # parts of a search that are searched again
+    trainings: int  # number of unfinished trainings
+    decisions: int  # number of decisions that these trainings still need
+    training_s: float  # time for trainings (s)
+    search_s: float  # time for searches of joint optima (s)
+    driving_s: float  # time for evaluating the trained policies (s)
+    training_folders: int  # number of folders of trainings, finished trainings included
+    search_folders: int  # number of folders of searches
+    damaged: tuple[Path, ...]  # damaged result files of searches; the search of their worlds is repeated
 
     @property
     def total_s(self) -> float:
-        """All work together."""
+        """Time for all remaining work (s)."""
         return self.training_s + self.search_s + self.driving_s
 
     def to_json(self) -> Json:
-        """Return the estimate as plain data."""
+        """Return the estimate as a mapping for JSON."""
         return {**self._asdict(), "damaged": [str(file) for file in self.damaged], "total_s": self.total_s}
 
     def __str__(self) -> str:
-        """Return the estimate in words, with a line for each damaged part of a search."""
+        """Return the estimate as text, with one line for each damaged file."""
         speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
         text = Timed.in_words
         line = (
@@ -75,22 +75,22 @@ class Cost(NamedTuple):
 
 
 HOW_MEASURED = (
-    "CPU time of short samples, measured now and not kept: four updates of each recipe, 50 worlds driven, 4 searched;"
-    " in a sweep at one of its values"
+    "processor time of short trials, which are not stored: four updates of each recipe, 50 worlds evaluated, 4 searched"
+    " (in a sweep: for one of its values)"
 )
 
 
 def ablation_cost(plan: Plan) -> Cost:
-    """Estimate the remaining work of an ablation in CPU time of one core.
+    """Estimate the remaining work of an ablation, as processor time of one core.
 
-    To estimate it, a short training of each level and recipe, an evaluation and a search are timed; in a sweep only
-    those of one level, because its levels are alike.
+    The function times a short training for each level and recipe, a short evaluation, and a short search. In a sweep it
+    does so for one level, because all levels of a sweep take about the same time.
 
-    Raises the exceptions of ``TrainingJob.steps_left``, and those of ``load_team`` for a finished training whose
-    policies cannot be loaded.
+    Raises the exceptions of ``TrainingJob.steps_left``. Raises the exceptions of ``load_team`` if the policies of a
+    finished training cannot be loaded.
     """
     left = [(level, algorithm, training, training.steps_left()) for level, algorithm, training in plan.trainings()]
-    decisions: Counter[tuple[str, str]] = Counter()  # by scenario, which all levels of a sweep share, and algorithm
+    decisions: Counter[tuple[str, str]] = Counter()  # (scenario, algorithm) -> number of decisions
     for level, algorithm, training, steps in left:
         decisions[level.scenario.name, algorithm] += steps
         if not steps:
@@ -105,7 +105,7 @@ def ablation_cost(plan: Plan) -> Cost:
     worlds_s = [each.world_s for each in short.values()] or [first.world_seconds(samples[level.scenario.name])]
     driving_s = sum(worlds_s) / len(worlds_s) * plan.episodes * (len(left) + len(plan.levels))
     shielded_s: dict[str, float] = {}
-    for level in plan.levels if plan.shield else ():  # timed with full braking, which the shield replaces most often
+    for level in plan.levels if plan.shield else ():  # timed with full braking, because the shield replaces it often
         if level.scenario.learners:
             task, often = Task(level.scenario, level.scenario.learners), plan.seeds * len(plan.recipes)
             name, shielded = level.scenario.name, partial(drive_shielded, make_agent("full_brake"), task=task)

@@ -19,47 +19,50 @@ def ablate_command(
         str | None,
         typer.Option(
             metavar="A,B,...",
-            help="Scenarios to compare, in this order.",
-            show_default="the shipped ladder; of a sweep cooperation-3-pair",
+            help="Levels (scenarios) to compare, in this order.",
+            show_default="the shipped levels; for a sweep cooperation-3-pair",
         ),
     ] = None,
     sweep: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KEY=LOW..HIGH:STEP|A,B,...",
-            help="Instead compare one level with several numbers of a key: objective=social:0..90:15.",
+            help="Compare one level with several values of one key, for instance objective=social:0..90:15.",
         ),
     ] = None,
     recipes: Annotated[str, typer.Option(metavar="A,B,...", help="Training recipes.")] = "cooperation",
     seeds: Annotated[
-        int | None, typer.Option(help="Trainings per level and recipe, seeds 0, 1, ...", show_default="5", min=1)
+        int | None, typer.Option(help="Number of trainings (seeds) per level and recipe.", show_default="5", min=1)
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(help="Decisions per training, for each of its learners.", show_default="400000", min=1)
+        int | None, typer.Option(help="Decisions of each learner in a training.", show_default="400000", min=1)
     ] = None,
     episodes: Annotated[
-        int | None, typer.Option(help="Worlds on which all are measured.", show_default="4000", min=1)
+        int | None, typer.Option(help="Number of worlds for the comparison.", show_default="4000", min=1)
     ] = None,
     search_episodes: Annotated[
-        int | None, typer.Option(help="How many of these to search for the joint optimum.", show_default="600", min=1)
+        int | None,
+        typer.Option(help="Number of these worlds in which to search the joint optimum.", show_default="600", min=1),
     ] = None,
     shield: Annotated[
         str | None,
-        typer.Option(metavar="step", help="Also drive behind this shield, one for all learners.", show_default="none"),
+        typer.Option(metavar="step", help="Also evaluate with this shield for all learners.", show_default="none"),
     ] = None,
     settings: SettingsOption = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A first look: few seeds, worlds and decisions.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Use few seeds, worlds and decisions.")] = False,
     cost: Annotated[
-        bool, typer.Option("--cost", help="Estimate CPU time and folders by short samples, and end; keeps nothing.")
+        bool, typer.Option("--cost", help="Estimate the time by short trials, print it with the folders, and exit.")
     ] = False,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Train levels of cooperation, compare them on common worlds.
+    """Train policies at several levels of cooperation, and compare them in the same worlds.
 
-    Prints first how long it will take. The same command goes on after an interruption: finished trainings are kept,
-    begun ones go on. Writes ablation.html, ablation.md, ablation.csv, ablation.json and three figures. With --sweep the
-    levels are one level with several numbers: axis of its two figures, and column of its tables.
+    The command first prints how long it will take. It writes ablation.html, ablation.md, ablation.csv, ablation.json
+    and three figures. After an interruption, repeat the command to continue.
+
+    With --sweep, one level is trained with several values of one key. The two figures of a sweep show harm against
+    these values.
     """
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.cooperation.ablation import HOW_MEASURED, ablation_cost, run_ablation
@@ -67,7 +70,7 @@ def ablate_command(
         from ethbrake_marl.extensions.studies.machine import this_machine
 
         if sweep is not None and len(sweep) > 1:
-            raise InvalidInput("--sweep is given twice; sweep one key, because a figure has one axis")
+            raise InvalidInput("--sweep is given twice; give it once, because the figures have one axis for the values")
         plan = plan_ablation(
             levels, recipes, settings, sweep=sweep[0] if sweep else None, quick=quick, tell=out.note,
             seeds=seeds, steps_per_learner=steps, episodes=episodes, search_episodes=search_episodes, shield=shield,

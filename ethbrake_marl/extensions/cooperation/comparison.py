@@ -1,10 +1,10 @@
-"""Compare levels of cooperation: harm per level, change from level to level, who pays, distance to the joint optimum.
+"""Compare levels of cooperation: harm at each level, change of harm between levels, and distance to the joint optimum.
 
-A *level* is a scenario; the *ladder* is the sequence of levels, each compared with the one before. The *joint optimum*
-is the least known harm that all learners of a level can achieve together.
+A *level* is a scenario. The *ladder* is the sequence of levels, in which each level is compared with the previous one.
+The *joint optimum* is the least known harm that all learners of a level can achieve together.
 
-Confidence intervals cover other training seeds and other worlds: both are resampled (``evaluation.seeds``).
-Worlds of one recording are resampled together.
+The confidence intervals account for the choice of training seeds and of worlds: both are resampled
+(``evaluation.seeds``). Worlds from one recording are resampled together.
 """
 
 from __future__ import annotations
@@ -24,17 +24,20 @@ from ethbrake_marl.shields.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Return the comparison of all levels as plain data for JSON; docs/extensions/cooperation.md describes it.
+    """Return the comparison of all levels as a mapping for JSON. docs/extensions/cooperation.md describes it.
 
-    Keys: ``levels`` (results of each level), ``steps`` (each level against the one before), ``channels`` (each level
-    with a worse V2X channel against the level that it varies), and ``undertrained`` (a list of one sentence that names
-    the levels whose trained policies do worse than full braking; empty without such a level). Steps are compared for
-    one algorithm at a time; a level without learners counts in the comparison of every algorithm.
+    The mapping has four keys with lists:
+
+    - ``levels``: results of each level;
+    - ``steps``: change of harm from each level to the next, for each algorithm;
+    - ``channels``: change of harm from a level to the same level with a worse V2X channel;
+    - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking. The list
+      is empty if there are none.
 
     Args:
         measured: results of ``measure``.
-        searched: number of worlds, from the first on, in which the joint optimum was searched. Figures compared with it
-            cover the same worlds.
+        searched: number of worlds, counted from the first, in which the joint optimum was searched. Results that are
+            compared with the joint optimum are for these worlds.
 
     """
     algorithms = [m.algorithm for m in measured if m.algorithm is not None]
@@ -67,7 +70,7 @@ def _undertrained(measured: Sequence[Measured]) -> list[str]:
 def _level(one: Measured, searched: int) -> Json:
     """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the first ``searched``.
 
-    The ``searched`` part also has the joint optimum and the share of the possible reduction.
+    For the first ``searched`` worlds, the result also has the joint optimum and the share of the possible reduction.
     """
     scenario = one.level.scenario
     of_searched = None if one.clusters is None else one.clusters[:searched]
@@ -115,13 +118,13 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: int) -> Json:
-    """Return the results of a level's teams behind a shield as plain data, compared with those without a shield.
+    """Return the results of a level's teams with a shield, and their differences from the results without a shield.
 
     Args:
         one: results of the level without a shield.
-        shielded: results of the same teams in the same worlds, behind a shield that bounds the harm ``harm_count``.
-        harm_count: impacts that harm counts: each pair's first one (``first``) or all (``total``).
-        searched: number of worlds, from the first on, over which the part ``searched`` of the result averages.
+        shielded: results of the same teams in the same worlds, with a shield that bounds the harm ``harm_count``.
+        harm_count: impacts that count as harm: the first impact of each pair (``first``), or all (``total``).
+        searched: number of worlds, counted from the first, whose means the entry ``searched`` of the result has.
 
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
@@ -146,19 +149,19 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return the change of harm from level ``before`` to level ``after`` on the same worlds; positive: more harm.
+    """Return the change of harm from level ``before`` to level ``after`` in the same worlds; positive: more harm.
 
-    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``, with
-    the changes of the whole line and of each vehicle under each count of harm. ``algorithm`` is only recorded in it.
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``. It
+    has the changes of the whole line and of each vehicle, for both counts of harm. ``algorithm`` is the name to record.
     """
     entry: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     if before.level.swept is not None and after.level.swept is not None:
         entry |= {"swept_key": after.level.swept.key}
         entry |= {"from_number": before.level.swept.number, "to_number": after.level.swept.number}
-    mean = partial(mean_over_seeds, clusters=after.clusters)  # both levels are measured in the same worlds
+    mean = partial(mean_over_seeds, clusters=after.clusters)
     for harm_count in HARM_COUNTS:
         pairs = zip(_columns(after.reached, harm_count), _columns(before.reached, harm_count), strict=True)
-        # compares seed k with seed k, or with the only seed
+        # seed k of one level is compared with seed k of the other, or with its only seed
         old, new = before.reached.vehicle[harm_count], after.reached.vehicle[harm_count]
         worse = new > old + TOLERANCE
         entry[harm_count] = {
@@ -171,5 +174,5 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _columns(harms: Harms, harm_count: HarmCount) -> list[Floats]:
-    """Return the harm of each vehicle, front to rear, as arrays [seeds, worlds]."""
+    """Return the harm of each vehicle, front to rear, as an array [seeds, worlds]."""
     return [harms.vehicle[harm_count][:, :, i] for i in range(harms.vehicle[harm_count].shape[2])]

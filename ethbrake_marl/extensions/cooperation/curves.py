@@ -1,4 +1,4 @@
-"""Figures of a sweep: harm against the swept number, and which vehicle bears it."""
+"""Figures of a sweep: harm of the line, and harm of each vehicle, against the swept number."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 
 _MOST_TICKS = 12
 
-_ROOM = 0.05  # least distance of two ticks, as a share of the axis
+_ROOM = 0.05  # least distance between two ticks, as a share of the axis
 
-_BESIDE = 0.008  # distance of whiskers at the same number, as a share of the axis; a mark's seeds are twice as far
+_BESIDE = 0.008  # horizontal distance between marks for the same number, as a share of the axis
 
-_MARGIN = 0.06  # at either end, as a share of the axis
+_MARGIN = 0.06  # margin at both ends of the axis, as a share of the axis
 
 Json = dict[str, Any]
 
 
 def swept_axis(results: Json) -> str | None:
-    """Return the label of the swept key: ``v2x.lost``, ``objective = social:…``; None if nothing is swept."""
+    """Return the label of the swept key, such as ``v2x.lost`` or ``objective = social:…``; None without a sweep."""
     first = results["levels"][0]
     if "swept_key" not in first:
         return None
@@ -36,12 +36,21 @@ def swept_axis(results: Json) -> str | None:
 
 
 def sweep_figures(results: Json, caption: str) -> list[Figure]:
-    """Return the figures of a sweep, drawn over its number on linear axes from 0, with 95 % intervals."""
+    """Return the two figures of a sweep, with the swept number on the x axis, linear axes, and 95 % intervals.
+
+    Args:
+        results: content of ``ablation.json``.
+        caption: text below each figure.
+
+    """
     return [_harm_curves(results, caption), _who_bears(results, caption)]
 
 
 def _harm_curves(results: Json, caption: str) -> Figure:
-    """Draw both harms between full braking and the joint optimum, in the worlds in which the optimum was searched."""
+    """Draw both counts of harm, with full braking and the joint optimum for comparison.
+
+    The figure is for the worlds in which the joint optimum was searched.
+    """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
         first = _of(results, algorithms(results)[0])
@@ -67,12 +76,12 @@ def _harm_curves(results: Json, caption: str) -> Figure:
         _number_axis(axes, results)
         name_axes(axes, TITLES[harm_count])
     worlds = results["levels"][0]["first"]["searched"]["worlds"]
-    told = f"{caption} All of this figure: the first {count_of(worlds, 'world')}."
-    return finish(figure, told, panels[0], columns=4, fontsize=8.5)
+    text = f"{caption} All values of this figure: means over the first {count_of(worlds, 'world')}."
+    return finish(figure, text, panels[0], columns=4, fontsize=8.5)
 
 
 def _who_bears(results: Json, caption: str) -> Figure:
-    """Draw the harm of each vehicle, in all worlds; a further algorithm has other dashes."""
+    """Draw the harm of each vehicle, in all worlds. Each algorithm has its own line style."""
     figure, panels = new_panels((10.5, 4.8), columns=2)
     several = len(algorithms(results))
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -89,14 +98,23 @@ def _who_bears(results: Json, caption: str) -> Figure:
 
 
 def algorithms(results: Json) -> list[str]:
-    """Return the algorithms that were trained, each once."""
+    """Return the names of the algorithms that were trained, without repetition."""
     return list(dict.fromkeys(level["algorithm"] for level in results["levels"] if level["algorithm"] is not None))
 
 
 def with_intervals(
     axes: Axes, at: Sequence[float], estimates: Sequence[Estimate], *, upright: bool = True, **style: Any
 ) -> None:
-    """Draw marks with whiskers at the positions ``at``; ``upright``: values are on the y axis."""
+    """Draw estimates as marks with whiskers.
+
+    Args:
+        axes: axes to draw on.
+        at: position of each mark.
+        estimates: value and interval of each mark.
+        upright: True: the values are on the y axis, the positions on the x axis; False: the reverse.
+        style: further arguments of matplotlib's ``errorbar``.
+
+    """
     values = np.array([each.value for each in estimates])
     errors = np.abs(np.array([each.ends for each in estimates]).T - values)
     if upright:
@@ -118,7 +136,7 @@ def _curve(
     shade: bool = False,
     **style: Any,
 ) -> None:
-    """Draw estimates over the swept number, with their intervals as whiskers, or as a ``shade``."""
+    """Draw estimates against the swept number, with their intervals as whiskers, or as a band (``shade``)."""
     at = _places(levels, beside)
     if not shade:
         with_intervals(axes, at, estimates, **style)
@@ -129,19 +147,22 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the swept numbers, moved to the right ``beside`` times."""
+    """Return the x positions of the swept numbers, moved to the right by ``beside`` small steps."""
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
 
 
 def _span(levels: Sequence[Json]) -> tuple[float, float]:
-    """Return the ends of the axis: the swept numbers and 0."""
+    """Return the ends of the x axis, which covers the swept numbers and 0."""
     numbers = [level["swept_number"] for level in levels]
     return min(*numbers, 0.0), max(*numbers, 0.0)
 
 
 def _number_axis(axes: Axes, results: Json) -> None:
-    """Make both axes linear from 0; ticks of the x axis are the swept numbers and 0 where there is room."""
+    """Set range, ticks and label of the x axis, and let the y axis begin at 0.
+
+    The ticks are 0 and the swept numbers if their labels do not overlap.
+    """
     numbers = sorted({0.0, *(level["swept_number"] for level in results["levels"])})
     low, high = _span(results["levels"])
     margin = _MARGIN * (high - low)

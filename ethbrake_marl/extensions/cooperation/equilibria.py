@@ -1,7 +1,8 @@
-"""Equilibria of several learners: each searches its own best command profile in turn, until nobody improves.
+"""Equilibria of several learners, found by best responses in turn.
 
-Everybody knows everything and commits to a *profile*: the commands of a whole episode (open loop), against which the
-others do not react.
+A *profile* is the sequence of a learner's commands in a whole episode. It is fixed at the alert (open loop), so no
+learner reacts to what the others do. The learners know the whole world. Each of them searches its best profile in turn,
+until no learner improves.
 """
 
 from __future__ import annotations
@@ -33,62 +34,61 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
-STARTS = ("braking", "driving", "random")  # constant commands of all learners from which the search begins
+STARTS = ("braking", "driving", "random")  # names of the constant commands with which the search begins
 
-BUDGET = 10_000  # candidates per world of one search
+BUDGET = 10_000  # number of candidate profiles that one search tries per world
 
-ROUNDS = 12  # most rounds, in each of which every learner searches once
+ROUNDS = 12  # largest number of rounds; every learner searches once in a round
 
-TOLERANCE = 0.01  # m2/s2; a learner changes its profile for a larger gain only
+TOLERANCE = 0.01  # m2/s2; a learner changes its profile only if it gains more than this
 
 
 class Equilibrium(NamedTuple):
-    """Where best responses in turn end from one start, in n worlds of N vehicles and C learners."""
+    """Result of best responses in turn from one start, in n worlds with N vehicles and C learners."""
 
     profiles: Profiles  # commands of the learners, with one phase for each decision
-    borne: dict[HarmCount, Floats]  # count of harm -> [n, N] harm that each vehicle bears, m2/s2
-    converged: Bools  # [n] whether no learner's search found more than the tolerance in the last round
-    rounds: Ints  # [n] number of rounds, with the last one, in which nobody improved
+    borne: dict[HarmCount, Floats]  # count of harm -> [n, N] harm of each vehicle, m2/s2
+    converged: Bools  # [n] whether no learner gained more than the tolerance in the last round
+    rounds: Ints  # [n] number of rounds, including the last round
 
 
 class Spread(NamedTuple):
-    """The equilibria of different starts, world by world; ends that did not converge are left out."""
+    """Comparison, in each world, of the equilibria from different starts. Starts that did not converge are left out."""
 
     found: Ints  # [n] number of starts that converged
-    differs: Bools  # [n] whether the harm of some vehicle differs between two of these by more than the tolerance
-    best: Floats  # [n, N] harm that each vehicle bears where the line's harm is least, m2/s2; NaN if none converged
-    worst: Floats  # [n, N] the same where the line's harm is greatest
+    differs: Bools  # [n] whether the harm of a vehicle differs by more than the tolerance between two equilibria
+    best: Floats  # [n, N] harm of each vehicle in the equilibrium with the least harm of the line, m2/s2; NaN: none
+    worst: Floats  # [n, N] harm of each vehicle in the equilibrium with the greatest harm of the line, m2/s2; NaN: none
 
 
 class _Game(NamedTuple):
-    """What the learners choose in, and what each of them minimises."""
+    """The worlds, and what each learner minimises in them."""
 
     worlds: Worlds
-    task: Task  # its vehicles are the learners
-    declared: Declared  # the objectives
-    joint: ProfileProblem  # the problem of all learners together
+    task: Task  # task of the learners
+    declared: Declared  # objectives of the learners
+    joint: ProfileProblem  # search problem of all learners together
     others: Floats  # [n, N] commands of the scripts, m/s2
 
     def take(self, rows: Ints) -> _Game:
-        """Return the game in the worlds with the indices ``rows`` only."""
         return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
 
     def together(self, own: list[Profiles]) -> Profiles:
-        """Return the joint profile of the learners' own ones, with one phase for each decision."""
+        """Join the profiles of the learners into one joint profile, with one phase for each decision."""
         steps = np.arange(int(self.joint.last_step.max()))
         at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
         return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))
 
     def amount(self, c: int, own: list[Profiles]) -> Floats:
-        """Return what learner number ``c`` minimises under the learners' profiles, [n] m2/s2."""
+        """Return the objective of learner number ``c`` if the learners follow the profiles ``own``, [n] m2/s2."""
         problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
-        """Return the best profile of learner number ``c`` that a search finds while the others follow ``own``.
+        """Search the best profile of learner number ``c`` while the other learners follow their profiles in ``own``.
 
-        The others follow them in pieces, which begin at the decisions of the joint problem. So harm differs from that
-        of the joint problem by rounding. ``effort`` holds the keywords of ``search_profiles``.
+        ``effort`` has keyword arguments of ``search_profiles``. The resulting harm differs by rounding from the harm in
+        the joint problem, because the profiles of the others are split at the times of the joint decisions.
         """
         task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
         problem = profile_problem(
@@ -101,7 +101,7 @@ class _Game(NamedTuple):
         return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
-        """Return the vehicles, of which the learners but number ``c`` follow ``own`` in pieces."""
+        """Return the vehicles, with the profiles ``own`` as fixed commands of all learners except number ``c``."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
@@ -129,11 +129,12 @@ def find_equilibria(
     seed: int = 0,
     threads: int = 1,
 ) -> dict[str, Equilibrium]:
-    """Search equilibria of the scenario's learners by best responses in turn, one from each of ``STARTS``.
+    """Search equilibria of the scenario's learners by best responses in turn, one equilibrium from each of ``STARTS``.
 
-    A learner keeps its profile unless the search finds one better by more than ``tolerance``. So what has converged is
-    an approximate equilibrium in open-loop profiles, as far as a search of ``budget`` candidates can tell. Nothing says
-    that it is the only one. The result does not depend on the other worlds or on ``threads``.
+    A learner changes its profile if a search finds a profile that is better by more than ``tolerance``. If no learner
+    changes its profile in a round, the result is an approximate equilibrium of open-loop profiles. It is not exact,
+    because a search tries only ``budget`` candidates. Other equilibria may exist. The result for a world does not
+    depend on the other worlds or on ``threads``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -143,27 +144,29 @@ def find_equilibria(
     (['braking', 'driving', 'random'], (5,))
 
     Args:
-        scenario: the scenario of the worlds; its learners play, the others follow their scripts.
-        worlds: the worlds at t = 0, [n].
-        objective: what each learner minimises: one for all, such as ``own``, or one for each vehicle of the line; None:
-            the scenario's.
-        harm_count: impacts that count: ``first`` of each pair, or ``total``.
-        budget: candidates of one search.
-        rounds: most rounds, in each of which every learner searches once.
-        tolerance: least gain for which a learner changes its profile, m2/s2.
+        scenario: scenario of the worlds, with at least one learner.
+        worlds: the n worlds at the alert.
+        objective: objective that each learner minimises: one for all, such as ``own``, or one for each vehicle of the
+            line; None: the objective of the scenario.
+        harm_count: impacts that count as harm: ``first`` (first impact of each pair), or ``total`` (all impacts).
+        budget: number of candidate profiles that one search tries per world.
+        rounds: largest number of rounds; every learner searches once in a round.
+        tolerance: gain that a learner must exceed to change its profile, m2/s2.
         seed: seed of the random start and of the searches.
         threads: number of threads.
 
-    Raises ``InvalidInput`` for a scenario without learners, a script whose command is not fixed at the alert, an
-    objective that is no weighted sum of the vehicles' harm nor ``maximin``, and numbers out of range; ``PhysicsError``
-    with the worlds in which a check of the physics failed.
+    Returns an equilibrium for each name in ``STARTS``.
+
+    Raises ``InvalidInput`` for a scenario without learners; for a script whose command is not fixed at the alert; for
+    an objective that is neither a weighted sum of the vehicles' harm nor ``maximin``; and for a number out of range.
+    Raises ``PhysicsError`` with the worlds in which a check of the physics failed.
 
     """
     check_whole_number("rounds", rounds, 1)
     if not 0.0 <= tolerance < math.inf:
-        raise InvalidInput(f"tolerance {tolerance!r}: must be a number of m2/s2, at least 0")
+        raise InvalidInput(f"tolerance = {tolerance!r}: the tolerance must be a finite number of m2/s2, at least 0")
     if not scenario.learners:
-        raise InvalidInput(f"scenario {scenario.name!r}: nobody learns; give at least one vehicle the role learner")
+        raise InvalidInput(f"scenario {scenario.name!r}: has no learner; give at least one vehicle the role learner")
     task, declared = (
         Task(scenario, scenario.learners, harm_count),
         scenario.objective if objective is None else objective,
@@ -182,14 +185,14 @@ def find_equilibria(
 
 
 def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, effort: Mapping[str, int]) -> Equilibrium:
-    """Let the learners search in turn, from the profiles ``own`` of each, until none improves by the tolerance."""
+    """Let the learners search in turn from the profiles ``own`` until no learner gains more than the tolerance."""
     active, taken = np.arange(game.joint.n), np.zeros(game.joint.n, np.int64)
     for turn in range(rounds):
         part, mine = game.take(active), [each.take(active) for each in own]
         moved = np.zeros(len(active), np.bool_)
         with renumbered(active):
             for c in range(len(mine)):
-                new = part.response(c, mine, {**effort, "seed": effort["seed"] + turn})  # not the same draws again
+                new = part.response(c, mine, {**effort, "seed": effort["seed"] + turn})  # new draws in each round
                 better = part.amount(c, [*mine[:c], new, *mine[c + 1 :]]) < part.amount(c, mine) - tolerance
                 mine[c].ends[better], mine[c].commands_mps2[better] = new.ends[better], new.commands_mps2[better]
                 moved |= better
@@ -204,12 +207,12 @@ def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, eff
 
 
 def compare_starts(ends: Mapping[str, Equilibrium], harm_count: HarmCount, tolerance: float = 0.1) -> Spread:
-    """Compare the equilibria of different starts, world by world.
+    """Compare the equilibria from different starts in each world.
 
     Args:
-        ends: what ``find_equilibria`` returns.
-        harm_count: harm to compare, ``first`` or ``total``.
-        tolerance: two ends whose harm differs by at most this for every vehicle count as the same, m2/s2.
+        ends: result of ``find_equilibria``.
+        harm_count: count of harm to compare, ``first`` or ``total``.
+        tolerance: two equilibria count as equal if the harm of every vehicle differs by at most this, m2/s2.
 
     """
     converged = np.stack([each.converged for each in ends.values()])
@@ -230,16 +233,17 @@ def best_joint_harm(
     seed: int = 0,
     threads: int = 1,
 ) -> dict[HarmCount, Floats]:
-    """Return what each vehicle bears where the learners together do the least harm known, count -> [n, N] m2/s2.
+    """Return the harm of each vehicle in the joint optimum: count of harm -> [n, N] m2/s2.
 
-    That is the best of a joint search (``best_harm``) and of all ``ends``, so that no equilibrium among them is better.
+    The joint optimum is the least known harm of the line that the learners can do together. It is the better of a joint
+    search (``best_harm``) and the equilibria ``ends``. No equilibrium of ``ends`` does less harm.
 
     Args:
-        scenario: the scenario of the worlds.
-        worlds: the worlds at t = 0, [n].
-        ends: equilibria of the same learners and worlds, under any objectives.
-        harm_count: harm of the line that is to be least: of each pair's ``first`` impact, or ``total``.
-        budget: candidates of the joint search per world.
+        scenario: scenario of the worlds.
+        worlds: the n worlds at the alert.
+        ends: equilibria of the same learners in the same worlds, for any objectives.
+        harm_count: count of the line's harm that is minimised: ``first`` (first impact of each pair) or ``total``.
+        budget: number of candidates that the joint search tries per world.
         seed: seed of the joint search.
         threads: number of threads.
 
@@ -255,14 +259,14 @@ def best_joint_harm(
 
 
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
-    """Return the mean harm of the line in equilibrium, divided by that of the joint optimum, with its interval.
+    """Return (mean harm of the line in equilibrium) / (mean harm of the line in the joint optimum), with its interval.
 
-    With ``Spread.worst`` it is the price of anarchy, with ``Spread.best`` the price of stability. None if the joint
-    optimum does no harm in any world.
+    For ``Spread.worst`` this ratio is called the price of anarchy, for ``Spread.best`` the price of stability. Returns
+    None if the joint optimum does no harm in any world.
 
     Args:
-        borne: [n, N] harm that each vehicle bears in equilibrium, m2/s2; worlds with NaN (none converged) are left out.
-        optimum: [n, N] harm that each vehicle bears in the joint optimum, m2/s2.
+        borne: [n, N] harm of each vehicle in equilibrium, m2/s2. Worlds with NaN (no equilibrium) are left out.
+        optimum: [n, N] harm of each vehicle in the joint optimum, m2/s2.
 
     """
     rows = np.isfinite(borne).all(axis=1)

@@ -1,10 +1,9 @@
-"""Figures of an ablation: harm per level, change by each step, and who pays."""
+"""Figures of an ablation: harm at each level, change of harm between levels, and change for each vehicle."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator
 
 from ethbrake_marl.envs.rendering import COLOURS
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.extensions.cooperation.curves import algorithms, sweep_figures, swept_axis, with_intervals
+from ethbrake_marl.extensions.cooperation.curves import Json, algorithms, sweep_figures, swept_axis, with_intervals
 from ethbrake_marl.extensions.report.style import (
     ALARM,
     GREY,
@@ -30,25 +29,25 @@ from ethbrake_marl.extensions.report.style import (
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
-LINEAR = 0.1  # m2/s2; axes are linear up to this harm and logarithmic beyond, because harm varies by a factor of 100
+LINEAR = 0.1  # m2/s2; axes are linear below this harm and logarithmic above it, because harm varies by a factor of 100
 
-_LEAST_IN = 2.6  # least height of a figure, for titles and caption
+_LEAST_IN = 2.6  # least height of a figure, which leaves space for titles and caption (inches)
 
 _LEAST_TICKS = 4
 
-_BESIDE = 0.42  # offset of a level with a worse channel, to the right of its level
-
-Json = dict[str, Any]
+_BESIDE = 0.42  # distance at which a level with a worse channel is drawn to the right of its level
 
 
 def ablation_figures(results: Json, caption: str) -> list[Figure]:
-    """Return three figures of an ablation: harm per level, change from level to level, and change for each vehicle.
+    """Return the three figures of an ablation, or the two figures of a sweep (``sweep_figures``).
 
-    Of a sweep, return its two figures (``sweep_figures``).
-
-    ``results`` is the content of ``ablation.json``; ``caption`` is the text below each figure.
-
+    The three figures show the harm at each level, the change of harm between levels, and the change for each vehicle.
     Red text above a figure names the levels that are not trained enough.
+
+    Args:
+        results: content of ``ablation.json``.
+        caption: text below each figure.
+
     """
     if swept_axis(results) is None:
         figures = [_harm_curve(results, caption), _change_figure(results, caption), _who_pays(results, caption)]
@@ -66,10 +65,9 @@ def ablation_figures(results: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curve(results: Json, caption: str) -> Figure:
-    """Draw first-impact and total harm at each level, between full braking and the joint optimum.
+    """Draw first-impact and total harm at each level, with full braking and the joint optimum for comparison.
 
-    All values are over the worlds in which the joint optimum was searched. ``results`` is the content of
-    ``ablation.json``; ``caption`` is the text below.
+    All values are means over the worlds in which the joint optimum was searched.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     ladder = list(dict.fromkeys(level["level"] for level in results["levels"] if level["clear"] is None))
@@ -79,7 +77,7 @@ def _harm_curve(results: Json, caption: str) -> Figure:
             ("best_known", "joint optimum", COLOURS[3]),
         ):
             shown = [level for level in results["levels"] if level[harm_count]["searched"][key] is not None]
-            for number, level in enumerate(shown):  # short lines; even shorter lines for worse channels
+            for number, level in enumerate(shown):  # short horizontal lines, shorter for levels with a worse channel
                 x, half = _place(level, ladder), 0.3 if level["clear"] is None else 0.07
                 value, name = level[harm_count]["searched"][key]["value"], "" if number else label
                 axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
@@ -92,14 +90,14 @@ def _harm_curve(results: Json, caption: str) -> Figure:
         axes.set_ylim(0.0, (1.5 if axes.get_yscale() == "symlog" else 1.1) * axes.get_ylim()[1])
         name_axes(axes, TITLES[harm_count])
     worlds = results["levels"][0]["first"]["searched"]["worlds"]
-    told = f"{caption} All of this figure: the first {count_of(worlds, 'world')}."
-    return finish(figure, told, panels[0], columns=4, fontsize=8.5)
+    text = f"{caption} All values of this figure: means over the first {count_of(worlds, 'world')}."
+    return finish(figure, text, panels[0], columns=4, fontsize=8.5)
 
 
 def _change_figure(results: Json, caption: str) -> Figure:
-    """Draw the change of harm from level to level, and by each worse V2X channel, with intervals; left: less harm.
+    """Draw the change of harm from level to level, and for each worse V2X channel, with 95 % intervals.
 
-    ``results`` is the content of ``ablation.json``; ``caption`` is the text below.
+    Marks to the left of 0 mean less harm.
     """
     changes = results["steps"] + results["channels"]
     figure, panels = new_panels((10.5, max(_LEAST_IN, 1.6 + 0.6 * len(changes))), columns=2, sharey=True)
@@ -128,10 +126,7 @@ def _change_figure(results: Json, caption: str) -> Figure:
 
 
 def _who_pays(results: Json, caption: str) -> Figure:
-    """Draw the change of each vehicle's harm from level to level as a matrix; blue is less harm.
-
-    ``results`` is the content of ``ablation.json``; ``caption`` is the text below.
-    """
+    """Draw the change of each vehicle's harm from level to level as a coloured matrix; blue means less harm."""
     changes = results["steps"] + results["channels"]
     figure = new_figure(10.5, max(_LEAST_IN, 1.8 + 0.42 * len(changes)))
     grids = {
@@ -157,9 +152,9 @@ def _who_pays(results: Json, caption: str) -> Figure:
 
 
 def signed_ticks(low: float, high: float) -> list[float]:
-    """Return a few round numbers, and 0, between ``low`` and ``high`` as ticks.
+    """Return ticks for an axis from ``low`` to ``high``: 0 and a few round numbers.
 
-    They are for an axis that is linear between -0.1 and 0.1 and logarithmic beyond (``LINEAR``).
+    The axis is linear between -0.1 and 0.1 (``LINEAR``), and logarithmic outside this range.
     """
     first = -1 if max(-low, high) > LINEAR else -3
     ticks: list[float] = []
@@ -174,7 +169,7 @@ def signed_ticks(low: float, high: float) -> list[float]:
 def _place(level: Json, ladder: Sequence[str]) -> float:
     """Return the x position of a level: its index in ``ladder``, the names of the compared levels in order.
 
-    A level with a worse V2X channel stands to the right of the level that it varies.
+    A level with a worse V2X channel is drawn to the right of the same level with the better channel.
     """
     return ladder.index(level["clear"] or level["level"]) + (0.0 if level["clear"] is None else _BESIDE)
 
@@ -182,17 +177,15 @@ def _place(level: Json, ladder: Sequence[str]) -> float:
 def _reached(
     axes: Axes, levels: Sequence[Json], ladder: Sequence[str], harm_count: HarmCount, algorithm: str, number: int
 ) -> None:
-    """Draw the harm that one algorithm reaches at each level, and over worse V2X channels beside it.
-
-    Each training seed is a dot.
+    """Draw the harm that one algorithm reaches at each level, with a dot for each training seed.
 
     Args:
         axes: axes to draw on.
         levels: results of all levels, from ``ablation.json``.
-        ladder: names of the levels, in order of their x positions.
-        harm_count: harm to draw.
+        ladder: names of the levels, in the order of their x positions.
+        harm_count: count of harm to draw.
         algorithm: name of the algorithm.
-        number: index of the algorithm, which chooses colour and offset.
+        number: index of the algorithm, which determines colour and offset.
 
     """
     own = [level for level in levels if level["algorithm"] in (None, algorithm)]
@@ -202,7 +195,7 @@ def _reached(
     shielded = [level for level in own if level["first"].get("shielded") is not None]
     for some, key, beside, look in (
         (steps, steps, 0.0, {**style, "label": algorithm}),
-        # the same teams behind the step shield, as crosses to the left
+        # results of the same teams with the step shield are crosses, to the left of the marks
         (
             shielded, [{harm_count: level[harm_count]["shielded"]} for level in shielded], -0.12,
             {"fmt": "x", "color": COLOURS[2], "label": f"{algorithm}, shielded"},
@@ -224,12 +217,12 @@ def _reached(
 
 
 def _short(name: str) -> str:
-    """Return the name of a level without ``cooperation-``, in two lines: ``2`` and ``paper``."""
+    """Return the name of a level for an axis: without ``cooperation-``, and on two lines (``2`` and ``paper``)."""
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 
 def _of_changes(results: Json) -> list[str]:
-    """Return a label ``LEVEL → LEVEL`` for each change between levels, then for each worse V2X channel."""
+    """Return a label ``LEVEL → LEVEL`` for each change between levels, and then for each worse V2X channel."""
     changes, several = results["steps"] + results["channels"], len(algorithms(results)) > 1
     words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
     return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]

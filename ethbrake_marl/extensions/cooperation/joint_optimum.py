@@ -1,8 +1,8 @@
-"""Joint optimum of every level: the least known harm that its learners can achieve together, world by world.
+"""Joint optimum of each level: in each world, the least known harm that the learners of the level can do together.
 
-It depends on the worlds, on the learners and on the scripts of the others. It does not depend on what anyone knows or
-on the objectives, so levels that differ only in information or objectives share one search. A result of one level also
-counts for every other level whose learners can do the same.
+The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles. It does not depend on
+information or objectives. Levels that differ only in information or objectives therefore share one search. The result
+of one level is also used for every other level whose learners can give the same commands.
 """
 
 from __future__ import annotations
@@ -44,20 +44,23 @@ from ethbrake_marl.training.training import Training
 
 @dataclass(frozen=True, slots=True)
 class LevelOptimum:
-    """What is known about the joint optimum of one level: a search result, and trained teams that may be better."""
+    """Candidates for the joint optimum of one level: a search result, and trained teams, which may be better."""
 
     level: Level  # the level
-    worlds: Worlds  # worlds in which the optimum was searched
-    searched: BestHarmTable  # best harm and profiles that the search found in these worlds
-    teams: tuple[Team, ...]  # trained teams of the level, of all recipes and seeds
+    worlds: Worlds  # worlds in which the joint optimum was searched
+    searched: BestHarmTable  # best harm and profiles from the search in these worlds
+    teams: tuple[Team, ...]  # trained teams of the level, for all recipes and seeds
 
 
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
-    """Return the searches for a joint optimum that are needed, one for all levels with the same optimum.
+    """Return the searches for joint optima that an ablation needs, as (first level, worlds, all levels).
 
-    Levels have the same optimum if worlds and learners are alike for the search. Each item is: the first such level,
-    the worlds to search, and all such levels. Levels without learners need no search. ``samples`` holds the worlds of
-    each level of ``plan``, in the same order.
+    All levels with the same search problem share one search. Levels without learners need no search.
+
+    Args:
+        plan: settings of the ablation.
+        samples: worlds of each level of the plan, in the same order.
+
     """
     by_content: dict[bytes, tuple[Level, Sample, list[Level]]] = {}
     rows = np.arange(plan.search_episodes)
@@ -70,15 +73,15 @@ def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample
 
 
 def search_all(plan: Plan, samples: Sequence[Sample], jobs: int, tell: OnProgress) -> dict[str, BestHarmTable]:
-    """Search the joint optimum of every level with learners, and return the results by the level's name.
+    """Search the joint optimum of every level with learners; return the results by the name of the level.
 
-    Parts that were searched before are read from the plan's folder.
+    Results of earlier searches are read from the folder of the ablation.
 
     Args:
         plan: settings of the ablation.
-        samples: worlds of each level of the plan.
+        samples: worlds of each level of the plan, in the same order.
         jobs: number of threads.
-        tell: called with the progress.
+        tell: function that receives the progress.
 
     """
     tables: dict[str, BestHarmTable] = {}
@@ -100,12 +103,12 @@ def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 
 def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmCount, Floats]:
-    """Return the least known harm [n] in each world of a level, under each count of harm (m2/s2).
+    """Return the least known harm in each world of a level: count of harm -> [n] m2/s2.
 
     Args:
         own: the level, with the result of its search and its trained teams.
-        answers: the same for all levels, including ``own``. A result of another level counts only in worlds in which
-            the learners of ``own`` can brake in the same way.
+        answers: all levels with their results, including ``own``. The result of another level is used in the worlds in
+            which the learners of ``own`` can give the same commands.
 
     """
     best = {harm_count: np.full(own.worlds.n, np.inf) for harm_count in HARM_COUNTS}
@@ -119,11 +122,12 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 
 
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
-    """Return in which worlds, [n] bool, the learners of ``own`` can do whatever the learners of ``other`` do.
+    """Return for each world, [n] bool, whether the learners of ``own`` can imitate the learners of ``other``.
 
-    Conditions: ``own`` has the same learners or more, the other vehicles have the same scripts, the line is the same (a
-    sweep may change it), latencies are equal, and at every decision time of ``other`` the learners of ``own`` decide
-    too. ``other`` may lack an obstacle, because its result is driven again with the obstacle.
+    Imitation needs five conditions. The learners of ``other`` are also learners in ``own``. The scripts of ``own``
+    are also scripts in ``other``. The lines of vehicles are the same. The latencies are equal. The decision times
+    of ``other`` are also decision times of ``own``. If only ``own`` has an obstacle, the profiles are simulated
+    again with it.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -140,9 +144,9 @@ def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
 
 
 def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[HarmCount, Floats]]:
-    """Yield the harm by the search result and by every team of ``other`` in the worlds ``rows`` of ``own``.
+    """Yield the harm of each search result and each team of ``other`` in the worlds ``rows`` of ``own``.
 
-    Each item maps a count of harm to the harm [rows] (m2/s2).
+    Each result is a mapping: count of harm -> [rows] harm (m2/s2).
     """
     scenario, task = other.level.scenario, Task(other.level.scenario, other.level.scenario.learners)
     worlds = replace(other.worlds, obstacle_gap_m=own.worlds.obstacle_gap_m).take(rows)
@@ -157,29 +161,34 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm of several trainings of one level (or of its scripts, as a single seed) on the same worlds."""
+    """Harm of the trainings of one level in the same worlds. For a level of scripts, there is one seed."""
 
     world: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds] harm of the whole line (m2/s2)
     vehicle: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds, N] harm of each vehicle (m2/s2)
     collided: Bools  # [seeds, worlds] whether at least one impact happened
-    policies: tuple[Mapping[str, str], ...] = ()  # for each seed: vehicle -> SHA-256 of its policy's manifest
-    ledgers: tuple[Ledger, ...] = ()  # harm of all impacts, one ledger for each seed
+    policies: tuple[Mapping[str, str], ...] = ()  # for each seed: vehicle -> SHA-256 of the manifest of its policy
+    ledgers: tuple[Ledger, ...] = ()  # one ledger for each seed, with the harm of all impacts
 
 
 class Goal(NamedTuple):
-    """The quantity that the trainings of a level minimise: its mean for the trained policies and for full braking."""
+    """Mean of the quantity that the trainings of a level minimise, for the trained policies and for full braking."""
 
     name: str  # name of the quantity: ``objective``, ``first-impact harm`` or ``total harm``
-    reached: float  # mean over seeds, worlds and learners, driven by the trained policies
-    full_brake: float  # the same mean if all vehicles brake fully
+    reached: float  # mean over seeds, worlds and learners with the trained policies
+    full_brake: float  # mean over worlds and learners if all vehicles brake fully
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """Return the quantity that ``training`` minimises, with its means.
+        """Return the means of the quantity that a training minimises.
 
-        It is the harm of the whole line, or, if recipe or scenario give the learners objectives of their own, the mean
-        of these. ``reached`` and ``full_brake`` are the harms by the trained policies and by full braking of all
-        vehicles.
+        The quantity is the objective of the learners if the recipe or the scenario has objectives, else the harm of the
+        whole line.
+
+        Args:
+            training: a training of the level.
+            reached: harm with the trained policies.
+            full_brake: harm if all vehicles brake fully.
+
         """
         reward, scenario = training.recipe.reward, training.scenario
         objectives = reward.settled(scenario.objective, scenario.vehicles)[1]
@@ -194,40 +203,40 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether full braking by all vehicles does better than the trained policies."""
+        """Whether the trained policies do worse than full braking of all vehicles."""
         return self.reached > self.full_brake + TOLERANCE
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Results of one level of cooperation with one training algorithm on the same worlds as all other levels."""
+    """Results of one level of cooperation with one training algorithm, in the same worlds as all other levels."""
 
     level: Level  # the level
     algorithm: str | None  # name of the algorithm (recipe and scheme); None: the level has no learner
-    reached: Harms  # harm by the trained policies (or by the scripts)
-    full_brake: Harms  # harm if all vehicles brake fully, whatever their roles
+    reached: Harms  # harm with the trained policies, or with the scripts if the level has no learner
+    full_brake: Harms  # harm if all vehicles brake fully instead
     # Count of harm -> [1, search_episodes] least known harm (m2/s2); None: the level has no learner.
     best: dict[HarmCount, Floats] | None
     identity: Mapping[str, Any] = field(default_factory=dict)  # hashes of worlds and scenario, and versions
-    # Count of harm -> results [seeds, worlds] behind a shield that bounds that harm; None: no shield requested.
+    # Count of harm -> results [seeds, worlds] with a shield that bounds this harm; None: without shields.
     shielded: dict[HarmCount, Shielded] | None = None
-    goal: Goal | None = None  # what the training minimises; None: the level has no learner
+    goal: Goal | None = None  # mean of the quantity that the training minimises; None: the level has no learner
     clusters: NDArray[np.str_] | None = None  # name of each world's cluster (``clusters_of``); None: no recordings
 
 
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
-    """Let the trained policies of all levels drive the same worlds, and search for the joint optimum of each level.
+    """Evaluate the trained policies of all levels in the same worlds, and search the joint optimum of each level.
 
-    Parts of a search that exist already are reused. Where a policy does better than the search, its harm becomes the
-    best known harm of that world.
+    Results of earlier searches are reused. If a policy does less harm in a world than the search, its harm is the best
+    known harm of this world.
 
     Args:
-        plan: settings of the ablation, whose trainings have finished.
+        plan: settings of the ablation. All its trainings must be finished.
         jobs: number of threads of the search.
-        tell: called with the progress; None: silent.
+        tell: function that receives the progress; None: the progress is not reported.
 
-    Returns the results level by level in the plan's order, algorithm by algorithm. Raises the exceptions of loading
-    teams and of ``common_worlds`` before any long work.
+    Returns one result for each level and algorithm, in the order of the plan. Raises the exceptions of ``load_team``
+    and ``common_worlds`` before any long work.
 
     """
     say = tell or (lambda progress: None)
@@ -275,10 +284,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 
 
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
-    """Let each of ``drivers`` (agents or teams) drive the worlds of ``sample``, and return their harm.
-
-    Each of them counts as one seed.
-    """
+    """Let several agents or teams drive in the worlds of ``sample``; return their harm, with one seed for each."""
     outcomes = []
     for driver in drivers:
         result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()

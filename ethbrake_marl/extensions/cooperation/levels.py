@@ -1,8 +1,8 @@
-"""The levels and the plan of an ablation.
+"""Levels and settings of an ablation.
 
-An ablation compares *levels*: scenarios with the same vehicles, gaps and speeds. They differ in who learns, who has
-which information, whose harm counts, and whether an obstacle stands ahead. A sweep takes one level and sets one key of
-its scenario, whichever it is, to several numbers; each number makes a level.
+An ablation compares *levels*: scenarios with the same vehicles, gaps and speeds. Levels may differ in who learns, who
+has which information, whose harm counts, and whether an obstacle is ahead. A *sweep* compares copies of one level that
+differ in the value of one key.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.spec import split_names
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput, check_whole_number, count_of
 from ethbrake_marl.evaluation.identity import LIST_SEED
 from ethbrake_marl.evaluation.trial import load_runnable
 from ethbrake_marl.extensions.cooperation.sweep import Swept
@@ -41,7 +41,7 @@ LADDER = (
 
 STANDARD = (*LADDER, "cooperation-2-blocked")
 
-SWEPT = "cooperation-3-pair"  # the level that is swept if none is named
+SWEPT = "cooperation-3-pair"  # default level of a sweep
 
 Json = dict[str, Any]
 
@@ -61,37 +61,37 @@ _BUT_CHANNEL = {"name", "title", "description", "source", "v2x"}
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """One level of cooperation in an ablation: a scenario, compared with others on the same lines of vehicles."""
+    """One level of cooperation in an ablation: a scenario that is compared with other scenarios."""
 
     scenario: Scenario
-    clear: str | None = None  # name of the level that differs only in ``v2x``; None: this level is on the ladder
-    swept: Swept | None = None  # the swept key at this level's value; None: no sweep
+    clear: str | None = None  # name of an earlier level that differs only in ``v2x``; None: there is no such level
+    swept: Swept | None = None  # the swept key with this level's value; None: no sweep
 
     @property
     def name(self) -> str:
-        """The scenario's name; in a sweep with the value: ``cooperation-3-pair-social-15``."""
+        """Name of the scenario; in a sweep followed by the value, such as ``cooperation-3-pair-social-15``."""
         return self.scenario.name if self.swept is None else f"{self.scenario.name}-{self.swept.label}"
 
     @property
     def same_lines(self) -> bool:
-        """Whether world k is the same line as in the levels beside it; False in a sweep that changes the lines."""
+        """Whether world k has the same line of vehicles at all levels; False for a sweep of a key of the vehicles."""
         return self.swept is None or self.swept.same_lines
 
     @property
     def columns(self) -> Json:
-        """Columns of tables that only a sweep has."""
+        """Entries for tables on the swept value; empty without a sweep."""
         return {} if self.swept is None else self.swept.columns
 
 
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
-    """Load the levels of an ablation, in this order.
+    """Load the levels of an ablation.
 
-    A level that differs from an earlier one only in ``v2x`` is compared with that level (``Level.clear``). Each of the
-    other levels is compared with the one before; they form the *ladder*.
+    A level that differs only in ``v2x`` from an earlier level is compared with this earlier level (``Level.clear``).
+    All other levels form the *ladder*: each is compared with the previous one.
 
     Args:
-        names: names or paths of scenarios.
-        settings: settings ``KEY=VALUE`` that override keys in each of them.
+        names: names or paths of scenarios, in the order of the comparison.
+        settings: settings ``KEY=VALUE`` that override keys of every scenario.
 
     Raises ``InvalidInput`` for fewer than two levels or a repeated level, and the exceptions of ``load_runnable``.
 
@@ -100,7 +100,7 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
     for name in names:
         scenario = load_runnable(name, settings)
         if any(level.name == scenario.name for level in levels):
-            raise InvalidInput(f"levels: {scenario.name!r} is given twice")
+            raise InvalidInput(f"levels: {scenario.name!r} is given twice; give each level once")
         fields = scenario.model_dump(mode="json", exclude=_BUT_CHANNEL)
         same = [
             level.name
@@ -111,45 +111,62 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
         ]
         levels.append(Level(scenario, same[0] if same else None))
     if len(levels) < 2:
-        raise InvalidInput(f"levels: {len(levels)} given; at least two are needed to compare")
+        raise InvalidInput(f"levels: only {count_of(len(levels), 'level')}; give at least two levels to compare")
     return levels
 
 
 def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: Sequence[TrainingRecipe]) -> list[Level]:
-    """Return one level for each value of a sweep, in ascending order: the level ``name`` with ``settings``.
+    """Return one level for each value of a sweep, in ascending order of the values.
 
-    Raises ``InvalidInput`` for a key that ``settings`` set too, that no scenario has, that a recipe replaces, or with
-    which levels could not be compared; and the exceptions of ``Swept.parse`` and ``load_runnable``.
+    Args:
+        name: name or path of the scenario.
+        sweep: swept key and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``.
+        settings: settings ``KEY=VALUE`` that override other keys of the scenario.
+        recipes: recipes of the ablation.
+
+    Raises ``InvalidInput`` if the key is not a key of a scenario; if ``settings`` or a recipe override it; or if levels
+    that differ in it cannot be compared. Also raises the exceptions of ``Swept.parse`` and ``load_runnable``.
+
     """
     values = Swept.parse(sweep)
     scenario = read_settings([values[0].setting], recipes).scenario
     if not scenario:
         key = values[0].key
-        raise InvalidInput(f"--sweep {key}: is a recipe's; a sweep varies a scenario (recipes: ethbrake study sweep)")
+        raise InvalidInput(
+            f"--sweep {key}: is a key of a recipe, but must be a key of a scenario; to vary a recipe, use"
+            " ethbrake study sweep"
+        )
     key, path = scenario[0].key, scenario[0].path
     if path[0] in _LINE:
         raise InvalidInput(
-            f"--sweep {key}: levels with different {path[0]} cannot be compared, vehicle by vehicle and time by time;"
-            f" give each a folder of its own (--set {path[0]}=..., --output)"
+            f"--sweep {key}: levels with different {path[0]} cannot be compared; run one ablation for each value of"
+            f" {path[0]} (--set {path[0]}=..., --output)"
         )
     if any(each.path[: len(path)] == path for each in settings):
-        raise InvalidInput(f"--sweep {key}: --set {key} has no place beside it; leave one of them out")
+        raise InvalidInput(f"--sweep {key}: --set changes the same key; leave out --sweep or --set")
     for recipe in recipes if path[0] == "objective" else ():
         if recipe.reward.objective is not None:
             raise InvalidInput(
-                f"--sweep {key}: recipe {recipe.name!r} has an objective of its own (reward.objective), so that the"
-                " scenario's changes nothing; give a recipe without"
+                f"--sweep {key}: has no effect, because recipe {recipe.name!r} has its own objective"
+                " (reward.objective); give a recipe without an objective"
             )
     each_value = [value._replace(key=key) for value in values]
     return [Level(load_runnable(name, [*settings, value.override]), swept=value) for value in each_value]
 
 
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sample]:
-    """Draw ``episodes`` worlds from ``seed`` for each level; world k is the same line of vehicles in all levels.
+    """Draw worlds for each level; world k has the same line of vehicles at all levels.
 
-    Latencies may differ where ``v2x`` differs, and an obstacle ahead may be present or not. In a sweep of any other
-    key, world k is drawn with the same random numbers, but the key changes it. Raises ``InvalidInput`` with the level
-    and the quantity that differs, if another quantity differs.
+    Latencies may differ between levels that differ in ``v2x``. An obstacle may be ahead at some levels only. In a sweep
+    of a key of the vehicles, world k is drawn with the same random numbers at all levels, but the vehicles differ.
+
+    Args:
+        levels: the levels.
+        episodes: number of worlds.
+        seed: seed of the worlds.
+
+    Raises ``InvalidInput`` with the level and the quantity if levels differ in another quantity.
+
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
     if not levels[0].same_lines:
@@ -157,8 +174,8 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sam
     for k, level in enumerate(levels):
         if level.scenario.observation != levels[0].scenario.observation:
             raise InvalidInput(
-                f"level {level.name!r}: its observation differs from that of {levels[0].name!r}, so that what it gains"
-                f" would not be cooperation's; levels may differ in {_MAY_DIFFER}"
+                f"level {level.name!r}: its observation differs from the observation of level {levels[0].name!r};"
+                f" levels may differ in {_MAY_DIFFER} only"
             )
         _check_same(levels[0], samples[0], level, samples[k], (*_LINE, *WORLD, *VEHICLE))
         clear = next(j for j in range(k + 1) if levels[j].scenario.v2x == level.scenario.v2x)
@@ -173,15 +190,15 @@ def _check_same(one: Level, first: Sample, other: Level, sample: Sample, names: 
         if rows.size:
             here, there = (", ".join(f"{each:g}" for each in np.ravel(v[rows[0]])) for v in (others, values))
             raise InvalidInput(
-                f"level {other.name!r}: its {name} differs from that of {one.name!r} ({here}; there {there}); levels"
-                f" are compared on the same lines and may differ in {_MAY_DIFFER}, so change or leave out one of them"
+                f"level {other.name!r}: {name} is {here}, but {there} at level {one.name!r}; levels may differ in"
+                f" {_MAY_DIFFER} only: change or leave out one of the two levels"
             )
 
 
 def _values(name: str, level: Level, sample: Sample) -> Floats:
-    """Return the quantity called ``name``, such as ``gaps_m``, in the worlds of ``sample``: one row per world.
+    """Return the quantity ``name``, such as ``gaps_m``, in the worlds of ``sample``, with one row per world.
 
-    A number of the level's whole scenario, such as ``time_step_s``, gives a single row.
+    For a key of the scenario, such as ``time_step_s``, the result has a single row.
     """
     if name in _LINE:
         return np.array([getattr(level.scenario, name)], np.float64)
@@ -189,7 +206,7 @@ def _values(name: str, level: Level, sample: Sample) -> Floats:
 
 
 def quantity(name: str, worlds: Worlds) -> Floats:
-    """Return a field of the worlds or of their vehicles, [n, ...]."""
+    """Return the field ``name`` of the worlds or of their vehicles, [n, ...]."""
     values: Floats = getattr(worlds if hasattr(worlds, name) else worlds.vehicles, name)
     return values
 
@@ -205,28 +222,28 @@ _FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_ep
 class Plan:
     """Settings of an ablation, a comparison of trainings at several levels of cooperation."""
 
-    levels: tuple[Level, ...]  # the compared levels, in order
-    recipes: tuple[TrainingRecipe, ...]  # how to train; each recipe names its scheme for several learners
-    seeds: int  # trainings per level and recipe
-    steps_per_learner: int  # decisions of each learner in a training
-    episodes: int  # number of common worlds
-    list_seed: int  # seed of the common worlds
-    search_episodes: int  # number of these worlds, from the first on, in which the joint optimum is searched
-    budget: int  # candidate profiles that the search tries per world and count of harm
+    levels: tuple[Level, ...]  # levels to compare, in order
+    recipes: tuple[TrainingRecipe, ...]  # training recipes; each has its scheme for several learners
+    seeds: int  # number of trainings (seeds) per level and recipe
+    steps_per_learner: int  # number of decisions of each learner in a training
+    episodes: int  # number of worlds for the comparison
+    list_seed: int  # seed of these worlds
+    search_episodes: int  # number of these worlds, counted from the first, in which the joint optimum is searched
+    budget: int  # number of candidate profiles that the search tries per world and count of harm
     folder: Path  # folder of all results
-    noted: tuple[str, ...] = ()  # overrides of scenarios and recipes, for ``config.json``
-    shield: str | None = None  # "step": everything also drives behind the step shield
-    sweep: str | None = None  # as given: objective=social:0..90:15; None: the levels are scenarios of their own
+    noted: tuple[str, ...] = ()  # overrides of scenarios and recipes, which are recorded in ``config.json``
+    shield: str | None = None  # "step": all teams are also evaluated with the step shield
+    sweep: str | None = None  # the sweep as text, such as objective=social:0..90:15; None: no sweep
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Names of the compared algorithms, ``RECIPE-SCHEME`` each."""
+        """Names of the compared algorithms, each in the form ``RECIPE-SCHEME``."""
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Yield all trainings as (level, name of the algorithm, training), seed by seed.
+        """Yield all trainings as (level, name of the algorithm, training): all levels with seed 0, then with seed 1 ...
 
-        So a first result over all levels exists early. Levels without learners are omitted.
+        Levels without learners are left out.
         """
         for seed in range(self.seeds):
             for recipe in self.recipes:
@@ -235,9 +252,9 @@ class Plan:
                         yield level, algorithm(recipe), self.training(level, recipe, seed)
 
     def training(self, level: Level, recipe: TrainingRecipe, seed: int) -> TrainingJob:
-        """Return the training of one recipe at one level with one seed, with its folder.
+        """Return the training of one recipe at one level with one seed.
 
-        Raises ``InvalidInput`` if recipe and level do not fit together.
+        Raises ``InvalidInput`` if the recipe cannot train at this level.
         """
         learners = len(level.scenario.learners)
         changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
@@ -249,7 +266,7 @@ class Plan:
         return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, noted)
 
     def settings(self) -> dict[str, Any]:
-        """Return all settings that affect the results as plain data: levels, recipes, numbers and the shield."""
+        """Return all settings that affect the results, as a mapping: levels, recipes, numbers and the shield."""
         numbers = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
         return {
             "levels": [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels],
@@ -259,23 +276,20 @@ class Plan:
         }
 
     def study_folder(self) -> StudyFolder:
-        """Return the object that guards the ablation's folder.
-
-        It refuses a folder with the results of an ablation with other settings.
-        """
-        advice = f"give another folder (--output), or, to use its trainings, a copy of it without {SETTINGS}"
+        """Return the folder of the ablation, which refuses results of an ablation with other settings."""
+        advice = f"give another folder (--output); to reuse the trainings, give a copy of the folder without {SETTINGS}"
         written = (*FIGURES, *SWEEP_FIGURES, *(f"ablation.{ending}" for ending in ("html", "md", "csv", "json")))
         return StudyFolder(self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=written)
 
     def optimum_folder(self, level: Level) -> Path:
-        """Return the path of the folder with the results of a level's search for the joint optimum."""
+        """Return the path of the folder in which the search for a level's joint optimum is stored."""
         return self.folder / "optimum" / level.name
 
 
 def with_scheme(recipe: TrainingRecipe, scheme: str | None = None) -> TrainingRecipe:
     """Return the recipe with a scheme for several learners.
 
-    This is ``scheme``, or if it is None the recipe's own, or else ``shared``.
+    The scheme is ``scheme`` if it is not None, else the scheme of the recipe if it has one, else ``shared``.
     """
     return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
@@ -294,15 +308,15 @@ def plan_ablation(
     tell: Callable[[str], None] | None = None,
     **given: Any,
 ) -> Plan:
-    """Return the plan of an ablation, or of a sweep of one level, from the options of its command.
+    """Return the settings of an ablation from the options of its command.
 
     Args:
-        levels: names or paths of scenarios with commas between them; None: the shipped levels.
-        recipes: names or paths of recipes with commas between them.
-        settings: settings ``KEY=VALUE`` of scenarios and recipes; None: none.
-        sweep: key of a scenario and its numbers, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
+        levels: names or paths of scenarios, separated by commas; None: the shipped levels.
+        recipes: names or paths of recipes, separated by commas.
+        settings: settings ``KEY=VALUE`` of scenarios and recipes; None: no settings.
+        sweep: key of a scenario and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
         quick: use few seeds, worlds and decisions by default.
-        tell: called with notes about settings that do not fit together.
+        tell: function that receives notes on settings that do not fit together.
         given: other fields of ``Plan``; None means the default.
 
     Raises ``InvalidInput`` for recipes with the same name, numbers below 1, an unknown shield, levels without any
@@ -320,7 +334,7 @@ def plan_ablation(
     elif len(names) == 1:
         compared = sweep_levels(names[0], sweep, changed.scenario, changed_recipes)
     else:
-        raise InvalidInput(f"levels: {len(names)} given; a sweep makes its levels out of one")
+        raise InvalidInput(f"levels: {len(names)} levels; a sweep needs exactly one level")
     plan = Plan(
         levels=tuple(compared),
         recipes=changed_recipes,
@@ -332,15 +346,18 @@ def plan_ablation(
         check_whole_number(name, getattr(plan, name), 1)
     called = [recipe.name for recipe in loaded]
     if len(set(called)) < len(called):
-        raise InvalidInput(f"recipes {', '.join(called)}: give at least one, each with a name of its own")
+        raise InvalidInput(f"recipes {', '.join(called)}: two recipes have the same name; give each recipe once")
     if plan.shield not in (None, "step"):
-        raise InvalidInput(f"shield {plan.shield!r}: must be step; episode and robust shield one vehicle")
+        raise InvalidInput(
+            f"shield {plan.shield!r}: must be step, because the other shields can control one vehicle only"
+        )
     if plan.search_episodes > plan.episodes:
         raise InvalidInput(
-            f"search-episodes {plan.search_episodes}: must be at most the {plan.episodes} worlds of --episodes"
+            f"search-episodes = {plan.search_episodes}: must be at most the number of worlds, episodes ="
+            f" {plan.episodes}"
         )
     if not any(level.scenario.learners for level in plan.levels):
-        raise InvalidInput("levels: nobody learns in any of them; give at least one with a learner")
+        raise InvalidInput("levels: no level has a learner; give at least one level with a learner")
     StudyFolder(plan.folder, "an ablation").check()
     samples = common_worlds(plan.levels, 5, plan.list_seed)
     for level, sample in zip(plan.levels, samples, strict=True) if plan.shield is not None else ():
@@ -349,7 +366,7 @@ def plan_ablation(
     return plan
 
 
-TOLERANCE = 1e-6  # m2/s2; a vehicle is worse off if its harm rises by more than this
+TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by more than this
 
 HARM = {"first": "first-impact harm", "total": "total harm"}
 
@@ -362,7 +379,7 @@ FIGURES = {  # file of each figure of ``ablation_figures``: its title and its de
     "ablation-who-pays.png": ("Who pays", "Change of the harm of each vehicle, under both counts."),
 }
 
-SWEEP_FIGURES = {  # the same of the figures of a sweep
+SWEEP_FIGURES = {  # file of each figure of a sweep: its title and its description
     "ablation.png": (
         "Harm against the number",
         "Both harms at each value, between full braking and the joint optimum.",

@@ -1,4 +1,4 @@
-"""Files of an ablation: tables, HTML page, CSV and JSON."""
+"""Output files of an ablation: HTML page, tables as Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 from ethbrake_marl.training.run_folder import RunDirectory
 from ethbrake_marl.training.team import load_team
 
-_MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a median and the least saving
+_MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a median and the least reduction of harm
 
 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
-    """Choose example worlds to watch, by the total harm that the last level of ``measured`` saves against the first.
+    """Choose worlds whose episodes the page shows, by the reduction of total harm from the first to the last level.
 
-    These are the worlds with the largest, a median and the least saving by the policies of the first seed. Levels with
-    a worse V2X channel do not count.
+    The chosen worlds have the largest, a median or the least reduction with the policies of the first seed. Levels with
+    a worse V2X channel are ignored.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]
@@ -55,16 +55,16 @@ def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
 
 
 def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
-    """Return a section of the page with episodes to watch, level beside level, in the worlds of ``choose_worlds``.
+    """Return the section of the page that shows episodes of all levels side by side (worlds of ``choose_worlds``).
 
-    Each trained level drives with its first seed.
+    At each level with learners, the policies of the first seed drive.
     """
     played = choose_worlds(measured)
     rows = np.array([each.number for each in played], np.int64)
     controlled: dict[str, tuple[int, ...]] = {}
     for level in plan.levels:
         worlds = level.scenario.sample(plan.episodes, plan.list_seed).worlds.take(rows)
-        drivers = {level.name: Team({}, level.name)}  # a team without vehicles: scripts drive
+        drivers = {level.name: Team({}, level.name)}  # an empty team: scripts drive all vehicles
         if level.scenario.learners:
             drivers = {}
             for recipe in plan.recipes:
@@ -86,10 +86,10 @@ def episodes_section(plan: Plan, measured: Sequence[Measured]) -> Section:
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """Return CSV text with one row per level, algorithm and seed: means over the worlds (m2/s2).
+    """Return CSV text with one row per level, algorithm and seed. Harms are means over the worlds (m2/s2).
 
-    Columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
-    Without a shield its columns are empty.
+    The columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
+    The columns for the shield are empty if no shield was used.
     """
     return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
 
@@ -134,7 +134,10 @@ _ALGORITHM = "Algorithm"
 def markdown(results: Json, conditions: str) -> str:
     """Return all tables of an ablation as Markdown.
 
-    ``results`` is the content of ``ablation.json``; ``conditions`` is the text below the tables.
+    Args:
+        results: content of ``ablation.json``.
+        conditions: text below the tables, about worlds, seeds and machine.
+
     """
     blocks = [f"**{line}**" for line in results["undertrained"]]
     blocks += [text for title, sheets in _blocks(results) for text in (f"## {title}", *(s.markdown() for s in sheets))]
@@ -149,8 +152,8 @@ def ablation_page(
     Args:
         results: content of ``ablation.json``.
         conditions: text about worlds, seeds and machine.
-        figures: file name -> figure.
-        episodes: sections with episodes to watch.
+        figures: name of the figure's file -> figure.
+        episodes: sections that show episodes.
 
     """
     titles = FIGURES if swept_axis(results) is None else SWEEP_FIGURES
@@ -177,7 +180,10 @@ def ablation_page(
 
 
 def _blocks(results: Json) -> list[tuple[str, list[Sheet]]]:
-    """Return the tables of an ablation in groups, each as (title, tables); ``results`` is from ``ablation.json``."""
+    """Return the tables of an ablation in groups: (title of the group, tables).
+
+    ``results`` is the content of ``ablation.json``.
+    """
     swept = swept_axis(results)
     shown = {
         level["level"]: f"`{level['level']}`" if swept is None else f"{level['swept_number']:g}"
@@ -257,10 +263,14 @@ _Columns = list[tuple[Column | str, str]]
 
 
 def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
-    """Return a table with one line for each of ``rows`` (nested objects from ``ablation.json``).
+    """Return a table of results from ``ablation.json``.
 
-    A column is a pair of its heading, and the path to its value in a row: ``first harm`` leads to
-    ``row["first"]["harm"]``. The algorithm's column is left out if there is only one algorithm.
+    If the results are for one algorithm only, the column with the name of the algorithm is left out.
+
+    Args:
+        rows: result of each row, as a nested mapping.
+        columns: heading of each column and path to its value: ``first harm`` means ``row["first"]["harm"]``.
+
     """
     if len({row["algorithm"] for row in rows} - {None}) == 1:
         columns = [(column, path) for column, path in columns if column != _ALGORITHM]
@@ -276,7 +286,7 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
 
 def interval_words(seeds: int) -> str:
-    """Return a phrase for captions about what 95 % intervals over this number of seeds cover."""
+    """Return a phrase for captions that says what the 95 % intervals account for, given the number of seeds."""
     if seeds == 1:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""
@@ -288,14 +298,14 @@ def _share(heading: str) -> Column:
 
 
 def write_ablation(plan: Plan, measured: Sequence[Measured], machine: str) -> tuple[Json, list[Path]]:
-    """Write page, Markdown, CSV, JSON and figures of an ablation, replacing existing files.
+    """Write page, Markdown, CSV, JSON and figures of an ablation. Existing files are replaced.
 
     Args:
         plan: settings of the ablation.
         measured: results of ``measure``.
         machine: description of this machine, for the caption.
 
-    Returns the content of ``ablation.json``, and the paths of page, Markdown and figures.
+    Returns the content of ``ablation.json``, and the paths of the page, the Markdown file and the figures.
 
     """
     settings = {

@@ -1,4 +1,4 @@
-"""Section of a run's report about several learners: who bears what, and what each learner and the messages add."""
+"""Section of a run's report for several learners: harm of each vehicle, benefit of each learner and of messages."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from ethbrake_marl.training.experiment import Experiment, without
 from ethbrake_marl.training.session import train
 from ethbrake_marl.training.team import load_team
 
-SEARCHED = 100  # worlds of the list in which the joint optimum is searched
+SEARCHED = 100  # number of worlds in which the joint optimum is searched
 
-BUDGET = 5_000  # candidates of this search, per world and count of harm
+BUDGET = 5_000  # number of candidates that this search tries per world and count of harm
 
 Harms = Mapping[HarmCount, Floats]  # count of harm -> harm of the whole line in each world, [n] m2/s2
 
 
 class Stopped(Exception):
-    """A further training did not finish; nothing more is compared.
+    """Raised if a training for the comparison was interrupted or failed.
 
     Args:
-        told: sentence about it, without the full stop.
-        interrupted: name of the training that Ctrl-C stopped; "": it failed.
+        told: message about the training, without a full stop.
+        interrupted: name of the training if Ctrl-C stopped it; empty if it failed.
 
     """
 
@@ -54,26 +54,27 @@ class Stopped(Exception):
 
 
 class Compared(NamedTuple):
-    """Another agent beside the team, in the same worlds."""
+    """Harm of another agent and of the trained team in the same worlds."""
 
-    name: str
-    other: Harms
-    team: Harms
+    name: str  # name of the other agent
+    other: Harms  # harm of the other agent
+    team: Harms  # harm of the team
     clusters: Texts | None  # name of each world's cluster (``Evaluation.clusters``)
 
 
 def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
-    """Train each learner alone and the team without messages, search the joint optimum, and compare the team with them.
+    """Compare the trained team of a run with single learners, with a team without messages, and with the joint optimum.
 
-    A learner has the same number of decisions in each training. Writes the trainings to ``alone/`` and
-    ``without-messages/`` in the folder of the run, and all numbers to ``cooperation.json``. After a training that was
-    interrupted or failed, nothing more is trained or searched.
+    The function trains each learner alone and a team without messages, and searches the joint optimum. A learner makes
+    as many decisions in each training as in the run. The trainings are stored in ``alone/`` and ``without-messages/``
+    in the folder of the run, and all numbers in ``cooperation.json``. If a training is interrupted or fails, the
+    function stops training and searching.
 
     Args:
-        experiment: the finished run: its folder, policies and evaluation.
-        tell: called with a ``Progress`` object at each stage.
+        experiment: the finished run, with its folder, policies and evaluation.
+        tell: function that receives the progress.
 
-    Returns None for one learner.
+    Returns the section of the report; None if the run has one learner only.
 
     """
     evaluation, team, by = experiment.evaluation, experiment.learned, experiment.evaluation.clusters
@@ -85,8 +86,8 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
     if experiment.trained.status == "finished":
         try:
             alone = _train_alone(experiment, tell)
-            found = evaluate(evaluation.worlds, alone, scenario=evaluation.scenario, aftermath=False).complete()
-            outcomes |= found.outcomes
+            single = evaluate(evaluation.worlds, alone, scenario=evaluation.scenario, aftermath=False).complete()
+            outcomes |= single.outcomes
             best = min(alone, key=lambda name: float(outcomes[name].world_harm(experiment.harm_count).mean()))
             rows = [Compared(f"best single learner ({best})", _harms(outcomes[best]), _harms(outcomes[team]), by)]
             silent, why_silent = _without_messages(experiment, tell)
@@ -106,7 +107,10 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
-    """Train each learner alone while all others brake fully; return name -> team, which brakes the others fully."""
+    """Train each learner alone while all other learners brake fully; return one team for each, by name.
+
+    In such a team, the other learners also brake fully.
+    """
     scenario, policies = experiment.evaluation.scenario, {}
     braking = make_agents(["full_brake"], scenario)["full_brake"]
     for vehicle in scenario.learners:
@@ -120,7 +124,10 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 
 
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
-    """Train the team with sensors instead of messages; return its rows of the comparison, and a sentence about it."""
+    """Train a team with sensors instead of messages; return the comparisons with it, and a sentence on how it was made.
+
+    The comparisons are empty if this training makes no sense or is impossible. The sentence then says why.
+    """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
         why = "a mixture" if scenario.members else "a scenario without messages"
@@ -142,10 +149,10 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
     ours = _harms(evaluation.outcome(TRAINED_TEAM).take(rows))
     left_out = ", without those in which something is hit before that" if len(rows) < evaluation.worlds.n else ""
     by = evaluation.take(rows).clusters
-    found = [
+    rows_of_table = [
         Compared(f"{name} without messages", _harms(driven.outcome(name)), ours, by) for name in ("team", "full_brake")
     ]
-    return found, (
+    return rows_of_table, (
         "The team without messages is trained and driven with sensors only, which see the next vehicle ahead and"
         f" behind, so that a vehicle may also react later; the lines are the same{left_out}."
     )
@@ -154,7 +161,10 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
 def _joint_optimum(
     experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress
 ) -> tuple[list[Compared], str]:
-    """Search the least harm of all learners together; return its row of the comparison, and a sentence about it."""
+    """Search the joint optimum; return the comparison with it, and a sentence on the search.
+
+    The comparison is missing if the search is impossible. The sentence then says why.
+    """
     evaluation = experiment.evaluation
     rows = np.arange(min(SEARCHED, evaluation.worlds.n))
     part = Sample(evaluation.worlds.take(rows), evaluation.index[rows], 0)
@@ -185,9 +195,17 @@ def _joint_optimum(
 
 
 def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, tell: OnProgress) -> Team:
-    """Train the learners of ``scenario`` as the run did, with its decisions divided by ``share``; return the team.
+    """Train the learners of ``scenario`` with the recipe of the run; return the team.
 
     Raises ``Stopped`` if the training was interrupted or failed.
+
+    Args:
+        experiment: the finished run.
+        scenario: scenario of the training.
+        folder: folder of the training, below the folder of the run.
+        share: number by which the decisions of the run are divided.
+        tell: function that receives the progress.
+
     """
     recipe, path = experiment.trained.training.recipe, experiment.run.path / folder
     path.parent.mkdir(exist_ok=True)
@@ -211,7 +229,7 @@ def _harms(outcome: Outcome) -> Harms:
 
 
 def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
-    """Return a table of the team's harm beside that of each other, in one count."""
+    """Return a table that compares the harm of the team with the harm of each other agent, for one count of harm."""
     columns = [
         Column("Compared with", "with", text=True),
         Column("Worlds", "worlds", digits=0),
@@ -227,7 +245,7 @@ def _compared(rows: list[Compared], harm_count: HarmCount) -> Sheet:
 
 
 def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: Evaluation) -> Sheet:
-    """Return a table of the harm that each vehicle bears, one row for each agent."""
+    """Return a table of the harm of each vehicle, with one row for each agent."""
     scenario, by = evaluation.scenario, evaluation.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     learn = ", ".join(names[i] for i in scenario.learners)
@@ -242,7 +260,10 @@ def _borne(outcomes: Mapping[str, Outcome], harm_count: HarmCount, evaluation: E
 
 
 def _added(experiment: Experiment) -> Sheet:
-    """Return a table of what each learner adds: the team with that vehicle braking fully instead, minus the team."""
+    """Return a table of how much harm each learner prevents.
+
+    The entry for a learner is the harm of the team if this learner brakes fully, minus the harm of the team.
+    """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     columns = [Column("Learner", "learner", text=True)]
     columns += [Column(f"More {HARM[each]} without it", f"{each}_added", sign="+") for each in HARM_COUNTS]

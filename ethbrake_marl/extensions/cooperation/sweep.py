@@ -1,4 +1,4 @@
-"""A sweep: one key of a scenario with several numbers, as in ``objective=social:0..90:15``."""
+"""A sweep: one key of a scenario with several values, such as ``objective=social:0..90:15``."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import re
 from decimal import Decimal
 from typing import Any, NamedTuple
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.overrides import Override
 
-MOST = 100  # numbers of a sweep
+MOST = 100  # largest number of values of a sweep
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
 
@@ -19,18 +19,20 @@ _WORD = re.compile(r"\s*([A-Za-z][\w-]*:)?", re.ASCII)
 
 
 class Swept(NamedTuple):
-    """The swept key at one of its values."""
+    """The swept key with one of its values."""
 
-    key: str  # as written: v2x.lost
-    word: str  # what stands before the number in the value: ``social:``; usually empty
-    text: str  # the number as written in the value
+    key: str  # key of a scenario, such as v2x.lost
+    word: str  # text before the number in the value, such as ``social:``; usually empty
+    text: str  # the number, as text
 
     @classmethod
     def parse(cls, text: str) -> list[Swept]:
-        """Parse ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``, also with a word before the numbers: ``social:0..90:15``.
+        """Read a text ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return the values in ascending order.
 
-        Items of both kinds may be mixed. Returns the values in ascending order. Raises ``InvalidInput`` for anything
-        that is no number, for a range whose steps miss its end, and for a repeated, a single or too many numbers.
+        A word may precede the numbers, as in ``objective=social:0..90:15``. Ranges and single numbers may be mixed.
+
+        Raises ``InvalidInput`` for a value that is not a number, a range whose steps do not meet its end, a repeated
+        number, a single number, and too many numbers.
         """
         key, equals, values = (part.strip() for part in text.partition("="))
         word = match.group(1) or "" if (match := _WORD.match(values)) else ""
@@ -40,7 +42,7 @@ class Swept(NamedTuple):
             if not (key and equals and parsed):
                 raise InvalidInput(
                     f"--sweep {text!r:.200}: must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance"
-                    " objective=social:0..90:15 or v2x.lost=0,0.1,0.3; compare other values as --levels"
+                    " objective=social:0..90:15 or v2x.lost=0,0.1,0.3; for other values, give scenarios with --levels"
                 )
             low, high, step = (Decimal(part or parsed["low"]) for part in parsed.group("low", "high", "step"))
             if parsed["step"] is None:
@@ -54,38 +56,38 @@ class Swept(NamedTuple):
                 )
             numbers += [low + k * step for k in range(int(steps) + 1)]
         if not 2 <= len(numbers) <= MOST:
-            raise InvalidInput(f"--sweep {key}: {len(numbers)} given; must be 2 to {MOST} numbers")
+            raise InvalidInput(f"--sweep {key}: has {count_of(len(numbers), 'number')}; give 2 to {MOST} numbers")
         for number in numbers:
             if numbers.count(number) > 1:
-                raise InvalidInput(f"--sweep {key}: {number} is given twice")
+                raise InvalidInput(f"--sweep {key}: {number} is given twice; give each number once")
         return [cls(key, word, f"{number.normalize():f}") for number in sorted(numbers)]
 
     @property
     def number(self) -> float:
-        """The number: its place on the axis of figures."""
+        """The swept number, which is the x value in figures."""
         return float(self.text)
 
     @property
     def setting(self) -> str:
-        """The value as a setting: ``objective=social:15``."""
+        """Key and value as a setting ``KEY=VALUE``, such as ``objective=social:15``."""
         return f"{self.key}={self.word}{self.text}"
 
     @property
     def override(self) -> Override:
-        """The setting, to put into a scenario."""
+        """The setting as an ``Override``, which changes the key of a scenario."""
         return Override.parse([self.setting])[0]
 
     @property
     def same_lines(self) -> bool:
-        """Whether the key leaves every world the same line with the same physics."""
+        """Whether the worlds have the same lines of vehicles, with the same physics, for all values of the key."""
         return self.key.partition(".")[0] in ("objective", "obstacle_gap_m", "roles", "v2x")
 
     @property
     def label(self) -> str:
-        """What the value adds to the name of a level: ``social-15``, ``v2x.lost-0.1``."""
+        """Text that the value adds to the name of a level, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns of tables: key, value and number."""
+        """Entries for tables: swept key, value and number."""
         return {"swept_key": self.key, "swept_value": f"{self.word}{self.text}", "swept_number": self.number}

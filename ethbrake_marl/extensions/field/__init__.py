@@ -1,1 +1,1 @@
-"""Controllers from the literature to compare with: IDM, ACC, RSS, UN R157, AEB."""
+"""Controllers from the literature for comparison: IDM, ACC, CACC, RSS, UN R157, AEB."""

@@ -1,7 +1,7 @@
 """Controllers from the literature: car-following models, the driver models of UN R157, emergency braking.
 
-``LAWS`` lists them. A *law* is a formula that depends only on the vehicle itself and on the vehicle ahead, with its
-parameters and its source.
+A *law* is the formula of a controller. It computes a command from the motion of the vehicle itself and of the vehicle
+ahead. ``LAWS`` lists all laws with their parameters and sources.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from ethbrake_marl.physics.messages import ACCELERATION, MEASURED, Messages, ref
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 from ethbrake_marl.registry import Part
 
-_TOUCHING_M = 1e-6  # smallest gap that a law sees, because laws divide by the gap
+_TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
 
-_SAME_S = 1e-9  # tolerance for rounding in an elapsed time
+_SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
 
 
 class Parameters:
-    """Parameters of one law (a controller's formula) as attributes, in SI units; ``LAWS`` lists their names."""
+    """Parameters of one law (the formula of a controller) as attributes, in SI units. ``LAWS`` lists their names."""
 
     def __init__(self, **values: float) -> None:
         self.__dict__.update(values)
@@ -39,10 +39,11 @@ class Parameters:
 
 
 class Seen(NamedTuple):
-    """What one vehicle knows about the vehicle ahead in ``n`` worlds, by sensors or messages; each field is [n].
+    """Motion of one vehicle, and what it knows from sensors or messages about the vehicle ahead, in ``n`` worlds.
 
-    Old information is extrapolated with the acceleration that it reported. Ahead of Vehicle 1 is the obstacle, if there
-    is one. Without an obstacle, and for a vehicle that has received nothing, the road ahead is free.
+    Old information is extrapolated to the present time with the acceleration that was reported. For Vehicle 1, an
+    obstacle counts as the vehicle ahead. If there is no obstacle, or if a vehicle has received no information, the road
+    ahead is free.
     """
 
     gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
@@ -54,7 +55,14 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
-        """Return what ``vehicle`` (0 = front) knows in these worlds; ``step_s`` is the time between decisions (s)."""
+        """Return what a vehicle knows in these worlds.
+
+        Args:
+            worlds: present state of the n worlds.
+            vehicle: index of the vehicle (0 = front).
+            step_s: time between two decisions (s).
+
+        """
         told, own, none = Told.to(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
         gap, front, force = told.obstacle_m, none, none
         if vehicle:
@@ -69,25 +77,27 @@ class Seen(NamedTuple):
 
     @property
     def closing_mps(self) -> Floats:
-        """Speed at which the gap closes, [n]; negative if it opens."""
+        """Speed at which the gap closes, [n] m/s; negative if the gap opens."""
         return self.speed_mps - self.front_mps
 
     @property
     def until_contact_s(self) -> Floats:
-        """Time to contact at the present speeds, [n]; infinite where the gap does not close."""
+        """Time to contact at the present speeds, [n] s; infinite if the gap does not close."""
         closing = self.closing_mps
         return np.where(closing > 0.0, self.gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
 
     @property
     def headway_s(self) -> Floats:
-        """Gap divided by the own speed, [n]; infinite where the vehicle does not move forward."""
+        """Gap divided by the speed of the vehicle itself, [n] s; infinite if it does not move forward."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the command [n] (m/s2) for the next time step, if braking can only build up gradually.
+        """Limit the rate at which braking builds up; return the command for the next time step, [n] m/s2.
 
-        It is ``wanted_mps2`` [n], but the deceleration exceeds the vehicle's present one by at most ``rate_mps3`` times
-        the time step.
+        Args:
+            wanted_mps2: [n] wanted acceleration (m/s2).
+            rate_mps3: largest increase of the deceleration per second (m/s3).
+
         """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
@@ -137,16 +147,20 @@ def _human_notices(seen: Seen, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """Return a fuzzy degree of danger [n]: 0 beyond the safe distance, 1 within the unsafe one, linear between."""
+    """Return a fuzzy degree of danger [n]: 0 above the safe distance, 1 below the unsafe distance, linear between."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
 
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
-    """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n] from 0 to 1.
+    """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n].
 
-    0 means no danger, 1 full danger. ``seen`` is what the vehicle knows about the one ahead, and ``p`` the parameters
-    of the law ``r157_fsm``.
+    Both range from 0 (no danger) to 1 (full danger).
+
+    Args:
+        seen: what the vehicle knows about the vehicle ahead.
+        p: parameters of the law ``r157_fsm``.
+
     """
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
@@ -185,14 +199,14 @@ def _aeb(seen: Seen, p: Parameters) -> Floats:
 class Law:
     """One controller from the literature: a formula for the acceleration, its parameters and its source."""
 
-    about: str  # name of the controller, for lists
-    source: str  # publication
+    about: str  # name of the controller
+    source: str  # publication of the formula
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
-    command: Callable[[Seen, Parameters], Floats]  # formula that returns the acceleration, [n] m/s2
-    # Formula that returns for each world whether the law sees a danger, [n] bool; None: it acts from the start.
+    command: Callable[[Seen, Parameters], Floats]  # function that returns the acceleration, [n] m/s2
+    # Function that returns for each world whether there is a danger, [n] bool. None: the law acts from the start.
     notices: Callable[[Seen, Parameters], Bools] | None = None
     stays: bool = False  # whether the reaction continues after the danger is over
-    # Names of parameters that may be 0; all others must be above 0.
+    # Names of the parameters that may be 0; all other parameters must be above 0.
     may_be_zero: frozenset[str] = field(default=frozenset({"T", "s0", "rho", "reaction", "perception", "release"}))
 
 
@@ -235,33 +249,34 @@ LAWS: dict[str, Law] = {
 
 
 class Controller:
-    """Agent that follows a ``Law``, a controller's formula from the literature.
+    """Agent that follows a ``Law``, the formula of a controller from the literature.
 
-    Its memory is the time at which it noticed the danger, [n] s; infinite: no danger yet; NaN: before its first
-    decision.
+    Its memory is the time at which it noticed a danger, [n] s. The memory is infinite before a danger is noticed, and
+    NaN before the first decision.
 
-    The reaction time runs from the decision at which the controller notices the danger. A danger that exists at the
-    first decision counts as noticed at the alert, so reaction time and latency overlap. If
-    ``law.stays``, a reaction that has begun goes on after the danger is over (law ``r157_human``); else the controller
-    waits for the next danger (law ``r157_fsm``).
+    The reaction time begins at the decision at which the controller notices the danger. A danger that exists at the
+    first decision counts as noticed at the alert; the reaction time then overlaps with the latency. If ``law.stays`` is
+    true (law ``r157_human``), a reaction continues after the danger is over. Otherwise (law ``r157_fsm``) it ends with
+    the danger, and the next danger starts a new reaction.
 
     Args:
-        name: spec of the agent.
-        law: the formula.
-        parameters: value of each of the law's parameters.
+        name: name of the agent, such as ``idm:T=1.0``.
+        law: the law.
+        parameters: value of each parameter of the law.
         step_s: time between two decisions (s).
 
     """
 
-    knows = Source.MESSAGES  # it decides from the messages that have reached it
+    knows = Source.MESSAGES  # the agent decides on received messages
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Return the initial memory [n]: NaN, because no decision was made yet.
+        """Return the memory before the first decision: NaN, [n].
 
-        Raises ``InvalidInput`` where messages of the vehicle ahead lack what a law reads, and no sensor measures it.
+        Raises ``InvalidInput`` if the law needs a quantity of the vehicle ahead that neither messages nor sensors
+        provide.
         """
         ahead = vehicle - 1
         if vehicle and np.isinf(Messages.of(alert).seen_from_s(vehicle, ahead)).any():
@@ -269,10 +284,13 @@ class Controller:
         return np.full(alert.n, np.nan)
 
     def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
-        """Return the command of the law within the vehicle's capacities, [n] m/s2, and the new memory [n].
+        """Return the command of the law, limited by the capacities of the vehicle, [n] m/s2, and the new memory [n].
 
-        ``memory`` is the new memory of the last call, or that of ``begin``; ``vehicle`` is this vehicle's index (0 =
-        front).
+        Args:
+            worlds: present state of the n worlds.
+            memory: memory from the last call of ``act``; at the first decision, the result of ``begin``.
+            vehicle: index of the vehicle that the controller drives (0 = front).
+
         """
         seen, p, vehicles = Seen.of(worlds, vehicle, self.time_step_s), self.parameters, worlds.vehicles
         command = self.law.command(seen, p)
@@ -289,15 +307,15 @@ class Controller:
 
 
 def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
-    """Return the controller of a spec such as ``idm:T=1.0``.
+    """Return the controller for a text such as ``idm:T=1.0``.
 
     Args:
-        argument: the part of the spec after the name, which sets parameters: ``T=1.0`` or ``T=1.0:a=2``; None: all
+        argument: text after the name of the law, with values of parameters: ``T=1.0`` or ``T=1.0:a=2``; None: all
             parameters have their default values.
-        settings: the whole spec, and the scenario's time step.
+        settings: the whole text, and the time step of the scenario.
 
-    Raises ``UnknownName`` for a parameter that the law does not have, and ``InvalidInput`` for a value that is not a
-    number in range.
+    Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` for a value that is not a
+    number or is out of range, and for a repeated parameter.
 
     """
     name = settings.spec.partition(":")[0]
@@ -312,11 +330,13 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
             least = "0 or more" if key in law.may_be_zero else "above 0"
             raise InvalidInput(f"{where}: {key} must be a number {least}, for instance {key}={law.parameters[key]:g}")
         if key in parameters:
-            raise InvalidInput(f"{where}: {key} is given twice")
+            raise InvalidInput(f"{where}: parameter {key} is given twice; give it once")
         parameters[key] = value
     parameters = {**law.parameters, **parameters}
     if parameters.get("b_min", 0.0) > parameters.get("b_max", math.inf):
-        raise InvalidInput(f"{where}: b_min {parameters['b_min']:g} must not be above b_max {parameters['b_max']:g}")
+        raise InvalidInput(
+            f"{where}: b_min = {parameters['b_min']:g}: must be at most b_max, which is {parameters['b_max']:g}"
+        )
     return Controller(settings.spec, law, parameters, settings.time_step_s)
 
 

@@ -1,4 +1,4 @@
-"""Hosts: agents drive vehicles that another simulator moves, for instance SUMO."""
+"""Hosts: agents drive vehicles that another simulator, for instance SUMO, moves."""
 
 from ethbrake_marl.extensions.hosts.protocol import (
     Host as Host,

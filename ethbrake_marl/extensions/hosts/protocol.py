@@ -1,15 +1,15 @@
 """Let agents drive vehicles that a *host* moves: another simulator or a test bench.
 
-The host only moves vehicles. This package makes the decisions on their time grid, applies latencies, holds vehicles at
-rest, resolves impacts and keeps the ledger of harm. Every step has three parts:
+The host moves the vehicles. This package does the rest: it makes the decisions, applies latencies, keeps standing
+vehicles at rest, resolves impacts and records the harm. Every step has three parts:
 
-1. *Decide.* Agents whose decision is due act on the state that the host reported, behind the shield if there is one.
-2. *Move.* The host receives one command and moves for one step.
-3. *Meet.* Pairs that overlap and still close exchange velocity, unless the host resolves impacts itself and reports
-   them.
+1. *Decide.* Agents whose decision is due act on the state that the host reported. A shield may replace their actions.
+2. *Move.* The host receives a command and moves the vehicles for one step.
+3. *Meet.* Vehicles that overlap and still approach each other exchange velocity. A host that resolves impacts itself
+   reports them instead.
 
-Latencies are rounded up to whole steps of the host, and agents know the rounded value, so no decision falls between two
-steps.
+Latencies are rounded up to whole steps of the host, because decisions are possible only between two steps. Agents know
+the rounded latencies.
 """
 
 from __future__ import annotations
@@ -51,18 +51,18 @@ from ethbrake_marl.shields.step import StepShield
 
 STANDS_MPS = 1e-3  # below this speed a vehicle of a host with a fixed step counts as standing
 
-STARTS_WITHIN = 0.01  # m, m/s: tolerance between the host's first state and the worlds it was set up with
+STARTS_WITHIN = 0.01  # m, m/s: tolerance between the first state of the host and the worlds
 
-READ_WITHIN = 0.2  # m, m/s: tolerance for a change between two states
+READ_WITHIN = 0.2  # m, m/s: tolerance for the change between two states
 
-# tolerances for following a command: delay, constant error, and error as a share of the command
+# tolerances of a vehicle that follows commands: delay, constant error, and error as a share of the command
 LAG_S, OFF_MPS2, OFF_SHARE = 0.5, 0.5, 0.2
 
-SNAP = 1e-6  # times closer than this share of a step count as equal
+SNAP = 1e-6  # times count as equal if they differ by less than this share of a step
 
 
 class HostState(NamedTuple):
-    """State that a host (another simulator or a test bench) reports of its ``n`` lines of ``N`` vehicles.
+    """State of ``n`` lines of ``N`` vehicles, as a host (another simulator or a test bench) reports it.
 
     >>> import ethbrake_marl as eb
 
@@ -72,10 +72,10 @@ class HostState(NamedTuple):
 
     """
 
-    time_s: ArrayLike  # a number or [n]: time on the host's own clock, which may start anywhere
-    gaps_m: ArrayLike  # [n, N - 1] bumper to bumper; below 0 where bodies overlap
-    speeds_mps: ArrayLike  # [n, N] speed of each vehicle, front to rear
-    impacts: Impacts | None = None  # impacts since the last state, if the host resolves impacts itself
+    time_s: ArrayLike  # time on the clock of the host (s), which may start at any number; a number or [n]
+    gaps_m: ArrayLike  # [n, N - 1] gaps from bumper to bumper; negative if vehicles overlap
+    speeds_mps: ArrayLike  # [n, N] speeds of the vehicles, front to rear
+    impacts: Impacts | None = None  # impacts since the last state; None: this host does not resolve impacts
 
 
 class HostCommand(NamedTuple):
@@ -89,19 +89,19 @@ class HostCommand(NamedTuple):
 
     """
 
-    acceleration_mps2: Floats  # [n, N] acceleration over the step, with latency, rest and speed limit applied
-    speeds_mps: Floats  # [n, N] speeds at the start of the step: the reported ones, or others after an impact
-    wanted_mps2: Floats  # [n, N] acceleration that agents decided, for a host that handles rest and latencies itself
-    until_s: Floats  # [n] time since the alert at which the step ends
+    acceleration_mps2: Floats  # [n, N] acceleration for this step, after latency, standstill and speed limit
+    speeds_mps: Floats  # [n, N] speeds at the start of the step: the reported speeds, changed by impacts
+    wanted_mps2: Floats  # [n, N] acceleration that the agents chose, for a host that applies latencies and standstill
+    until_s: Floats  # [n] time at which the step ends, measured from the alert (s)
 
 
 class Host(Protocol):
-    """Interface of a host, a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
+    """Interface of a host: a simulator that moves ``n`` lines of vehicles, one line per world, from the alert on.
 
-    A host needs the attribute ``dt`` and the methods ``state`` and ``apply``; it need not inherit from this class.
+    A host has the attribute ``dt`` and the methods ``state`` and ``apply``. It need not inherit from this class.
 
-    ``dt`` is the length of every step (s). With ``math.inf`` each world moves to its own ``command.until_s``, the time
-    of its next decision; a world that is already there does not move.
+    ``dt`` is the length of every step (s). With ``dt = math.inf``, a step moves each world to its ``command.until_s``,
+    the time of its next decision. A world whose time is already ``command.until_s`` does not move.
 
     >>> import ethbrake_marl as eb
 
@@ -126,16 +126,19 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present time, gaps and speeds, and impacts since the last call if the host reports impacts."""
+        """Return the present time, gaps and speeds, and impacts since the last call if the host resolves them."""
 
     def apply(self, command: HostCommand) -> None:
-        """Move all vehicles by one step, as ``command`` says."""
+        """Move all vehicles by one step with the accelerations of ``command``."""
 
 
 class HostFailed(EthBrakeError):
     """Raised if a host raises an exception or reports an impossible state.
 
-    Its attributes ``ledger`` and ``worlds`` hold the harm and the last valid state; ``reason`` is the message.
+    Args:
+        reason: message of the exception.
+        ledger: harm until the failure; also an attribute of the exception.
+        worlds: last valid state; also an attribute of the exception.
 
     >>> import ethbrake_marl as eb
 
@@ -151,56 +154,61 @@ class HostFailed(EthBrakeError):
 
 
 class Hosted(NamedTuple):
-    """Result of an agent that drove vehicles in a host (another simulator)."""
+    """Result of episodes in which an agent drove vehicles of a host (another simulator)."""
 
     outcome: Outcome  # harm and final state of each world
-    # [n] whether the host moved otherwise than the shield predicted, so that the shield's bound does not hold. None
-    # without a shield of mode step or robust, because only these compare their prediction with the host.
+    # [n] whether the motion in the host differed from the shield's prediction; the bound of the shield then has no
+    # guarantee. None without a shield of mode step or robust, because other shields make no predictions.
     distrusted: Bools | None
 
     @classmethod
     def join(cls, parts: list[Hosted]) -> Hosted:
-        """Join the results of consecutive batches of worlds, in their order, into one result."""
+        """Join the results for consecutive batches of worlds into one result, in the order of ``parts``."""
         distrusted = [part.distrusted for part in parts if part.distrusted is not None]
         outcome = Outcome.join([part.outcome for part in parts])
         return cls(outcome, np.concatenate(distrusted) if distrusted else None)
 
 
 def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, worlds: Worlds) -> Hosted:
-    """Let an agent or a team control the scenario's learners in a host, from the alert to the end of every episode.
+    """Let an agent or a team drive the scenario's learners in a host, from the alert to the end of every episode.
 
     Args:
-        host: the host, at the alert.
+        host: the host, whose vehicles are at the alert.
         agent: agent or team for the learners, as returned by ``make_agent``, with or without a shield. It is not
             changed.
-        scenario: the scenario; its scripts control the other vehicles, and agents know these scripts.
-        worlds: the worlds at the alert with which the host was set up. Only gaps and speeds are read from the host.
+        scenario: the scenario. Its scripts drive all other vehicles, and agents know these scripts.
+        worlds: the worlds at the alert. The host must have the gaps and speeds of these worlds.
 
-    Returns the outcome, and the worlds in which the host moved otherwise than a shield predicted. Raises
-    ``InvalidInput`` for a scenario, agent or worlds that a host does not support, and ``HostFailed`` if the host raises
-    or reports an impossible state.
+    Returns the outcome, and the worlds in which the motion differed from the prediction of a shield. Raises
+    ``InvalidInput`` for a scenario, agent or worlds that a host does not support. Raises ``HostFailed`` if the host
+    raises an exception or reports an impossible state.
 
     """
     scenario = load_scenario(scenario)
     if not isinstance(worlds, Worlds):
-        raise InvalidInput(f"host: worlds = {worlds!r}: must be worlds, as scenario.sample(n, seed).worlds")
+        raise InvalidInput(
+            f"host: worlds = {worlds!r}: must be a Worlds object, for instance scenario.sample(n, seed).worlds"
+        )
     check_alert(worlds, worlds.n, scenario.vehicles)
     check_agent(agent, "host", alone=False)
     team = Team.of(agent, scenario.learners)
     if not team.drivers:
-        raise InvalidInput(f"host: scenario {scenario.name!r} has no learner to drive; scenario.with_learners([1])")
+        raise InvalidInput(
+            f"host: scenario {scenario.name!r} has no learner; give one with a learner, for instance"
+            " scenario.with_learners([1])"
+        )
     return _Run(host, worlds, team, scenario).to_the_end()
 
 
 class _Grid:
-    """Decision times of vehicles that decide together: a first time in each world, and every time step after it.
+    """Decision times of vehicles that decide at the same times: a first time in each world, then every time step.
 
-    ``made`` [n] counts the decisions so far, ``all`` [n] the decisions until the horizon.
+    ``made`` [n] is the number of decisions so far, ``all`` [n] the number of decisions until the horizon.
 
     Args:
-        first_s: [n] time of the first decision.
+        first_s: [n] time of the first decision (s).
         vehicles: indices (0 = front) of the vehicles.
-        scenario: scenario, for time step and horizon.
+        scenario: scenario with the time step and the horizon.
 
     """
 
@@ -211,19 +219,16 @@ class _Grid:
 
     @property
     def next_s(self) -> Floats:
-        """Time of the next decision in each world, [n] s; after the last decision, the horizon."""
+        """Time of the next decision in each world, [n] s; the horizon after the last decision."""
         return np.where(self.made < self.all, self.decisions.at(self.made), self.horizon_s)
 
     def is_due(self, time_s: Floats) -> Bools:
-        """Return whether the next decision, or the horizon, is due at the times ``time_s`` [n], as [n] bool."""
+        """Return for each world, [n] bool, whether the next decision or the horizon is due at ``time_s`` [n]."""
         return self.next_s <= time_s + ROUNDING * self.decisions.time_step_s
 
 
 class _Run:
-    """Running episodes in a host: decisions, latencies, impacts and harm, around the host's steps.
-
-    The arguments are those of ``drive_host``; ``team`` holds the agent of each learner.
-    """
+    """Running episodes in a host. The arguments are those of ``drive_host``; ``team`` has the agent of each learner."""
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -270,7 +275,7 @@ class _Run:
 
     # decisions
     def _decide(self) -> None:
-        """Let every vehicle decide whose decision is due. All of them see the same state."""
+        """Let all vehicles whose decision is due decide, on the same state."""
         each = [~self.ended & (grid.made < grid.all) & grid.is_due(self.time_s) for grid in self.grids]
         if not np.any(each):
             return
@@ -294,7 +299,7 @@ class _Run:
         Args:
             worlds: the present state.
             due: [n] whether a decision is due in each world.
-            idle: row numbers of the other worlds, whose memories stay as they are.
+            idle: row numbers of all other worlds, whose memories are not changed.
 
         """
         engine = self.engine
@@ -309,7 +314,7 @@ class _Run:
             self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
 
     def _seen(self) -> Worlds:
-        """Return the present state as agents see it: nearly standing vehicles stand, and gaps are at least 0."""
+        """Return the present state for the agents: very slow vehicles stand, and gaps are at least 0."""
         latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
         in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
         if not self.exact:
@@ -318,7 +323,7 @@ class _Run:
         return self.alert.running(self.time_s, gaps, speeds, command_mps2=in_force, pair_hit=self.ledger.count > 0)
 
     def _end(self) -> None:
-        """Mark the episodes that end with the last step. Their controlled vehicles brake fully from now on."""
+        """Mark the episodes that end with the last step. Their learners brake fully from now on."""
         first = self.grids[0]
         if not (stepped := ~self.ended & first.is_due(self.time_s) & (first.made > 0)).any():
             return
@@ -333,7 +338,7 @@ class _Run:
 
     # the host's steps
     def _move(self) -> None:
-        """Let the host make one step, check the state that it reports, and resolve impacts unless it reported them."""
+        """Let the host make one step, check the state that it reports, and resolve impacts if the host does not."""
         if self.exact:
             until = np.minimum.reduce([grid.next_s for grid in self.grids])
             until = np.where(self.ended, self.time_s, np.maximum(until, self.time_s))
@@ -362,9 +367,10 @@ class _Run:
     def _meet(self, before_m: Floats, begin: Floats, step_s: Floats) -> Impacts:
         """Resolve the impacts of the step by the paper's eq. (13), from the rear pair to the front pair.
 
-        A pair has an impact if its gap is at most 0 and still closes. At the end of the step let w be the closing
-        speed, g <= 0 the gap, and b the mean closing acceleration of the step. A pair that was apart before the step
-        met with the closing speed ``sqrt(w^2 + 2 b g)``; this speed counts as harm and enters eq. (13).
+        A pair has an impact if its gap is at most 0 and still closes. At the end of the step, let w be the closing
+        speed, g <= 0 the gap, and b the mean closing acceleration of the step. If the pair was apart before the step,
+        its closing speed at the contact was ``sqrt(w^2 + 2 b g)``. This speed determines the harm, and is used in
+        eq. (13). If the pair was in contact before the step, w is used instead.
 
         Args:
             before_m: [n, P] gaps before the step.
@@ -392,9 +398,9 @@ class _Run:
         return Impacts(first, total, count, *Impacts.no_obstacle(len(gaps)))
 
     def _read(self) -> tuple[Floats, Floats, Floats, Impacts | None]:
-        """Read the host's state, and return checked copies.
+        """Read and check the state of the host; return copies of its arrays.
 
-        These are the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: not reported). Raises
+        Returns the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: not reported). Raises
         ``HostFailed`` for an exception, a wrong shape or a number that is not finite.
         """
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
@@ -406,7 +412,7 @@ class _Run:
         numbers[0] = numbers[0] if numbers[0].ndim else np.full(n, numbers[0])
         for name, each, shape in zip(HostState._fields, numbers, ((n,), (n, N - 1), (n, N)), strict=False):
             if each.shape != shape:
-                self._fail(f"{name} is of shape {each.shape}; {shape} is needed: worlds, then vehicles or pairs")
+                self._fail(f"{name} has shape {each.shape}; must have shape {shape}: (worlds, vehicles or pairs)")
             if not np.isfinite(each).all():
                 at = np.argwhere(~np.isfinite(each))[0].tolist()
                 self._fail(f"{name}{at} is {each[tuple(at)]}; every number must be finite")
@@ -414,38 +420,41 @@ class _Run:
         impacts = state.impacts
         if impacts is not None:
             if not isinstance(impacts, Impacts):
-                self._fail(f"impacts are {type(impacts).__name__}; what eb.advance gives is needed, or None")
+                self._fail(f"impacts is of type {type(impacts).__name__}; must be None, or as eb.advance returns it")
             for place, column in enumerate(fields(Impacts)[:6]):
                 values, shape = np.asarray(getattr(impacts, column.name)), (n, N - 1) if place < 3 else (n,)
                 whole = values.dtype.kind in ("iu" if column.name.endswith("count") else "fiu")
                 if not (whole and values.shape == shape and np.isfinite(values).all() and (values >= 0).all()):
-                    self._fail(f"impacts.{column.name} must be of shape {shape}, finite and not below 0; counts whole")
+                    self._fail(
+                        f"impacts.{column.name} must have shape {shape} and finite numbers of at least 0; counts must"
+                        " be whole numbers"
+                    )
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:
-        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and set the origin of its clock.
+        """Return gaps [n, P] and speeds [n, N] of the host at the alert, and set the origin of its clock.
 
-        Raises ``HostFailed`` if they differ from the worlds with which the host was set up.
+        Raises ``HostFailed`` if gaps or speeds differ from the worlds.
         """
         self.origin_s, gaps, speeds, _ = self._read()
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
             if not (close := np.abs(told - given) <= STARTS_WITHIN).all():
                 at = tuple(np.argwhere(~close)[0].tolist())
                 self._fail(
-                    f"{name}{list(at)} is {told[at]:g} and {given[at]:g} in the worlds that were given; set the host up"
-                    f" with these, to {STARTS_WITHIN:g}"
+                    f"{name}{list(at)} is {told[at]:g} in the host, but {given[at]:g} in worlds; the host must start"
+                    f" with the gaps and speeds of worlds, with a difference of at most {STARTS_WITHIN:g}"
                 )
         return np.maximum(gaps, 0.0), speeds
 
     def _check_clock(self, time_s: Floats, until: Floats) -> None:
-        """Raise ``HostFailed`` unless the host's clock ``time_s`` [n] is at ``until`` [n], to half a step."""
+        """Raise ``HostFailed`` if the host's clock ``time_s`` [n] is more than half a step from ``until`` [n]."""
         within = SNAP * self.scenario.time_step_s if self.exact else self.dt / 2.0
         if not (good := np.abs(time_s - until) <= within).all():
             k = int(np.argmin(good))
             went = "skips" if time_s[k] > until[k] else "goes back" if time_s[k] < self.told_s[k] else "loses a step"
             self._fail(
-                f"world {k} {went}: its clock went from {self.told_s[k]:g} s to {time_s[k]:g} s, and {until[k]:g} s is"
-                f" right to {within:g} s; each call of apply must make one step of dt"
+                f"world {k} {went}: its clock went from {self.told_s[k]:g} s to {time_s[k]:g} s, but should be at"
+                f" {until[k]:g} s (tolerance {within:g} s); each call of apply must make one step of dt"
             )
 
     def _fail(self, what: str, error: Exception | None = None, world: int | None = None) -> NoReturn:
@@ -454,46 +463,49 @@ class _Run:
 
 
 class _Step(NamedTuple):
-    """One step of a host: its command and the state that it reported at the end."""
+    """One step of a host: the command, and the state that the host reported at the end of the step."""
 
-    wanted_mps2: Floats  # [n, N] acceleration that the agents decided
-    begin_mps: Floats  # [n, N] speeds at the start of the step, as commanded to the host
-    until_s: Floats  # [n] time since the alert at which the step should end
-    clock_s: Floats  # [n] length of the step on the host's own clock (s)
-    gaps_m: Floats  # [n, N - 1] reported gaps at the end; below 0 where bodies overlap
+    wanted_mps2: Floats  # [n, N] acceleration that the agents chose
+    begin_mps: Floats  # [n, N] commanded speeds at the start of the step
+    until_s: Floats  # [n] time at which the step should end, measured from the alert
+    clock_s: Floats  # [n] length of the step on the clock of the host (s)
+    gaps_m: Floats  # [n, N - 1] reported gaps at the end; negative if vehicles overlap
     speeds_mps: Floats  # [n, N] reported speeds at the end
     impacts: Impacts | None  # impacts in the step; None: the host does not report impacts
 
 
 class _Motion:
-    """Ranges in which the gaps and speeds of a host's vehicles can be, given the commands since the alert.
+    """Checks whether the states that a host reports are possible, given the commands since the alert.
 
-    ``alert`` are the worlds at the alert, ``dt`` is the length of the host's steps (s; infinite: each to a decision).
+    A state is refused if it breaks one of three rules:
 
-    Three rules refuse an impossible state:
+    1. *Speed in a step.* In a step, a speed changes by no more than the commands so far allow.
+    2. *Gaps since the alert.* The gaps agree with the speeds at the start and at the end of each step.
+    3. *Speed since the alert.* A vehicle follows its commands with a delay of at most ``LAG_S``. The error of its
+       acceleration is at most ``OFF_MPS2`` plus ``OFF_SHARE`` of the command.
 
-    1. *Speed in a step.* It changes by no more than the commands so far allow.
-    2. *Gaps since the alert.* They follow from the speeds at the start and at the end of each step.
-    3. *Speed since the alert.* It follows the commands with a delay of at most ``LAG_S`` and an error of the
-       acceleration of at most ``OFF_MPS2`` plus ``OFF_SHARE`` of the command.
+    If the host does not report impacts, its vehicles pass through one another and do not push. If the host reports
+    impacts, vehicles in contact may push one another. For such vehicles, rule 1 uses the commands of the whole line and
+    the energy of the line after an impact, and rules 2 and 3 start again from the reported state.
 
-    In a host that does not report impacts, bodies pass through one another and never push. In a host that reports
-    impacts, vehicles in contact push one another. For them rule 1 uses the commands of the whole line, and the line's
-    energy after an impact; rules 2 and 3 start again from the reported state.
+    Args:
+        alert: the worlds at the alert.
+        dt: length of the host's steps (s); infinite: each step ends at a decision.
+
     """
 
     def __init__(self, alert: Worlds, dt: float) -> None:
         self.vehicles, self.jitter_s = alert.vehicles, 0.0 if math.isinf(dt) else dt
         self.time_s, self.gaps_m, self.speeds_mps = alert.time_s, alert.gaps_m, alert.speeds_mps
         self.least_mps2 = self.most_mps2 = np.zeros(alert.speeds_mps.shape)  # range of the commands so far
-        self.least_m = self.most_m = alert.gaps_m  # range of the gaps that follows from the speeds
-        self.led_mps = alert.speeds_mps  # speeds that follow from the commands
-        self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # tolerance of led_mps, without the delay
+        self.least_m = self.most_m = alert.gaps_m  # range of the gaps that agree with the speeds
+        self.led_mps = alert.speeds_mps  # speeds of vehicles that follow the commands exactly
+        self.off_mps = np.full(alert.speeds_mps.shape, READ_WITHIN)  # tolerance for led_mps, without the delay
 
     def refusal(self, step: _Step) -> tuple[int, str] | None:
         """Check the state that the host reported at the end of ``step``.
 
-        Returns the row number of a world and what is impossible in it, or None if every state is possible.
+        Returns the row number of a world and a message on its impossible state; None if all states are possible.
         """
         acting_s = np.maximum(step.until_s[:, np.newaxis] - np.maximum(self._now, self.vehicles.latency_s), 0.0)
         command = np.where(acting_s > 0.0, step.wanted_mps2, 0.0)
@@ -503,9 +515,9 @@ class _Motion:
             _refused(
                 step.speeds_mps, low, high,
                 lambda k, i, right: f"vehicle_{i + 1} of world {k} goes from {step.begin_mps[k, i]:g} to"
-                f" {step.speeds_mps[k, i]:g} m/s within {step.until_s[k] - self.time_s[k]:g} s; {right} m/s is possible"
-                f" under {command[k, i]:g} m/s2: begin a step with command.speeds_mps and let bodies pass through one"
-                " another, or report every impact in the state",
+                f" {step.speeds_mps[k, i]:g} m/s within {step.until_s[k] - self.time_s[k]:g} s, but its command of"
+                f" {command[k, i]:g} m/s2 allows {right} m/s; begin each step with command.speeds_mps and let vehicles"
+                " pass through one another, or report every impact",
             )
             or self._wrong_gap(step, met, low, high)
             or self._wrong_speed(step, met, command * acting_s)
@@ -518,7 +530,7 @@ class _Motion:
         return self.time_s[:, np.newaxis]
 
     def _met(self, step: _Step) -> Bools:
-        """Return which vehicles may have pushed one another during the step, [n, N] bool."""
+        """Return for each vehicle whether another vehicle may have pushed it during the step, [n, N] bool."""
         met = np.zeros(step.speeds_mps.shape, np.bool_)
         if step.impacts is not None:
             touch = (step.impacts.count > 0) | (np.minimum(step.gaps_m, self.gaps_m) <= READ_WITHIN)
@@ -529,7 +541,7 @@ class _Motion:
     def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
         """Return the least and the greatest possible speed at the end of the step, each [n, N] m/s.
 
-        ``met`` [n, N]: vehicles that may have pushed one another.
+        ``met`` [n, N] marks the vehicles that may have pushed one another.
         """
         # a host that handles latencies itself does not round them up to whole steps
         acting = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
@@ -539,7 +551,7 @@ class _Motion:
         most = np.where(met, self.most_mps2.max(axis=1, keepdims=True), self.most_mps2)
         begin, seconds = step.begin_mps, np.maximum(step.until_s - self.time_s, step.clock_s)[:, np.newaxis]
         low = begin + least * seconds - READ_WITHIN
-        high = np.maximum(begin, 0.0) + most * seconds + READ_WITHIN  # brakes stop a vehicle that rolls backwards
+        high = np.maximum(begin, 0.0) + most * seconds + READ_WITHIN  # brakes may stop a vehicle that rolls backwards
         if step.impacts is None:
             return low, high
         mass, fastest = self.vehicles.mass_t, np.maximum(np.abs(low), np.abs(high))
@@ -560,16 +572,16 @@ class _Motion:
         return _refused(
             step.gaps_m, least - off, most + off,
             lambda k, p, right: f"the gap between vehicle_{p + 1} and vehicle_{p + 2} of world {k} is"
-            f" {step.gaps_m[k, p]:g} m at {step.until_s[k]:g} s; their speeds lead to {right} m",
+            f" {step.gaps_m[k, p]:g} m at {step.until_s[k]:g} s, but must be {right} m by the reported speeds",
         )  # fmt: skip
 
     def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
-        """Return the first reported speed that the commands since the alert rule out, and what is wrong with it.
+        """Find a reported speed that does not follow the commands since the alert.
 
         Args:
             step: the step.
-            met: [n, N] vehicles that may have pushed one another, which are not checked.
-            change: [n, N] m/s that the command alone adds to the speed in this step.
+            met: [n, N] whether another vehicle may have pushed each vehicle; such vehicles are not checked.
+            change: [n, N] change of speed (m/s) by the command in this step.
 
         Returns the row number of the world and a message; None if all speeds are possible.
 
@@ -584,16 +596,16 @@ class _Motion:
         return _refused(
             step.speeds_mps, np.where(met, -np.inf, led - off), np.where(met, np.inf, led + off),
             lambda k, i, right: f"vehicle_{i + 1} of world {k} drives at {step.speeds_mps[k, i]:g} m/s at"
-            f" {step.until_s[k]:g} s; its commands lead to {right} m/s: follow command.acceleration_mps2",
+            f" {step.until_s[k]:g} s, but should drive at {right} m/s; the host must follow command.acceleration_mps2",
         )  # fmt: skip
 
 
 def _refused(
     values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
 ) -> tuple[int, str] | None:
-    """Find the first of ``values`` [n, entries] outside its range from ``low`` to ``high``.
+    """Find the first of ``values`` [n, k] that is outside its range from ``low`` to ``high``.
 
-    Returns its row, and ``describe(row, entry, range in words)``; None if all values are in range.
+    Returns its row, and the message ``describe(row, column, range as text)``; None if all values are in range.
     """
     good = (low <= values) & (values <= high)
     if good.all():
@@ -603,40 +615,40 @@ def _refused(
 
 
 def _checked_dt(host: Host, scenario: Scenario) -> float:
-    """Return the length of the host's steps (s), its ``dt``.
+    """Return the length ``dt`` of the host's steps (s).
 
-    Raises ``InvalidInput`` for an object that is not a host, and for a step that does not divide the scenario's time
-    step.
+    Raises ``InvalidInput`` if the object is not a host, or if the scenario's time step is not a multiple of ``dt``.
     """
     missing = [what for what in ("dt", "state", "apply") if not hasattr(host, what)]
     if missing:
         raise InvalidInput(
-            f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/extensions/hosts.md shows one"
+            f"host {type(host).__name__}: has no {' and no '.join(missing)}; docs/extensions/hosts.md shows what a host"
+            " needs"
         )
     dt, step = host.dt, scenario.time_step_s
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not dt > 0.0:
-        raise InvalidInput(f"host: dt = {dt!r}: must be a number of seconds above 0, or math.inf")
+        raise InvalidInput(f"host: dt = {dt!r}: the step length must be a number of seconds above 0, or math.inf")
     if not math.isinf(dt) and not (dt <= step * (1.0 + SNAP) and abs(step / dt - round(step / dt)) <= SNAP):
         raise InvalidInput(
-            f"host: dt = {dt:g} s: decisions every {step:g} s must be whole steps; for instance"
-            f" {step / math.ceil(step / dt):g} s"
+            f"host: dt = {dt:g} s: the time between decisions, {step:g} s, must be a multiple of dt; for instance"
+            f" dt = {step / math.ceil(step / dt):g} s"
         )
     return float(dt)
 
 
 def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) -> None:
-    """Raise ``InvalidInput`` if the worlds have brakes that build up, columns of messages or an obstacle.
+    """Raise ``InvalidInput`` if the worlds have brakes that build up, periodic messages or an obstacle.
 
-    A host provides gaps and speeds only, so it cannot represent these. ``vehicles``: indices of controlled vehicles.
+    Hosts do not support them. ``vehicles`` are the indices of the controlled vehicles.
     """
     scenario.play_pieces(worlds, vehicles).refuse_build_up("host")
     if worlds.messages.shape[1] or worlds.obstacle_ahead.any():
         what = "periodic messages or tells (v2x)" if worlds.messages.shape[1] else "an obstacle ahead (obstacle_gap_m)"
-        raise InvalidInput(f"host: scenario {scenario.name!r}: has {what}; hosts know lines of vehicles alone")
+        raise InvalidInput(f"host: scenario {scenario.name!r}: has {what}, which hosts do not support")
 
 
 def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
-    """Return the vehicles of these worlds with all latencies rounded up to whole steps of ``dt`` (s)."""
+    """Return the vehicles of the worlds with all latencies rounded up to multiples of ``dt`` (s)."""
 
     def up(seconds: Floats) -> Floats:
         return np.ceil(seconds / dt - SNAP) * dt

@@ -1,4 +1,4 @@
-"""SUMO as a host. Each world is a straight edge of one simulation, which runs in this process (libsumo)."""
+"""SUMO as a host. Each world is a straight road of one simulation, which runs in this process (libsumo)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 _SUMO_DT_S = 0.01  # default step length
 
-_SUMO_LENGTH_M = 5.0  # length of every vehicle; gaps are bumper to bumper, so its value has no effect
+_SUMO_LENGTH_M = 5.0  # length of every vehicle; it has no effect, because gaps are from bumper to bumper
 
 _SUMO_EDGE_M = 10_000.0
 
@@ -36,17 +36,18 @@ _SUMO_OPTIONS = (
 
 
 class SumoHost:
-    """Host that runs worlds as parallel edges of one SUMO simulation. A process can hold one at a time.
+    """Host that runs worlds as parallel roads of one SUMO simulation. A process can run one simulation at a time.
 
-    Vehicles take the commanded speed. SUMO moves them by its ballistic steps and lets bodies pass through one another.
-    It has no negative speeds: a vehicle that would bounce backwards stands instead. ``close`` ends the simulation.
+    In each step, vehicles reach the commanded speed. SUMO moves them with its ballistic integration, and lets vehicles
+    pass through one another. SUMO has no negative speeds: a vehicle that would move backwards after an impact stands
+    still. ``close`` ends the simulation.
 
     Args:
         worlds: the worlds at the alert.
-        dt: step length, in whole milliseconds (s).
+        dt: step length (s), a whole number of milliseconds.
 
-    Raises ``MissingExtra`` without libsumo. Raises ``InvalidInput`` for another step length, or while another
-    simulation is open.
+    Raises ``MissingExtra`` without libsumo. Raises ``InvalidInput`` for a step length that is not a whole number of
+    milliseconds, or while another simulation is open.
 
     """
 
@@ -54,9 +55,13 @@ class SumoHost:
         with naming_extras(), redirect_stdout(StringIO()):  # libsumo prints a warning about another library's version
             import libsumo
         if not (dt >= 0.001 and abs(1000.0 * dt - round(1000.0 * dt)) < 1e-9):
-            raise InvalidInput(f"sumo: dt = {dt!r}: must be whole milliseconds, s, for instance 0.01")
+            raise InvalidInput(
+                f"sumo: dt = {dt!r}: the step length must be a whole number of milliseconds, for instance 0.01 s"
+            )
         if libsumo.isLoaded():
-            raise InvalidInput("sumo: a simulation is open in this process, which can hold one; close() it first")
+            raise InvalidInput(
+                "sumo: another SUMO simulation is open in this process, but only one is possible; close() it first"
+            )
         self.dt, self._sumo = float(dt), libsumo
         self._names = [[f"{k}.{i}" for i in range(worlds.N)] for k in range(worlds.n)]
         with TemporaryDirectory() as folder:
@@ -65,7 +70,7 @@ class SumoHost:
             routes.write_text(_routes(worlds, self._names), "utf-8")
             files = ("--net-file", str(net), "--route-files", str(routes))
             libsumo.start(["sumo", *files, "--step-length", repr(self.dt), *_SUMO_OPTIONS])
-        libsumo.simulationStep()  # inserts the vehicles at their positions and speeds
+        libsumo.simulationStep()  # the first step creates the vehicles at their positions and speeds
         for name in (name for line in self._names for name in line):
             libsumo.vehicle.setSpeedMode(name, _EVERY_CHECK_OFF)
         self._speeds: Floats = np.array(self.state().speeds_mps)
@@ -79,7 +84,7 @@ class SumoHost:
         return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
 
     def apply(self, command: HostCommand) -> None:
-        """Set the speed of every vehicle at the end of the step from ``command``, and let SUMO make the step."""
+        """Compute from ``command`` the speed of every vehicle at the end of the step, and let SUMO make the step."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
         end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
@@ -90,12 +95,12 @@ class SumoHost:
         self._sumo.simulationStep()
 
     def close(self) -> None:
-        """End the SUMO simulation, so that this process can start another one."""
+        """End the SUMO simulation. Afterwards this process can start another one."""
         self._sumo.close()
 
 
 def _net(edges: int) -> str:
-    """Return the XML of SUMO's network: ``edges`` straight roads of one lane, side by side, one for each world."""
+    """Return the XML of SUMO's network: ``edges`` parallel straight roads with one lane, one for each world."""
     lines = []
     for k in range(edges):
         y = 10.0 * k
@@ -115,8 +120,12 @@ def _net(edges: int) -> str:
 def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
     """Return the XML of SUMO's routes file: all vehicles with their positions and speeds at the alert.
 
-    ``names`` holds the names of the vehicles of each world, front to rear. The last vehicle of each line stands at a
-    tenth of its edge.
+    The last vehicle of each line is at one tenth of the length of its road.
+
+    Args:
+        worlds: the worlds at the alert.
+        names: names of the vehicles of each world, front to rear.
+
     """
     lines = [
         f'<vType id="v" length="{_SUMO_LENGTH_M}" minGap="0" tau="0.001" sigma="0" accel="1000" decel="1000"'
@@ -136,10 +145,11 @@ def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
 
 
 class FoundHost(NamedTuple):
-    """A kind of host (a simulator that moves the vehicles), chosen by its name on a command line."""
+    """A kind of host (a simulator that moves the vehicles), which can evaluate agents."""
 
-    name: str  # name and version, for tables
-    open: Callable[[Worlds], AbstractContextManager[Host]]  # starts a host at the alert of these worlds, for ``with``
+    name: str  # name and version of the simulator, for tables
+    # function that starts a host with worlds at the alert, as a context manager
+    open: Callable[[Worlds], AbstractContextManager[Host]]
 
     def evaluate(
         self,
@@ -151,18 +161,18 @@ class FoundHost(NamedTuple):
         at_once: int = 100,
         on_progress: Callable[[str, int], None] = lambda agent, done: None,
     ) -> tuple[Evaluation, dict[str, Bools | None]]:
-        """Let agents drive the scenario's learners in hosts, in the same worlds.
+        """Let several agents drive the scenario's learners in a host, all in the same worlds.
 
         Args:
             sample: the worlds at the alert.
             agents: agents or teams by name.
             scenario: scenario of the worlds.
-            seed: seed of the worlds, which is recorded; None for worlds of other origin.
+            seed: seed of the worlds, which is stored in the evaluation; None: the worlds have no seed.
             at_once: number of worlds in one host.
-            on_progress: called with an agent's name and the number of its worlds done.
+            on_progress: function that receives the name of an agent and the number of finished worlds.
 
-        Returns the evaluation, and for each agent in which worlds [n] the host moved otherwise than its shield
-        predicted (None without such a shield).
+        Returns the evaluation, and for each agent whether the motion in each world [n] differed from the prediction of
+        its shield (None without a shield that makes predictions).
 
         """
         results: dict[str, Hosted] = {}
@@ -183,15 +193,18 @@ class FoundHost(NamedTuple):
 
 
 def find_host(spec: str) -> FoundHost:
-    """Return the kind of host that a spec names: ``sumo``, or ``sumo:0.05`` with the step length in s.
+    """Return the kind of host for a text: ``sumo``, or ``sumo:0.05`` with the step length in s.
 
-    Raises the exceptions of ``SumoHost``.
+    Raises ``UnknownName`` for an unknown host, ``InvalidInput`` for a wrong step length, and ``MissingExtra`` without
+    libsumo.
     """
     name, colon, text = spec.partition(":")
     if name != "sumo":
         raise unknown_name("host", name, ("sumo",))
     dt = parse_numeral(text) if colon else _SUMO_DT_S
     if dt is None:
-        raise InvalidInput(f"host {spec!r}: {text!r} is no step in s; for instance sumo:{_SUMO_DT_S:g}")
+        raise InvalidInput(
+            f"host {spec!r}: {text!r} is not a step length; give a number of seconds, for instance sumo:{_SUMO_DT_S:g}"
+        )
     need("libsumo")
     return FoundHost(f"SUMO {version('libsumo')}, steps of {dt:g} s", lambda worlds: closing(SumoHost(worlds, dt)))

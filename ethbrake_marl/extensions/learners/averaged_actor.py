@@ -1,4 +1,4 @@
-"""The actor of ``vine``: weights that learn, and their running average, which drives."""
+"""Actor of ``vine``: a network in training, and a copy with the running average of its weights, which drives."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 class Deterministic(BasePolicy):
     """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1].
 
-    A subclass defines ``means`` and ``forward``, and ``expect`` if decisions are drawn by their expected gradient. It
-    can define ``act`` instead of ``means`` if it has no outputs to clip.
+    A subclass defines ``forward``, and either ``means`` or ``act``. For a recipe of ``vine`` with ``focus`` above 0 it
+    also defines ``expect``. In all methods, F is the number of features of an observation.
     """
 
     def means(self, observation: Float32s) -> Float32s:
-        """Return the outputs [rows] of the network in training for observations [rows, F], before clipping."""
+        """Return the unclipped outputs [rows] of the network in training for observations [rows, F]."""
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return a prediction, [rows], of how strongly the return depends on the action at observations [rows, F].
+        """Return the expected absolute gradient of the return with respect to the action, [rows].
 
-        It is the expected absolute gradient of the return with respect to the action.
+        ``observation`` [rows, F] are the observations.
         """
         raise NotImplementedError
 
@@ -45,7 +45,7 @@ class Deterministic(BasePolicy):
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights, by their names in the policy bundle that ``network`` describes."""
+        """Return copies of the averaged weights, by their names in a policy bundle that ``network`` describes."""
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -56,13 +56,13 @@ class Deterministic(BasePolicy):
 class AveragedActor(Deterministic):
     """Actor with two copies of its network: one in training (``learning``), and the running average of its weights.
 
-    A trained policy drives with the average. Its parameters have the same names as in Stable-Baselines3's PPO.
+    A trained policy uses the averaged weights. They have the names that Stable-Baselines3's PPO gives its weights.
 
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
-        recipe: recipe of the training, with the shape of the network.
+        rate: function from the share of the training that remains (1 to 0) to the learning rate.
+        recipe: recipe of the training, which also describes the network.
 
     """
 
@@ -94,7 +94,7 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Copy ``tensors``, the weights of a policy bundle by name, into both copies of the network."""
+        """Copy the weights of a policy bundle into both copies of the network. ``tensors`` maps name to weights."""
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))

@@ -1,7 +1,8 @@
-"""Branches of running episodes: the same moment, played to the end in more than one way.
+"""Branches: copies of a running episode that are played to the end with different actions.
 
-In a branch, an offset is added to one learner's actions for a few steps; then the policy continues in closed loop. Two
-branches of a moment differ only by the offset. Everything else in them is the same, bit for bit.
+In a branch, an offset is added to one learner's actions for a few steps. After these steps the policy acts without an
+offset. Two branches that start in the same state differ only in the offset. Their physics and their random messages are
+the same, bit for bit.
 """
 
 from __future__ import annotations
@@ -29,16 +30,15 @@ Decide = Callable[[Observations, Ints, int], Floats]  # (observations [m, L, F],
 
 
 class Offsets(NamedTuple):
-    """Changed actions in n branches (copies of a running episode).
+    """Offsets that are added to the actions of one learner in each of n branches (copies of a running episode).
 
-    In each branch, an offset is added to the actions of one learner during its first steps. For example, with
-    ``learner = [0, 0]``, ``size = [0.1, -0.1]``, ``steps = [3, 3]``, the foremost learner brakes less for three steps
-    in the first branch, and more in the second.
+    For example, with ``learner = [0, 0]``, ``size = [0.1, -0.1]``, ``steps = [3, 3]``, the foremost learner brakes less
+    for three steps in the first branch, and more for three steps in the second branch.
     """
 
-    learner: Ints  # [n] for each branch: index of the changed learner among the learners (0 = foremost)
-    size: Floats  # [n] for each branch: offset added to its actions; the sum is clipped to [-1, 1]
-    steps: Ints  # [n] for each branch: number of steps with the offset, from the first step on
+    learner: Ints  # [n] index, among the learners, of the learner with the offset (0 = foremost)
+    size: Floats  # [n] offset added to the actions of this learner; the sum is clipped to [-1, 1]
+    steps: Ints  # [n] number of steps with the offset, counted from the start of the branch
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
@@ -46,13 +46,14 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
     Args:
         engine: engine whose n rows are the branches to play; it is changed.
-        act: policy of all learners, a function of observations alone.
-        offsets: for each row the learner whose actions are changed, by how much, and for how many steps.
+        act: policy of all learners: a function from observations to actions.
+        offsets: offset of each row, with its learner and its number of steps.
         gamma: discount of one time step.
 
-    Returns two arrays [n]: the changed learner's discounted return from now on (NaN for a row that could not be
-    advanced), and the sum over the steps of the changes of its actions, after clipping to [-1, 1]. If the reward is
-    harm alone, a row ends as soon as nothing can change any more.
+    Returns two arrays [n]. The first is the discounted return, from the start of the branch, of the learner with the
+    offset (NaN for a row whose simulation failed). The second is the change of that learner's action after clipping to
+    [-1, 1], summed over the steps. If harm is the only term of the reward, a row ends as soon as all its vehicles are
+    at rest for good.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -74,15 +75,17 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
     """Play every row of an engine to the end of its episode, and return each learner's discounted return, [n, L].
 
+    n is the number of rows, L of learners, F of features, m of rows that still run.
+
     Args:
         engine: engine whose rows are played; it is changed.
-        decide: function of the observations [m, L, F], the row numbers [m] that still run, and the number of steps so
-            far. It returns the learners' actions [m, L].
+        decide: function of the observations [m, L, F], the numbers of the rows that still run [m], and the number of
+            steps so far. It returns the learners' actions [m, L].
         gamma: discount of one time step.
-        at_least: number of steps before which no row ends early.
+        at_least: number of steps that every row makes before it may end early.
 
-    If the reward is harm alone, a row ends early as soon as nothing can change any more. The return is NaN for a row
-    that could not be advanced.
+    If harm is the only term of the reward, a row ends early as soon as all its vehicles are at rest for good. The
+    return is NaN for a row whose simulation failed.
 
     """
     vehicles = np.array(engine.learners, np.int64)
@@ -105,10 +108,10 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row of an engine to the end of its episode, and return what the policy met on the way.
+    """Play every row of an engine to the end of its episode, and return all observations and states on the way.
 
-    ``act`` is the policy of all learners. The result covers the m decisions of all rows, in the order of time: the
-    observations [m, L, F], and the states of the worlds.
+    ``act`` is the policy of all learners. Returns the observations [m, L, F] and the states of the worlds at the m
+    decisions of all rows, in the order of time. L is the number of learners, F the number of features.
     """
     seen_then, moments = [], []
 
@@ -124,13 +127,12 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
     """Return for each of ``rows`` [m] whether all vehicles stand and will keep standing, [m] bool.
 
-    ``before`` [m, columns] is the packed state of these rows one step earlier; it must show the same standstill.
-
-    A policy with the same observation acts the same. So the answer is True only if no latency or message can change
-    the observation later.
+    ``before`` [m, columns] is the packed state of these rows one step earlier. A row counts as standing only if nothing
+    has changed since, and if no latency that ends later can change the observation: a policy may act differently on a
+    new observation.
     """
     if engine.packed.has_messages or engine.in_pieces:
-        return np.zeros(len(rows), np.bool_)  # messages under way may change the observation; a profile, the braking
+        return np.zeros(len(rows), np.bool_)  # a message may still change the observation, or a profile the command
     (state, params), stands = engine.packed, np.empty(len(rows), np.bool_)
     find_standing(state, before, params, rows, stands)
     return stands
@@ -138,14 +140,14 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Write into ``stands`` [m] whether nothing can change any more in each of ``rows`` [m].
+    """Write into ``stands`` [m], for each of ``rows`` [m], whether all vehicles are at rest for good.
 
     Args:
         state: packed state of all rows of an engine.
         before: [m, columns] packed state of ``rows`` one step earlier.
         params: packed constants of all rows.
-        rows: [m] row numbers.
-        stands: [m] result, which is overwritten.
+        rows: [m] numbers of the rows to check.
+        stands: [m] array for the result; it is overwritten.
 
     """
     column = columns(state)
@@ -166,9 +168,10 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def counted_harm(engine: Engine, count: HarmCount) -> Floats:
-    """Return the harm so far that each learner of an engine minimises, [n, L] m2/s2: its objective, if it has one.
+    """Return the harm so far that each learner of an engine minimises, [n, L] m2/s2.
 
-    ``count``: each pair's ``first`` impact, or ``total``.
+    This harm is the learner's objective if the reward has objectives, else the harm of the whole line. ``count`` is the
+    count of harm: ``first`` (each pair's first impact) or ``total`` (all impacts).
     """
     declared, shape = engine.reward.objective, (engine.n, len(engine.learners))
     if declared is None:
@@ -185,7 +188,7 @@ def other_count(count: HarmCount) -> HarmCount:
 def moving_rows(moments: State) -> Bools:
     """Return for each of the n states ``moments`` whether at least one vehicle moves, [n] bool.
 
-    Decisions at which all vehicles stand are left out of training, because actions make no difference there.
+    Training leaves out states in which all vehicles stand, because actions have no effect in them.
     """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)

@@ -1,4 +1,4 @@
-"""Gating network of a mixture of experts, which chooses the expert that acts: learning weights and their average."""
+"""Gating network of a mixture of experts: at each decision it chooses the expert that acts."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 
 
 class AveragedGatingNetwork(nn.Module):
-    """Gating network, which chooses one of K experts (networks that drive) from an observation of F features.
+    """Gating network: it chooses one of K experts (networks that drive) from an observation of F features.
 
-    It has two copies: ``learning`` is in training, and ``average``, with the running average of its weights, chooses.
+    The network exists twice. ``learning`` is in training. ``average`` has the running average of the weights of
+    ``learning``, and chooses.
 
-    A memory of M places holds the last decisions at which the experts were compared: the observation, and the extra
-    cost of each expert over the best one.
+    A memory stores the last M decisions at which the experts were compared. For each decision it stores the observation
+    and the extra cost of each expert: its cost minus the cost of the best expert.
 
     Args:
-        inputs: number of features of an observation.
-        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        inputs: number F of features of an observation.
+        rate: function from the share of the training that remains (1 to 0) to the learning rate.
         recipe: recipe with the key ``experts``.
 
     """
 
     seen: Tensor  # [M, F] observations in memory
-    more: Tensor  # [M, K] extra cost of each expert over the best one at these decisions
-    compared: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
+    more: Tensor  # [M, K] extra cost of each expert at these decisions
+    compared: Tensor  # [1] number of decisions added to the memory so far; a new decision replaces the oldest
 
     def __init__(self, inputs: int, rate: Schedule, recipe: VineRecipe) -> None:
         super().__init__()
@@ -53,18 +54,21 @@ class AveragedGatingNetwork(nn.Module):
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Add m decisions to the memory: observations ``seen`` [m, F], and each expert's extra cost ``more`` [m, K]."""
+        """Add m decisions to the memory: observations ``seen`` [m, F] and extra costs ``more`` [m, K]."""
         places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
         self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
         self.compared += len(seen)
 
     def recall(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return randomly drawn decisions of the memory: observations [count, F] and extra costs [count, K]."""
+        """Draw ``count`` decisions from the memory; return their observations [count, F] and extra costs [count, K]."""
         some = torch.randint(min(int(self.compared), len(self.seen)), (count,))
         return self.seen[some], self.more[some]
 
     def choose(self, observation: Float32s) -> NDArray[np.int64]:
-        """Return the index of the expert that the averaged weights choose for each of the observations [rows, F]."""
+        """Return the index of the expert that ``average`` chooses for each observation, [rows].
+
+        ``observation`` [rows, F] are the observations.
+        """
         with torch.no_grad():
             chosen: NDArray[np.int64] = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen

@@ -1,4 +1,4 @@
-"""``gradient_limit: auto``: derive the gradient limit and the smallest offset from recently measured gradients."""
+"""Recipe setting ``gradient_limit: auto``: choose the gradient limit and the smallest offset from recent gradients."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ REMEMBERED = 65_536  # number of measured gradients in memory
 
 CUT = 0.1  # share of the sum of gradient sizes that the limit removes
 
-SPREAD = 2.0  # largest ratio of the spread of gradients at the smallest offset to the spread at the largest
+SPREAD = 2.0  # ratio: root mean square of gradients at the smallest offset / the same at the largest offset
 
-NARROWEST = 4.0  # least ratio of the largest to the smallest offset, which takes precedence over SPREAD
+NARROWEST = 4.0  # least ratio of the largest offset to the smallest; takes precedence over SPREAD
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit to which large gradients are reduced, so that the sum of all sizes falls by ``share``.
+    """Return the limit for gradients with which clipping lowers the sum of absolute gradients by ``share``.
 
-    ``sizes`` [n] are absolute gradients. For example, reducing ``[1, 1, 4]`` to at most 2 lowers the sum 6 to 4, so 2
-    is the limit for the share 1/3.
+    ``sizes`` [n] are absolute gradients. For example, clipping ``[1, 1, 4]`` at 2 lowers the sum from 6 to 4, which is
+    one third less. The limit for the share 1/3 is therefore 2.
     """
     rising = np.sort(sizes)
     remaining = (
@@ -32,14 +32,14 @@ def limit_that_cuts(sizes: Floats, share: float) -> float:
 def smallest_offset(measured: Floats, least: float, most: float) -> float:
     """Return the smallest offset (change of an action) with which gradients should be measured.
 
-    Where harm jumps, gradients scatter more the smaller the offset; where harm is smooth, they do not. So the result is
-    the offset at which their root mean square is expected to be ``SPREAD`` times as large as at ``most``. It is limited
-    to ``most / NARROWEST``, and is never below ``least``. If gradients do not scatter more at small offsets, it is
-    ``least``.
+    A smooth harm gives similar gradients at all offsets. A harm that jumps gives larger gradients at smaller offsets.
+    The result is the offset at which the root mean square of the gradients is expected to be ``SPREAD`` times as large
+    as at ``most``. It is at most ``most / NARROWEST`` and at least ``least``. If gradients are not larger at small
+    offsets, the result is ``least``.
 
     Args:
-        measured: [n, 2] absolute value of each measured gradient, and the offset with which it was measured (0: no
-            measurement yet). The smaller half of the offsets is compared with the larger half.
+        measured: [n, 2] absolute gradient, and the offset with which it was measured (0: no measurement yet). The half
+            of the measurements with the smaller offsets is compared with the other half.
         least: lower end of the range of offsets.
         most: upper end of the range of offsets.
 

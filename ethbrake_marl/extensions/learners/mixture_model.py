@@ -1,4 +1,4 @@
-"""Train a mixture of experts (several networks that drive, and a gating network that chooses one at each decision)."""
+"""Training of a mixture of experts: several networks that drive, and a gating network that chooses one of them."""
 
 from __future__ import annotations
 
@@ -36,9 +36,13 @@ from ethbrake_marl.policies.network_spec import Float32s
 class ExpertsModel(VineModel):
     """Model that trains a mixture of experts: several networks that drive, and a gating network that chooses.
 
-    It trains the first expert in all worlds, the other experts in worlds of their own, the gating network, then all
-    networks jointly. The key ``experts`` of the recipe configures it. The arguments are the environment of the
-    training, and the recipe.
+    The training has four stages. It trains the first expert in all worlds, then each other expert in worlds that are
+    selected for this expert, then the gating network, then all networks jointly.
+
+    Args:
+        environment: environment of the training.
+        recipe: recipe with the key ``experts``.
+
     """
 
     policy: ExpertsPolicy  # type: ignore[assignment]
@@ -47,7 +51,7 @@ class ExpertsModel(VineModel):
         assert recipe.experts is not None
         self.plan = recipe.experts
         self._stage: Stage | None = None
-        self._own: State | None = None  # starting states of the worlds of the stage's expert
+        self._own: State | None = None  # starting states of the worlds selected for the stage's expert
         self._rate_share = 1.0
         super().__init__(environment, recipe)
 
@@ -58,7 +62,7 @@ class ExpertsModel(VineModel):
         if stage != self._stage:
             self._enter(stage, number)
         member = policy.actors[stage.network]
-        if stage.trains == "other":  # whole episodes in some of the expert's own worlds
+        if stage.trains == "other":  # whole episodes in some of the worlds selected for this expert
             assert self._own is not None
             some = torch.randint(len(self._own.motion), (self.n_envs,)).numpy()
             visited, moments = visit(self.engine.branch(self._own.take(some)), member.act)
@@ -90,10 +94,12 @@ class ExpertsModel(VineModel):
     def _enter(self, stage: Stage, number: int) -> None:
         """Prepare a stage of the training that begins, or is resumed, at update ``number``.
 
-        For an expert after the first, find the worlds that it will be trained in, and let it imitate templates (random
-        braking profiles) that do better than the experts so far.
+        If the stage trains an expert after the first one, select the worlds for its training. Let this expert imitate
+        templates (random braking profiles) that do better than the earlier experts.
 
-        The result depends only on finished experts, so it is the same after a resume.
+        The preparation depends on the earlier experts only. A resumed training therefore repeats it exactly.
+
+        Raises ``NoBetterTemplate`` if no template does better, or no world is suitable.
         """
         self._stage, self._own = stage, None
         if stage.trains != "other":
@@ -108,15 +114,15 @@ class ExpertsModel(VineModel):
         self._own = own_worlds(engine, self.plan, explored, pupil.act, gamma)
         if len(shown.action) == 0 or len(self._own.motion) == 0:
             raise NoBetterTemplate(
-                f"experts: network {stage.network + 1}: in none of {self.plan.worlds:,} worlds does one of"
-                f" {self.plan.templates} templates do better than the experts before by {self.plan.gain:g}; set fewer"
-                " networks, or leave experts out"
+                f"experts: no use for expert {stage.network + 1}: in none of the {self.plan.worlds:,} worlds does one"
+                f" of the {self.plan.templates} templates exceed the return of the earlier experts by"
+                f" {self.plan.gain:g}; set fewer networks, or leave out experts"
             )
         if number == stage.first:
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
 
     def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
-        """Train the expert ``pupil`` to imitate the shown actions; ``seed`` orders the batches."""
+        """Train the expert ``pupil`` to imitate the actions of ``shown``; ``seed`` determines the order of batches."""
         pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
@@ -129,17 +135,16 @@ class ExpertsModel(VineModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """Let each of the K experts play to the end from B of the visited decisions, and return what it costs.
+        """Let each of the K experts play to the end of the episode from B of the visited decisions; return the costs.
 
-        The cost is minus the return, plus ``tie_break`` times the harm under the count that the reward does not use.
-        The B decisions are drawn; those at which all experts take the same action are
-        left out, because the choice has no effect there.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm in the count of harm that the
+        reward does not use. The B decisions are drawn from those at which the experts take different actions.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
 
-        Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision [B].
+        Returns observations [B, F], costs [B, K], and the importance (weight in the loss) of each decision, [B].
 
         """
         engine, members = self.engine, [actor.act for actor in self.policy.actors]
@@ -161,12 +166,12 @@ class ExpertsModel(VineModel):
     def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
         """Train the gating network to choose the cheapest expert.
 
-        A decision's weight is the extra cost of the other experts.
+        A wrong choice counts in the loss in proportion to its extra cost over the cheapest expert.
 
         Args:
             seen: [B, F] observations.
             costs: [B, K] cost of each expert.
-            importance: [B] factor of each decision; None: 1.
+            importance: [B] factor of each decision in the loss; None: 1.
 
         """
         importance = np.ones(len(seen), np.float32) if importance is None else importance

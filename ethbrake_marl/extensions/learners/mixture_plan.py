@@ -1,4 +1,4 @@
-"""The recipe's key ``experts``: how a mixture of experts is trained."""
+"""Recipe key ``experts``: settings for the training of a mixture of experts."""
 
 from __future__ import annotations
 
@@ -9,51 +9,49 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 
 
 class Shares(FileModel):
-    """Share, 0 to 1, of all updates that each stage of training a mixture of experts has; the shares sum to 1."""
+    """Share (0 to 1) of all updates for each stage of training a mixture of experts. The four shares sum to 1."""
 
-    pretraining_first: Fraction  # share for the first expert, in all worlds
-    pretraining_others: Fraction  # share for the other experts, one after the other, each in worlds of its own
+    pretraining_first: Fraction  # share for the first expert, which is trained in all worlds
+    pretraining_others: Fraction  # share for the other experts together; each is trained in worlds selected for it
     gating: Fraction  # share for the gating network, which chooses an expert at each decision
-    joint: Fraction  # share for all experts and the gating network; each expert learns where it is chosen
+    joint: Fraction  # share for joint training of all networks; each expert learns at decisions at which it is chosen
 
     @model_validator(mode="after")
     def _everything(self) -> Shares:
         total = self.pretraining_first + self.pretraining_others + self.gating + self.joint
         if not abs(total - 1.0) <= 1e-9:
-            raise ValueError(f"the sum of the shares is {total:g}; must be 1")
+            raise ValueError(f"the sum of the four shares is {total:g}; it must be 1")
         return self
 
 
 class ExpertsPlan(FileModel):
     """Settings of a mixture of experts: several networks that drive, and a gating network that chooses one of them.
 
-    Each expert after the first is pre-trained in two steps. It imitates templates (random braking profiles) in worlds
-    where one of them does better than all experts before. It is then trained in worlds of its own: those in which it is
-    hardly worse than these experts.
+    Each expert after the first is pre-trained in two steps. First, it imitates templates (random braking profiles) in
+    worlds in which a template does better than all earlier experts. Then it is trained in the worlds in which it is
+    nearly as good as the best earlier expert, or better.
     """
 
     networks: int = Field(ge=2, le=16, description="number of experts")
     gating: Layers = Field(description="hidden layers of the gating network")
-    # Number of worlds, the first of the training, in which templates are compared with the experts so far.
-    worlds: int = Field(ge=1, le=1_000_000, description="worlds in which templates are compared with the experts")
-    templates: int = Field(ge=1, le=100_000, description="templates (random braking profiles) drawn in each world")
-    # A template is imitated if its return exceeds the return of every earlier expert by more than this.
-    gain: NonNegative = Field(
-        description="a template is imitated if its return exceeds that of every earlier expert by this"
+    worlds: int = Field(
+        ge=1, le=1_000_000, description="number of worlds in which templates are compared with the earlier experts"
     )
-    # A world belongs to a new expert if its return there is at most this much below the best earlier expert.
+    templates: int = Field(ge=1, le=100_000, description="templates (random braking profiles) drawn in each world")
+    gain: NonNegative = Field(
+        description="an expert imitates a template whose return exceeds the best earlier expert's by more than this"
+    )
     margin: Positive = Field(
-        description="an expert is trained in worlds where its return is at most this below the best earlier expert"
+        description="an expert is trained in worlds in which its return is at most this below the best earlier expert's"
     )
     imitation_epochs: int = Field(ge=1, le=1000, description="passes over the decisions of the imitated templates")
-    # Number of decisions in each update at which every expert is played to the end, for the gating network to learn.
-    gating_states: int = Field(ge=1, le=1_000_000, description="decisions of an update at which experts are compared")
-    gating_memory: int = Field(ge=1, le=1_000_000, description="compared decisions that are kept in memory")
-    gating_steps: int = Field(ge=1, le=100_000, description="gradient steps of the gating network in each update")
-    # Weight, in that comparison, of harm under the count that the reward does not use (first impacts or all).
-    tie_break: NonNegative = Field(
-        description="weight, in this comparison, of harm in the count that the reward does not use"
+    gating_states: int = Field(
+        ge=1, le=1_000_000, description="number of decisions in each update at which the experts are compared"
     )
-    # Factor on the learning rate in the last stage, in which all networks learn.
+    gating_memory: int = Field(ge=1, le=1_000_000, description="number of compared decisions that are stored")
+    gating_steps: int = Field(ge=1, le=100_000, description="gradient steps of the gating network in each update")
+    tie_break: NonNegative = Field(
+        description="when experts are compared: weight of the count of harm (first or total) that the reward omits"
+    )
     joint_rate: Rate = Field(description="factor on the learning rate in the last stage, in which all networks learn")
-    shares: Shares = Field(description="share of all updates that each stage has; their sum is 1")
+    shares: Shares = Field(description="share of all updates for each stage; the shares sum to 1")

@@ -1,4 +1,4 @@
-"""A mixture of experts as one policy: several actors and a gating network."""
+"""Policy made of several actors (experts) and a gating network that chooses one of them at each decision."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ExpertsPolicy(Deterministic):
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
+        rate: function from the share of the training that remains (1 to 0) to the learning rate.
         recipe: recipe with the key ``experts``.
 
     """
@@ -40,9 +40,9 @@ class ExpertsPolicy(Deterministic):
         self.gate = AveragedGatingNetwork(flatdim(observation_space), rate, recipe)
 
     def _chosen(self, observation: Float32s, ask: Callable[[AveragedActor, Float32s], NDArray[Any]]) -> Floats:
-        """Return for each observation [rows, F] one value, [rows], from the actor that the gating network chooses.
+        """Return one value for each observation [rows, F], computed by the actor that the gating network chooses.
 
-        ``ask`` is a method of the actors from observations to values, such as ``AveragedActor.means``.
+        ``ask`` is a method of an actor that maps observations to values, such as ``AveragedActor.means``.
         """
         chosen, values = self.gate.choose(observation), np.empty(len(observation))
         for number, actor in enumerate(self.actors):

@@ -1,4 +1,4 @@
-"""Stages of training a mixture of experts: which updates train which of its networks."""
+"""Stages of training a mixture of experts: which networks each update trains."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ Trains = Literal["first", "other", "gating", "joint"]
 
 
 class Stage(NamedTuple):
-    """One stage of training a mixture of experts: a range of updates, and what they train."""
+    """One stage of training a mixture of experts: a range of updates, and the networks that these updates train."""
 
     trains: Trains  # the first expert, one of the others, the gating network, or all networks jointly
-    network: int  # index of the expert that a stage ``other`` trains, from 1; 0 in other stages
-    first: int  # first update, counted from 0
-    end: int  # first update after the stage
+    network: int  # index of the expert that a stage ``other`` trains, 1 or more; 0 in all other stages
+    first: int  # number of the stage's first update, counted from 0
+    end: int  # number of the first update after the stage
 
 
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training with this number of updates, in order; a stage may be empty.
+    """Return the stages of a training in their order. A stage may be empty.
 
-    ``plan`` is the key ``experts`` of the recipe, with the share of each stage.
+    Args:
+        plan: value of the recipe's key ``experts``, with the share of each stage.
+        updates: number of updates in the whole training.
+
     """
     shares, others = plan.shares, plan.networks - 1
     parts: list[tuple[Trains, int, float]] = [("first", 0, shares.pretraining_first)]

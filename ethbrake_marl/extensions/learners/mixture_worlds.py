@@ -1,6 +1,6 @@
-"""Worlds in which random templates do better than all experts so far, and the templates to imitate in them.
+"""Selection of worlds and templates for a new expert of a mixture.
 
-A *template* is a random braking profile from the search.
+A *template* is a random braking profile. A new expert imitates templates that do better than all earlier experts.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from ethbrake_marl.game.observations import Observations
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 from ethbrake_marl.policies.network_spec import Float32s
 
-NO_DIFFERENCE = 1e-2  # returns closer than this are equal
+NO_DIFFERENCE = 1e-2  # returns that differ by less than this count as equal
 
 
 class Explored(NamedTuple):
-    """The first n worlds of the training, and the best results of the experts so far in them."""
+    """The first n worlds of the training, and the best result of the earlier experts in each of these worlds."""
 
     alert: Worlds  # the worlds at the alert
-    start: State  # their states at the first decision
-    gained: Floats  # [n] highest return of any expert
-    harm: Floats  # [n] least harm of any expert (m2/s2)
+    start: State  # states of the worlds at the first decision
+    gained: Floats  # [n] highest return of the earlier experts
+    harm: Floats  # [n] least harm of the earlier experts (m2/s2)
 
 
 class Shown(NamedTuple):
-    """Observations and actions of m decisions of templates (random braking profiles), for an expert to imitate."""
+    """Decisions of templates (random braking profiles) that a new expert imitates: m observations and actions."""
 
     seen: Float32s  # [m, F] observations
-    action: Float32s  # [m] actions in [-1, 1]
+    action: Float32s  # [m] actions of the templates, in [-1, 1]
 
 
 def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every expert drive the first ``plan.worlds`` worlds of the training, and return the best results.
+    """Let every earlier expert drive in the first ``plan.worlds`` worlds of the training; return the best results.
 
     Args:
         engine: engine of the training; it is not changed.
-        plan: the key ``experts`` of the recipe.
-        acts: function of each expert from observations [rows, F] to actions [rows].
+        plan: value of the recipe's key ``experts``.
+        acts: earlier experts, each as a function from observations [rows, F] to actions [rows].
         gamma: discount of one time step.
 
     """
@@ -64,17 +64,17 @@ def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float
 def drive_from(
     engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
-    """Play states to the end of their episodes with one policy.
+    """Let one policy drive from n states to the end of each episode; return its return and harm.
 
     Args:
         engine: engine of the training; it is not changed.
-        start: the n states to continue from.
-        act: policy, from observations [rows, F] to actions [rows].
+        start: the n states at which the policy begins.
+        act: policy: a function from observations [rows, F] to actions [rows].
         gamma: discount of one time step.
-        count: impacts that the harm counts; None: as the reward does.
+        count: impacts that count as harm, ``first`` or ``total``; None: the count of the reward.
 
-    Returns the first learner's return [n] (NaN for a row that could not be advanced), and the harm [n] (m2/s2) by its
-    objective.
+    Returns two arrays [n] for the first learner: its return (NaN for a row whose simulation failed), and the harm
+    (m2/s2) that it minimises.
 
     """
     rows = engine.branch(start)
@@ -84,16 +84,17 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
-    """Draw templates (random braking profiles), and return the actions of those that do better than all experts.
+    """Draw templates (random braking profiles), and return the decisions of the templates that beat all experts.
 
-    In each world the best of ``plan.templates`` is taken, if its return exceeds every expert's by ``plan.gain``.
+    For each world, ``plan.templates`` templates are drawn. The best of them is returned if its return exceeds the best
+    expert's by more than ``plan.gain``.
 
     Args:
         engine: engine of the training; it is not changed.
-        plan: the key ``experts`` of the recipe.
-        explored: worlds and results of the experts, from ``explore``.
+        plan: value of the recipe's key ``experts``.
+        explored: worlds and results of the earlier experts, from ``explore``.
         gamma: discount of one time step.
-        seed: seed of the templates.
+        seed: seed with which the templates are drawn.
 
     """
     (vehicle,) = engine.learners
@@ -132,15 +133,15 @@ def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma:
 def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, gamma: float) -> State:
     """Return the starting states of the worlds in which a new expert is to be trained.
 
-    These are the worlds in which its return is at most ``plan.margin`` below the best of the earlier experts. Worlds in
-    which it has the same return as the best one, or in which an earlier expert does no harm, are left out: it could
-    learn nothing there.
+    A world is selected if the return of the new expert is less than ``plan.margin`` below the return of the best
+    earlier expert. Two kinds of worlds are left out: worlds in which both returns are equal, and worlds in which an
+    earlier expert does no harm.
 
     Args:
         engine: engine of the training; it is not changed.
-        plan: the key ``experts`` of the recipe.
+        plan: value of the recipe's key ``experts``.
         explored: worlds and results of the earlier experts, from ``explore``.
-        act: the new expert, from observations [rows, F] to actions [rows].
+        act: the new expert: a function from observations [rows, F] to actions [rows].
         gamma: discount of one time step.
 
     """
@@ -151,4 +152,4 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """No template (random braking profile) does better than the experts so far, so another has nothing to learn."""
+    """Raised if no template (random braking profile) does better than the earlier experts; a new one is of no use."""

@@ -1,4 +1,4 @@
-"""Adam, one gradient step, and a running average of weights."""
+"""The optimiser Adam, one gradient step, and a running average of weights."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch.optim import Optimizer
 
 
 class Adam(torch.optim.Adam):
-    """Adam optimiser of torch with the same results, bit for bit, that does not import torch's compiler.
+    """Torch's optimiser Adam without torch's decorators. Its results are the same, bit for bit.
 
-    Its methods lack torch's decorators, which would import the compiler (1 to 3 s of CPU).
+    The decorators would import torch's compiler, which takes 1 to 3 s of processor time.
     """
 
 
@@ -22,12 +22,12 @@ for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 def adam(rate: float, *networks: nn.Module | None) -> Adam:
-    """Return an Adam optimiser with the learning rate ``rate`` for all weights of these networks; None is skipped."""
+    """Return an Adam optimiser with the learning rate ``rate`` for all weights of ``networks``. None is skipped."""
     return Adam([weight for each in networks if each is not None for weight in each.parameters()], lr=rate, eps=1e-5)
 
 
 def descend(optimizer: Optimizer, *losses: Tensor) -> None:
-    """Change the weights of ``optimizer`` by one gradient step that lowers the sum of these losses (scalars)."""
+    """Make one gradient step of ``optimizer`` on the sum of ``losses`` (scalars)."""
     optimizer.zero_grad()
     for loss in losses:
         loss.backward()  # type: ignore[no-untyped-call]
@@ -36,9 +36,13 @@ def descend(optimizer: Optimizer, *losses: Tensor) -> None:
 
 @torch.no_grad()
 def follow(average: Iterable[Tensor], learning: nn.Module, keep: float) -> None:
-    """Move averaged weights towards the weights of ``learning``: ``average = keep average + (1 - keep) learning``.
+    """Update a running average of weights: ``average = keep * average + (1 - keep) * learning``.
 
-    ``average`` holds the averaged weights in the order of ``learning.parameters()``; they are changed.
+    Args:
+        average: averaged weights in the order of ``learning.parameters()``; they are changed.
+        learning: network in training, whose weights are averaged.
+        keep: share of the average that remains, from 0 to 1.
+
     """
     for mean, learns in zip(average, learning.parameters(), strict=True):
         mean.lerp_(learns, 1.0 - keep)

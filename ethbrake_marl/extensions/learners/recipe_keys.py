@@ -1,4 +1,4 @@
-"""Recipe keys that the algorithms of this extension share."""
+"""Types of recipe keys that both algorithms, ``vine`` and ``rollout-classification``, use."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ethbrake_marl.training.recipe import Rate
 
 
 class OffsetRange(FileModel):
-    """Range from which a distance between two actions is drawn, uniformly in its logarithm.
+    """Range from which a distance between two actions is drawn. The logarithm of the distance is uniform.
 
     Actions are numbers from -1 (full braking) to 1.
     """
@@ -24,7 +24,7 @@ class OffsetRange(FileModel):
     @classmethod
     def _in_order(cls, value: float, info: ValidationInfo) -> float:
         if "smallest" in info.data and not value >= info.data["smallest"]:
-            raise ValueError(f"must be at least smallest = {info.data['smallest']:g}")
+            raise ValueError(f"must be at least smallest, which is {info.data['smallest']:g}")
         return value
 
 
@@ -32,8 +32,8 @@ Holds = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict
 
 Averaging = Annotated[float, Field(ge=0.0, lt=1.0)]  # with 1 the average would never change
 
-AVERAGING = "share of the averaged weights that a gradient step keeps; the average is what drives"
+AVERAGING = "share of the weight average that a gradient step keeps; the trained policy uses the averaged weights"
 
-NO_SHAPING = "must be 0: tried actions are played to the end of the episode, where shaping adds nothing"
+NO_SHAPING = "must be 0: this algorithm plays tried actions to the end of the episode, so shaping has no effect"
 
 Focus = Annotated[float, Field(ge=0.0, le=0.99, exclude_if=not_)]

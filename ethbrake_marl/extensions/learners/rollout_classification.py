@@ -1,6 +1,6 @@
-"""The algorithm rollout classification: try several actions at a decision and learn to choose the cheapest one.
+"""The algorithm rollout classification: try several actions at a decision, and learn to choose the cheapest of them.
 
-Source: Lagoudakis and Parr 2003, Reinforcement Learning as Classification.
+Source: Lagoudakis and Parr, Reinforcement Learning as Classification, 2003.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from ethbrake_marl.training.training import Training
 
 
 class RolloutClassification(Algorithm):
-    """The algorithm rollout classification, with one actor for all learners."""
+    """The algorithm rollout classification. One actor drives all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model for a training, which learns in ``environment``.
+        """Return a new model for a training. It learns in ``environment``.
 
-        Before it learns, it brakes fully, or acts as the first policy of the recipe's key ``policies``.
+        The untrained model acts as the first policy of the recipe's key ``policies``; without this key it brakes fully.
         """
         recipe = training.recipe
         assert isinstance(recipe, RolloutClassificationRecipe)
@@ -31,6 +31,9 @@ class RolloutClassification(Algorithm):
         return RolloutClassificationModel(environment, recipe, weights)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
+        """Return copies of an actor's averaged weights, by their names in a policy bundle.
+
+        ``network`` describes the network in the bundle.
+        """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors

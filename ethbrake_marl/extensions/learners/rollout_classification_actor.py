@@ -1,4 +1,4 @@
-"""Actor that scores a number of actions and takes the best one, with a memory of what tried actions cost."""
+"""Actor that scores a number of actions and takes the best one. A memory stores the costs of tried actions."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 
 
 class _TorchActor(Actor):
-    """``Actor`` (a policy's network) with torch's matrix products instead of numpy's.
+    """``Actor`` (the network of a policy) with the matrix products of torch instead of numpy.
 
-    It is three times as fast; the last bits differ.
+    It is three times as fast. Its outputs differ from those of ``Actor`` by rounding.
     """
 
     @torch.no_grad()
@@ -45,26 +45,27 @@ class _TorchActor(Actor):
 class ChoosingActor(Deterministic):
     """Actor whose network scores a number of choices; it takes the choice with the highest score.
 
-    The first ``first`` choices are policies, which then act; the others are actions, evenly spaced from -1 to 1.
-    The network ``learning`` is in training; ``average``, with the running average of its weights, drives.
+    Choices are numbered. A number below ``first`` means a trained policy, which then decides on the action. Each
+    other number means an action; the actions are evenly spaced from -1 to 1. The network ``learning`` is in training.
+    The network ``average`` has the running average of its weights, and drives.
 
-    The memory of M places holds the last decisions at which C choices were tried, and how much more each cost than the
-    best one. F is the number of features.
+    A memory stores the last M decisions at which C choices were tried. The *extra cost* of a choice is its cost minus
+    the cost of the best tried choice. F is the number of features.
 
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: learning rate as a function of the remaining share of the training, from 1 to 0.
-        recipe: the recipe.
-        policies: for each trained policy that the actor can choose instead of an action, its weights by name.
-        members: number of scenarios in the training's mixture; 1 without a mixture.
+        rate: function from the share of the training that remains (1 to 0) to the learning rate.
+        recipe: recipe of the training.
+        policies: weights by name of each trained policy that the actor can choose.
+        members: number of scenarios in the mixture on which the actor is trained; 1 without a mixture.
 
     """
 
     seen: Tensor  # [M, F] observations in memory
-    tried: Tensor  # [M, C] numbers of the tried choices; the actor itself took the first of the C
-    more: Tensor  # [M, C] extra cost of each tried choice over the best one
-    known: Tensor  # [1] number of decisions added to the memory so far; new ones replace the oldest
+    tried: Tensor  # [M, C] numbers of the tried choices; the actor itself took the choice in column 0
+    more: Tensor  # [M, C] extra cost of each tried choice
+    known: Tensor  # [1] number of decisions added to the memory so far; a new decision replaces the oldest
     usual: Tensor  # [members] mean cost of the best tried choice in each scenario of a mixture; 0: not measured yet
 
     def __init__(
@@ -80,14 +81,14 @@ class ChoosingActor(Deterministic):
         inputs, shape, room = flatdim(observation_space), recipe.network, (recipe.memory, 1 + recipe.others)
         self.first, scores = len(policies), len(policies) + shape.choices  # numbers below ``first`` stand for policies
         layers = create_mlp(inputs, scores, list(shape.policy), ACTIVATIONS[shape.activation])
-        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # until it learns, all scores are equal and it
-        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # takes number 0: a policy, or full braking
+        nn.init.zeros_(layers[-1].weight)  # type: ignore[arg-type]  # all scores of the untrained network are equal:
+        nn.init.zeros_(layers[-1].bias)  # type: ignore[arg-type]  # it takes choice 0, a policy or full braking
         self.average = nn.Sequential(*layers)
         self.learning = copy.deepcopy(self.average)
         self.optimizer = adam(rate(1.0), self.learning)
         spec = recipe.network_spec(inputs)
         tensors = {f"among_{m}.{name}": each[name] for m, each in enumerate(policies, 1) for name in each}
-        self._names = tuple(tensors)  # of the tensors of the policies
+        self._names = tuple(tensors)  # names of the weights of the policies
         for name, tensor in tensors.items():
             self.register_buffer(name.replace(".", "_"), torch.from_numpy(tensor))
         chooser = {row.name: np.zeros(row.shape, np.float32) for row in spec.tensors if row.name not in tensors}
@@ -102,8 +103,8 @@ class ChoosingActor(Deterministic):
     def choose(self, observation: Float32s) -> Ints:
         """Return the number of the choice with the highest score, [rows], for each of the observations [rows, F].
 
-        Numbers below the attribute ``first`` stand for policies. The other numbers stand for actions, evenly spread:
-        ``first`` is the action -1, and the largest number is the action 1.
+        A number below the attribute ``first`` means a policy. A larger number means an action: ``first`` is the action
+        -1, the largest number is the action 1, and the numbers between them are evenly spaced.
         """
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
@@ -125,7 +126,7 @@ class ChoosingActor(Deterministic):
 
         Args:
             seen: [m, F] observations.
-            tried: [m, C] numbers of the tried choices, as from ``choose``; the actor itself took the first of the C.
+            tried: [m, C] numbers of the tried choices, as from ``choose``; the actor itself took column 0.
             more: [m, C] extra cost of each tried choice over the best one.
 
         """
@@ -135,14 +136,16 @@ class ChoosingActor(Deterministic):
         self.known += len(seen)
 
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Draw decisions from the memory; yield for each gradient step their rows and importance, both [count].
+        """Draw decisions from the memory for several gradient steps.
 
-        The importance is a decision's weight in the loss.
+        Yields, for each gradient step, the rows of the decisions in the memory and their importance (weight in the
+        loss), both [count].
 
         Args:
             batches: number of gradient steps.
-            count: decisions per step.
-            focus: share that is drawn in proportion to how much the choice matters; 0: all are drawn uniformly.
+            count: number of decisions for each step.
+            focus: share of the decisions that are drawn in proportion to the largest extra cost of a tried choice; the
+                rest is drawn uniformly.
 
         """
         known = min(int(self.known), len(self.seen))
@@ -156,15 +159,16 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Return the loss at decisions of the memory: the expected cost of actions drawn by a softmax of the scores.
+        """Return the loss at decisions of the memory: the expected extra cost of a choice, plus a convex term.
 
-        Its gradient vanishes if the probabilities are nearly 0 or 1. So ``guide`` times a convex loss is added, which
-        lowers the score of every action except the best, and more for a costlier action.
+        The expected extra cost uses the softmax of the scores as probabilities. Its gradient nearly vanishes where a
+        probability is close to 0 or 1. The convex term has a gradient there too. It lowers the score of every tried
+        choice except the best one, in proportion to the extra cost.
 
         Args:
             some: row numbers of the decisions in the memory.
-            importance: factor of each of them.
-            guide: weight of the convex loss.
+            importance: factor of each decision.
+            guide: weight of the convex term.
 
         """
         more = self.more[some]

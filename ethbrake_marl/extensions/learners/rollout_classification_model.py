@@ -1,4 +1,4 @@
-"""The model of rollout classification: it tries several actions at a decision and learns which costs least."""
+"""Model of rollout classification: it tries several actions at a decision, and learns which of them costs least."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from ethbrake_marl.scenario.schema import as_scenario
 
 FOR_GOOD = 2**31  # number of steps beyond the length of any episode
 
-USUAL_KEPT = 0.98  # share of itself that the running mean of costs keeps in each update
+USUAL_KEPT = 0.98  # weight of the old value when the running mean of costs is updated
 
 LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with almost no harm
 
 
 class RolloutClassificationModel(VineModel):
-    """Model that visits decisions with the actor, tries several actions at some of them, and learns their costs.
+    """Model that drives with an actor, tries several actions at some of its decisions, and learns from their costs.
 
     Args:
         environment: environment of the training.
-        recipe: the recipe.
-        policies: for each trained policy that the actor can choose instead of an action, its weights by name.
+        recipe: recipe of the training.
+        policies: weights by name of each trained policy that the actor can choose.
 
     """
 
@@ -48,7 +48,7 @@ class RolloutClassificationModel(VineModel):
         policies: Sequence[Mapping[str, Float32s]],
     ) -> None:
         self._policies = policies
-        super().__init__(environment, recipe)  # type: ignore[arg-type]  # it has all keys that the base class reads
+        super().__init__(environment, recipe)  # type: ignore[arg-type]  # the recipe has all keys of the base class
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
@@ -82,15 +82,15 @@ class RolloutClassificationModel(VineModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try several choices (actions, or policies that act) at some visited decisions, each to the episode's end.
+        """Try C choices (actions, or policies that act) at B of the visited decisions, each to the end of its episode.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
 
-        Returns for B decisions and C choices at each: observations [B, F], numbers of the choices [B, C] as from
-        ``ChoosingActor.choose``, and their costs [B, C]. The first choice is the one that the actor takes. A cost is
-        minus the return, changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
+        Returns three arrays: the observations [B, F], the numbers of the choices [B, C] as from
+        ``ChoosingActor.choose``, and the costs of the choices [B, C]. The actor itself takes the choice in column 0. A
+        cost is minus the return; the recipe's keys ``tie_break``, ``caution`` and ``relative`` modify it.
 
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
@@ -146,13 +146,13 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the running mean cost of each scenario of a mixture; return the mean that belongs to each decision.
+        """Update the mean cost of each scenario of a mixture; return the mean cost of each decision's scenario, [B].
+
+        The result is at least ``LEAST_USUAL``, because costs are divided by it.
 
         Args:
-            rows: [B] indices of the decisions' worlds among all visited worlds.
+            rows: [B] index of each decision's world among all visited worlds.
             least: [B] cost of the best tried choice at each decision.
-
-        The result [B] has a lower limit, so that costs can be divided by it.
 
         """
         numbers = self._numbers[rows]

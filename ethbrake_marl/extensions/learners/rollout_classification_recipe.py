@@ -1,4 +1,4 @@
-"""The recipe of the algorithm ``rollout-classification``."""
+"""Recipe of the algorithm ``rollout-classification``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
 
 class ChoosingShape(Shape):
-    """Hidden layers of an actor that scores a number of actions, spread evenly from -1 to 1."""
+    """Network of an actor that scores a number of actions, evenly spaced from -1 to 1."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
@@ -32,9 +32,12 @@ class ChoosingShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description of the network in a policy bundle: an actor that takes the action of highest score.
+        """Return the description, for a policy bundle, of an actor that takes the action with the highest score.
 
-        ``observation_size`` is the number of features of an observation; ``more`` are other fields of ``NetworkSpec``.
+        Args:
+            observation_size: number of features of an observation.
+            more: other fields of ``NetworkSpec``.
+
         """
         return super().spec(observation_size, output="choice", choices=self.choices, **more)
 
@@ -45,76 +48,71 @@ PolicyName = Annotated[str, Field(pattern=r"^[a-z-]+(@.+)?$", max_length=4096)]
 class RolloutClassificationRecipe(TrainingRecipe):
     """Recipe of rollout classification: the policy learns from several actions, each tried to the end of its episode.
 
-    It learns to choose between ``network.choices`` actions, spread evenly from -1 to 1, and the ``policies``. In
-    a round (``n_envs x n_steps`` decisions, then an update), ``tried`` of the decisions are tried with: the action that
-    the policy takes; one below and one above it for each distance of ``near``; the actions ``fixed``; and ``drawn``
-    random ones (policies if there are any, else actions). The *cost* of an action is minus the return after it.
+    The policy chooses among ``network.choices`` actions, evenly spaced from -1 to 1, and the trained ``policies``. A
+    round is ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a round, these choices are tried:
+
+    - the choice of the policy itself;
+    - for each range of ``near``, one action below and one action above the action of the policy;
+    - the actions ``fixed``;
+    - ``drawn`` random choices: trained policies if the recipe has any, else actions.
+
+    The *cost* of a choice is minus the return from that decision to the end of the episode.
     """
 
     most_decisions = 2**22
 
     algorithm: Literal["rollout-classification"]
-    # Trained policies that the network can choose instead of an action. A policy that itself chooses between policies
-    # is replaced by these.
     policies: Annotated[tuple[PolicyName, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
-        (), description="trained policies, one of which can be chosen to act at a decision; left out: none"
+        (), description="trained policies; at a decision the network can let one of them act; left out: none"
     )
-    # Number of consecutive decisions in each world between two updates.
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
-    tried: int = Field(ge=1, description="decisions of a round that are tried with other actions")
-    # Ranges of distances; from each, one is drawn, and the actions this far below and above the taken one are tried.
+    tried: int = Field(ge=1, description="number of decisions in a round at which several actions are tried")
     near: Annotated[tuple[OffsetRange, ...], Field(strict=False, max_length=8)] = Field(
-        description="ranges of distances, drawn uniformly in the logarithm; the actions this far below and above the"
-        " policy's are tried"
+        description="ranges of distances; from each range one distance is drawn, and the actions this far below and"
+        " above the policy's action are tried"
     )
-    # Actions that are tried at every such decision; each is rounded to the nearest of the ``choices`` of the network.
     fixed: Annotated[tuple[Annotated[float, Field(ge=-1.0, le=1.0)], ...], Field(strict=False, max_length=16)] = Field(
-        description="actions tried at each of these decisions, -1 (full braking) to 1; rounded to the network's choices"
+        description="actions that are always tried, -1 (full braking) to 1; rounded to the nearest choice of the"
+        " network"
     )
-    # Number of random choices that are tried: ``policies``, or actions if there are none.
     drawn: int = Field(
-        ge=0, le=16, description="number of random choices tried as well: policies, or actions if there are none"
+        ge=0, le=16, description="number of random choices that are tried too: policies, or actions without policies"
     )
-    # Numbers of steps, one of which is drawn at each decision; a tried action is held for so long.
-    holds: Holds = Field(description="numbers of steps, one of which is drawn; a tried action is held for so long")
-    # Upper limit of an action's extra cost over the best tried action, so that rare large costs do not dominate.
+    holds: Holds = Field(description="numbers of steps for which a tried action lasts; one number is drawn each time")
     largest_cost: Positive = Field(
-        description="largest extra cost of an action over the best one; larger ones are cut to it"
+        description="limit of an action's extra cost over the best tried action; a larger extra cost is cut to it"
     )
-    # Factor, growing from 0 to this value during the training, of an additional cost: by how much more an action costs
-    # than braking fully from this decision on.
     caution: float = Field(
         0.0,
         ge=0.0,
         allow_inf_nan=False,
         exclude_if=not_,
-        description="weight of an action's extra cost over full braking from there on; grows from 0 to this at the end",
+        description="weight of a further cost: the action's cost minus the cost of full braking to the end, if"
+        " positive; grows from 0 to this value during the training",
     )
-    # Weight, in the cost, of the line's harm under the count that the reward does not use (first impacts or all).
     tie_break: float = Field(
         0.0,
         ge=0.0,
         allow_inf_nan=False,
         exclude_if=not_,
-        description="weight of the line's harm in the count that the reward does not use",
+        description="weight, in the cost, of the count of harm (first or total) that the reward omits",
     )
-    # Whether costs are divided by the mean cost in the same scenario of a mixture, so that all scenarios count alike.
     relative: bool = Field(
         False,
         exclude_if=not_,
-        description="true: in a mixture, costs are divided by the mean cost in the same scenario",
+        description="true: in a mixture of scenarios, a cost is divided by the mean cost in its scenario",
     )
-    # Share of the decisions to learn from that are drawn in proportion to how much the tried actions differ in cost.
     focus: Focus = Field(
-        0.0, description="share of the decisions to learn from that are drawn where the costs differ most"
+        0.0, description="share of the decisions to learn from that are drawn in proportion to the largest extra cost"
     )
-    # Weight of a convex term in the loss, which keeps gradients alive where the policy is nearly certain.
     guide: NonNegative = Field(
-        description="weight of the convex part of the loss, without which learning can stall at the beginning"
+        description="weight of the convex term of the loss; without it learning can stall at the beginning"
     )
-    # Number of decisions in memory, from which the network learns: the latest with a difference between the costs.
     memory: int = Field(
-        ge=1, le=500_000, description="decisions to learn from: the last ones at which the tried actions differ in cost"
+        ge=1,
+        le=500_000,
+        description="number of decisions in memory to learn from: the last ones at which the tried actions differ in"
+        " cost",
     )
     gradient_steps: int = Field(ge=1, le=100_000, description="steps of the optimiser in one update")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
@@ -129,18 +127,18 @@ class RolloutClassificationRecipe(TrainingRecipe):
         if not self.tried <= visited:
             refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
         if not self.memory >= self.tried:
-            refuse(("memory",), self.memory, f"must be at least tried = {self.tried}")
+            refuse(("memory",), self.memory, f"must be at least tried, which is {self.tried}")
         if not self.others:
-            refuse(("near",), list(self.near), "must hold a range if there are neither fixed nor drawn actions")
+            refuse(("near",), list(self.near), "must contain a range, because the recipe has no fixed or drawn actions")
         return self
 
     @property
     def others(self) -> int:
-        """Number of actions that are tried in addition to the action that the policy takes."""
+        """Number of choices that are tried at a decision besides the policy's own choice."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network in a policy bundle, including the policies that it may choose.
+        """Return the description of the network, and of the policies that it may choose, for a policy bundle.
 
         ``observation_size`` is the number of features of an observation.
         """
@@ -150,9 +148,9 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
     @cached_property
     def loaded_policies(self) -> tuple[Policy, ...]:
-        """The policies that the key ``policies`` names, loaded once.
+        """The trained policies that the key ``policies`` names. They are loaded once.
 
-        A policy that itself chooses between policies is replaced by these.
+        A policy that itself chooses between policies is replaced by these policies.
 
         Raises ``InvalidInput`` with the name of a policy that cannot be used.
         """
@@ -163,7 +161,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
             policy = load_policy(path) if path else load_shipped(kind)
             by = policy.manifest.algorithm
             if path and kind not in ("policy", by):
-                raise InvalidInput(f"recipe {self.name!r}: policies: {name}: must be {by}@{path}")
+                raise InvalidInput(f"recipe {self.name!r}: policies: {name}: was trained by {by}; write {by}@{path}")
             loaded += policy.among or [policy]
         if loaded and not self.drawn <= len(loaded):
             raise InvalidInput(
@@ -179,6 +177,6 @@ ROLLOUT_CLASSIFICATION = Part(
 ROLLOUT_CLASSIFICATION_AGENT = Part(
     make_policy_agent,
     form="rollout-classification@PATH",
-    about="a policy trained by rollout classification: a run or a bundle",
+    about="a policy trained by rollout classification; PATH is a run or a bundle",
     knows=Source.MESSAGES,
 )

@@ -1,7 +1,7 @@
-"""A scout: a small network that learns which decisions matter, so that most branches are spent on those.
+"""Scout: a small network that predicts at which decisions the action matters. More branches start at such decisions.
 
-A branch costs the same at every decision, but its gradient is 0 where the action changes nothing. So decisions are
-drawn with unequal probabilities. Decisions that are drawn more often get a smaller weight, so the expectation is the
+A branch takes as long where the action has no effect as where it has one. Decisions are therefore drawn with unequal
+probabilities. A decision that is drawn more often gets a smaller weight in the loss, which keeps the expected loss the
 same (importance sampling).
 """
 
@@ -20,9 +20,10 @@ WIDTH = 64  # units of the hidden layer
 
 
 class Scout(nn.Module):
-    """Small network that predicts from an observation how much the choice of the action matters there.
+    """Small network that predicts from an observation how much the action matters.
 
-    It learns the size of the measured gradient, or cost difference. ``inputs`` is the number of features.
+    It learns the absolute value of the measured gradient, or the measured difference in cost. This value is called the
+    *size* below. ``inputs`` is the number F of features of an observation.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -30,11 +31,11 @@ class Scout(nn.Module):
         self.layers = nn.Sequential(nn.Linear(inputs, WIDTH), nn.ReLU(), nn.Linear(WIDTH, 1))
         last = self.layers[-1]
         assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.weight)  # until it learns, its prediction is the same everywhere
+        nn.init.zeros_(last.weight)  # the untrained network predicts the same size for all observations
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the logarithm of the expected gradient size, [rows], for observations [rows, F]; at most 20."""
+        """Return the logarithm of the expected size, [rows], for observations [rows, F]; at most 20."""
         logarithm: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return logarithm
 
@@ -45,14 +46,14 @@ class Scout(nn.Module):
         return size
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Return a loss whose minimum is reached by predicting the mean size.
+        """Return a loss that is smallest if the network predicts the mean size.
 
-        Large sizes weigh less than in a squared error.
+        Large sizes have less influence on this loss than on a squared error.
 
         Args:
             observation: [rows, F] observations.
             size: [rows] measured sizes.
-            importance: [rows] factor of each row.
+            importance: [rows] factor of each row in the loss.
 
         """
         logarithm = self(observation)
@@ -61,10 +62,16 @@ class Scout(nn.Module):
 
 
 def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of n rows with replacement, preferring rows with a large expected size.
+    """Draw ``count`` of n rows with replacement; a row with a large expected size is drawn more often.
 
-    The share ``focus`` is drawn in proportion to ``expected`` [n] > 0, the rest uniformly. Returns the rows and their
-    importance, 1 / (probability of the row x number of rows), which is 1 on average.
+    Args:
+        expected: [n] expected size of each row, above 0.
+        count: number of rows to draw.
+        focus: share of the rows that is drawn in proportion to ``expected``; the rest is drawn uniformly.
+
+    Returns the numbers of the rows [count], and their importance [count]: 1 / (n x probability of the row). The
+    expected importance is 1.
+
     """
     n = len(expected)
     chance = (1.0 - focus) / n + focus * (expected / expected.sum())
@@ -75,18 +82,17 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 def choose_rows(
     observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats] | None
 ) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of ``rows`` at which to try actions, preferring decisions that matter.
+    """Draw ``count`` of the decisions ``rows`` at which to try actions; decisions that matter are drawn more often.
 
     Args:
-        observed: [n, F] observations of all decisions.
+        observed: [n, F] observations at all decisions.
         rows: row numbers of the decisions to draw from.
-        count: number of rows to draw.
-        focus: share drawn in proportion to ``expect`` with replacement (``draw_rows``). 0: all are drawn uniformly
-            without replacement.
-        expect: function from observations to the expected size of the difference, [rows]; None: all are drawn
-            uniformly.
+        count: number of decisions to draw.
+        focus: share of the decisions drawn in proportion to ``expect``, with replacement (see ``draw_rows``). 0: all
+            decisions are drawn uniformly, without replacement.
+        expect: function from observations [rows, F] to expected sizes [rows]; None: as with ``focus`` 0.
 
-    Returns the drawn rows and their importance (1 if drawn uniformly).
+    Returns the row numbers of the drawn decisions, and their importance (1 if they are drawn uniformly).
 
     """
     if focus == 0.0 or expect is None or len(rows) == 0:

@@ -1,4 +1,4 @@
-"""Take over the weights of a trained policy that observes fewer features."""
+"""Copy the weights of a trained policy into a training that observes further features."""
 
 from __future__ import annotations
 
@@ -11,40 +11,46 @@ from ethbrake_marl.training.training import Training
 
 
 def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of a trained policy, by name, enlarged to the features that a new training observes.
+    """Return the weights of a trained policy by name, with added weights for the further features of a training.
 
-    The weights of features that the policy does not observe are 0. Raises ``InvalidInput`` if the training lacks a
-    feature of the policy, or has another network.
+    The added weights are 0. Raises ``InvalidInput`` if the training does not observe a feature of the policy, or if
+    the two networks differ.
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
     network = policy.manifest.network
     if network.networks > 1:
         raise InvalidInput(
-            f"recipe {recipe.name!r}: start: this policy is a mixture of {network.networks} networks; give a"
-            " policy with one network"
+            f"recipe {recipe.name!r}: start: the policy is a mixture of {network.networks} networks; name a policy"
+            " with one network"
         )
     for name in ("policy_hidden", "activation", "output"):
         if getattr(network, name) != getattr(wanted, name):
             raise InvalidInput(
                 f"recipe {recipe.name!r}: network: {name} is {getattr(wanted, name)}, but {getattr(network, name)} in"
-                " the policy to start from; they must be the same"
+                " the policy to start from; change the recipe to the value of the policy"
             )
     return padded(policy, training, "start")
 
 
 def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np.float32]]:
-    """Return all weights of a trained policy except the critic's, by name, enlarged to the training's features.
+    """Return the weights of a trained policy by name, with added weights for the further features of a training.
 
-    The weights of features that the policy does not observe are 0. Raises ``InvalidInput`` if the training lacks a
-    feature of the policy; ``key`` is the key of the recipe that names the policy, for the message.
+    The added weights are 0. The weights of the critic are left out. Raises ``InvalidInput`` if the training does not
+    observe a feature of the policy.
+
+    Args:
+        policy: trained policy.
+        training: training that begins with the weights.
+        key: key of the recipe that names the policy, for the error message.
+
     """
     names = [feature.name for feature in training.observation.features]
     known = policy.manifest.observation.features
     missing = [name for name in known if name not in names]
     if missing:
         raise InvalidInput(
-            f"recipe {training.recipe.name!r}: observation: lacks {', '.join(missing[:5])}, which the policy of {key}"
-            " observes; list all of its features"
+            f"recipe {training.recipe.name!r}: observation: lacks {', '.join(missing[:5])}, which the policy of the key"
+            f" {key} observes; list all features of this policy"
         )
     weights = {name: tensor.copy() for name, tensor in policy.tensors.items() if not name.startswith("value.")}
     for name in [name for name in weights if name.endswith(".0.weight")]:

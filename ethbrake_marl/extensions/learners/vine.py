@@ -1,6 +1,6 @@
-"""The algorithm ``vine``: gradients of the return, measured by continuing from the same moment in two ways.
+"""The algorithm ``vine``: measure gradients of the return by continuing from the same state with two actions.
 
-Vine is the sampling scheme of Schulman et al. 2015 (TRPO): branches from visited states with common random numbers.
+The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ from ethbrake_marl.training.training import Training
 class Vine(Algorithm):
     """The algorithm vine: it measures gradients of the return, and trains an actor with them.
 
-    All learners share one actor; a single learner may have a mixture of experts instead.
+    One actor drives all learners. If there is one learner, a mixture of experts may drive it instead.
     """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a new model for a training, which learns in ``environment``.
+        """Return a new model for a training. It learns in ``environment``.
 
-        It begins with the weights of the policy that the recipe's key ``start`` names, or with random weights.
+        Its first weights are copied from the policy that the recipe's key ``start`` names. Without this key they are
+        random.
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
@@ -46,14 +47,17 @@ class Vine(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights of ``actor``, by the names in the bundle that ``network`` describes."""
+        """Return copies of an actor's averaged weights, by their names in a policy bundle.
+
+        ``network`` describes the network in the bundle.
+        """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the model's optimisers by name.
+        """Return the model's optimisers by name: ``policy``, or ``network_1``, ``network_2``, ... and ``gate``.
 
-        The only one is ``policy``, or in a mixture there are ``network_1``, ``network_2``, ..., and ``gate``.
+        The names ``network_K`` and ``gate`` belong to a mixture of experts.
         """
         if not isinstance(model, ExpertsModel):
             return {"policy": model.policy.optimizer}

@@ -1,4 +1,4 @@
-"""The model of vine: visit decisions, try some of them in two ways, learn from the difference."""
+"""Model of vine: at some decisions it tries a higher and a lower action, and learns from the difference in return."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class VineModel(BaseAlgorithm):
-    """Model that visits decisions with a deterministic actor, tries two actions at some of them, and learns from that.
+    """Model that drives with a deterministic actor, tries two actions at some of its decisions, and learns from them.
 
-    One of the two actions is higher than the actor's, the other is lower. The difference of the returns measures the
-    gradient of the return with respect to the action.
+    One of the two actions is higher than the actor's action, the other is lower. The difference between the two returns
+    measures the gradient of the return with respect to the action.
 
     Args:
         environment: environment of the training.
-        recipe: the recipe.
+        recipe: recipe of the training.
 
     """
 
@@ -69,7 +69,7 @@ class VineModel(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train until the learners have made ``total_timesteps`` decisions; arguments as in Stable-Baselines3."""
+        """Train until the learners have made ``total_timesteps`` decisions. The arguments are Stable-Baselines3's."""
         total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total:
@@ -79,9 +79,9 @@ class VineModel(BaseAlgorithm):
         return self
 
     def _update(self, callback: BaseCallback, total: int) -> None:
-        """Do one update of the training: collect decisions, and learn from them.
+        """Make one update of the training: collect decisions, and learn from them.
 
-        ``callback`` is the training's; ``total`` is the number of decisions in the whole training.
+        ``callback`` is the callback of the training; ``total`` is the number of decisions in the whole training.
         """
         actor = self.policy
         seen, moments = self._visit(callback, actor.act)
@@ -90,7 +90,7 @@ class VineModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions with the policy ``act``, and report each to ``callback``.
+        """Drive in all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each one.
 
         Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
         """
@@ -112,14 +112,14 @@ class VineModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """Try some of the visited decisions with a higher and a lower action, each to the end of its episode.
+        """Try a higher and a lower action at some of the visited decisions, each to the end of its episode.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
-            actor: policy that drives before and after the change of the action.
+            actor: policy to whose actions the offsets are added.
 
-        Returns the tried decisions with their measured gradients.
+        Returns the decisions at which actions were tried, with the measured gradients.
 
         """
         recipe, learners = self.recipe, len(self.engine.learners)
@@ -153,10 +153,7 @@ class VineModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Train the actor on the decisions of ``tried`` towards better actions within the trust radius.
-
-        The loss is logged.
-        """
+        """Train the actor on the decisions and gradients of ``tried``, with targets within the trust radius."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

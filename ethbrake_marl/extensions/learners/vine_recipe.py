@@ -1,4 +1,4 @@
-"""The recipe of the algorithm ``vine``."""
+"""Recipe of the algorithm ``vine``."""
 
 from __future__ import annotations
 
@@ -22,26 +22,28 @@ from ethbrake_marl.training.agents import make_policy_agent
 from ethbrake_marl.training.recipe import ACTOR_LAYERS, Layers, Positive, Rate, Shape, TrainingRecipe
 from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
-_RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@ or vine@ and the path of one"
+_RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@PATH or vine@PATH of a trained policy"
 
 
 class ActorShape(Shape):
-    """Hidden layers of an actor without a critic."""
+    """Network of an actor. There is no critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
     initial_action: Annotated[float | None, Field(ge=-1.0, le=1.0, exclude_if=lambda v: v is None)] = Field(
-        None, description="action of the untrained network, [-1, 1], about; left out: 0, which coasts"
+        None, description="approximate action of the untrained network, -1 to 1; left out: 0, which coasts"
     )
 
 
 class VineRecipe(TrainingRecipe):
-    """Recipe of vine: some decisions are tried with a higher and a lower action, each to the end of its episode.
+    """Recipe of vine: a higher and a lower action are tried at some decisions, each to the end of its episode.
 
-    A round has ``n_envs x n_steps`` decisions; ``tried`` of them are tried. The policy learns from the
-    differences of the returns. ``start`` names a trained policy to continue from; without it the weights are random.
-    ``start: ppo`` means the shipped policy ``ppo`` or ``ppo-...`` that was trained on the scenario of this training; if
-    there is none, the weights are random.
+    A round has ``n_envs x n_steps`` decisions. The two actions are tried at ``tried`` of these decisions. The policy
+    learns from the difference of the two returns.
+
+    ``start`` names the trained policy whose weights the training begins with; without this key the weights are random.
+    ``start: ppo`` means the shipped policy ``ppo`` or ``ppo-...`` that was trained on the scenario of this training. If
+    no such policy is shipped, the weights are random.
     """
 
     most_decisions = 2**22
@@ -49,29 +51,28 @@ class VineRecipe(TrainingRecipe):
     algorithm: Literal["vine"]
     start: Annotated[str, Field(pattern=r"^((ppo|vine)@.+|[a-z-]+)$", max_length=4096)] | None = Field(
         None,
-        description="a policy to continue from, ppo or ppo@PATH; ppo: the shipped policy that was trained on this"
-        " scenario, or random weights if there is none; left out: random weights",
+        description="policy to start from, ppo or ppo@PATH; ppo: the shipped policy that was trained on this scenario,"
+        " or random weights if no such policy is shipped; left out: random weights",
     )
     n_steps: int = Field(ge=1, description="decisions of each world between two updates")
-    tried: int = Field(ge=1, description="decisions of a round that are tried with a higher and a lower action")
-    offset: OffsetRange = Field(description="range of the change of the tried action; drawn uniformly in its logarithm")
-    holds: Holds = Field(description="numbers of steps, one of which is drawn; the action is changed for so long")
-    # Largest size of a measured gradient (return per unit of action); larger ones, at jumps of the harm, are cut to it.
+    tried: int = Field(ge=1, description="decisions of a round at which a higher and a lower action are tried")
+    offset: OffsetRange = Field(description="range of the offset between a tried action and the policy's action")
+    holds: Holds = Field(description="numbers of steps for which an offset lasts; one number is drawn each time")
     gradient_limit: Positive | Literal["auto"] = Field(
-        description="largest gradient, in return per action; larger ones are cut to it; auto: as measured"
+        description="largest gradient (return per unit of action); a larger gradient is cut to it; auto: computed from"
+        " measured gradients"
     )
-    # Largest distance from an action to the target that it is trained towards in one update.
-    trust_radius: Rate = Field(description="largest change of an action that one update aims at")
-    # Weight that holds actions where they are; the larger, the less small gradients move them.
+    trust_radius: Rate = Field(description="largest distance from an action to its target in one update")
     anchor: Positive = Field(
-        description="weight that holds an action in place; the larger, the less small gradients move it"
+        description="weight against changes of an action; with a larger weight small gradients change it less"
     )
     n_epochs: int = Field(ge=1, le=1000, description="passes of an update over the tried decisions")
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
     averaging: Averaging = Field(description=AVERAGING)
-    # Share of the tried decisions that are drawn in proportion to the gradient that a small network expects there.
     focus: Focus = Field(
-        0.0, description="share of the tried decisions drawn where a small network expects large gradients"
+        0.0,
+        description="share of the tried decisions that are drawn in proportion to the gradient that a small network"
+        " predicts",
     )
     network: ActorShape = Field(description=NETWORK)
     experts: Annotated[ExpertsPlan | None, Field(exclude_if=not_)] = Field(
@@ -108,7 +109,7 @@ class VineRecipe(TrainingRecipe):
         return self
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network in a policy bundle: an actor, or several actors and a gating network.
+        """Return the description of the network for a policy bundle: an actor, or several actors and a gating network.
 
         ``observation_size`` is the number of features of an observation.
         """
@@ -117,9 +118,9 @@ class VineRecipe(TrainingRecipe):
         return self.network.spec(observation_size, **mixture)
 
     def policy_to_start_from(self, scenario: Scenario) -> str | None:
-        """Return the spec of the policy whose weights a training on ``scenario`` begins with.
+        """Return the policy whose weights a training on ``scenario`` begins with; None: random weights.
 
-        For instance ``ppo-obstacle`` or ``ppo@runs/x``; None: random weights.
+        The policy is a text such as ``ppo-obstacle`` or ``ppo@runs/x``.
         """
         if self.start is None or "@" in self.start:
             return self.start
@@ -127,23 +128,27 @@ class VineRecipe(TrainingRecipe):
         return next((name for name in names if load_shipped(name).manifest.scenario.get("name") == scenario.name), None)
 
     def begins(self, scenario: Scenario) -> str:
-        """Return a phrase about the initial weights, for messages.
+        """Return a phrase on the initial weights for messages: a policy such as ``ppo``, or ``random weights``.
 
-        It is the spec of a policy, such as ``ppo``, or ``random weights`` with the reason.
+        If ``start`` names a policy that is not shipped for ``scenario``, the phrase says so.
         """
-        why = "" if self.start is None else f", as no {self.start} ships for scenario {scenario.name!r}"
+        why = "" if self.start is None else f", because no {self.start} is shipped for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` for a mixture of experts with several learners; it is for one learner only."""
+        """Raise ``InvalidInput`` if the recipe has a mixture of experts and the training has several learners."""
         if self.experts is not None and learners != 1:
             raise InvalidInput(
-                f"recipe {self.name!r}: experts: a mixture is for one learner, not for {learners}; leave experts out"
+                f"recipe {self.name!r}: experts: a mixture of experts can drive one learner only, but the scenario has"
+                f" {learners}; leave out experts"
             )
 
 
 VINE = Part(VineRecipe, "ethbrake_marl.extensions.learners.vine:Vine")
 
 VINE_AGENT = Part(
-    make_policy_agent, form="vine@PATH", about="a policy trained by vine: a run or a bundle", knows=Source.MESSAGES
+    make_policy_agent,
+    form="vine@PATH",
+    about="a policy trained by vine; PATH is a run or a bundle",
+    knows=Source.MESSAGES,
 )

@@ -1,1 +1,1 @@
-"""Proven bounds on harm that no behaviour of the controlled vehicles can beat."""
+"""Proven lower bounds on harm: no command of the controlled vehicles does less harm."""

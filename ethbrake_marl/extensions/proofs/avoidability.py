@@ -1,12 +1,13 @@
 """Decide whether the controlled vehicle can avoid contact with both neighbours.
 
-The *largest trajectory* is the trajectory of the controlled vehicle that is farthest ahead at all times without contact
-with the front vehicle. Contact with the rear vehicle is avoidable exactly if the rear vehicle stays behind it.
+One trajectory decides. The *largest trajectory* of the controlled vehicle is farther ahead at every time than any other
+trajectory that stays behind the front vehicle. Contact with the rear vehicle can be avoided exactly if the rear vehicle
+stays behind the largest trajectory.
 
-Symbols: l the front vehicle (leader), f the controlled vehicle (follower), r the rear vehicle; gap [m], speed v [m/s],
-braking capacity a > 0, driving capacity u >= 0 [m/s2]. Times count from the moment at which the controlled vehicle
-may act; by then the leader brakes. docs/internals/proofs/avoidable-contact.md derives
-every formula. Only + - * / and sqrt are used.
+Symbols: the index l marks the front vehicle (leader), f the controlled vehicle (follower), r the rear vehicle. A gap is
+in m, a speed v in m/s, a braking capacity a > 0 and a driving capacity u >= 0 in m/s2. Time 0 is the moment at which
+the controlled vehicle may act; the leader brakes by then. docs/internals/proofs/avoidable-contact.md derives every
+formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import BOUND, solo_motion, stopping_distances
 from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
-ROUNDING_M = 1e-12  # a smaller overlap is a rounding error of gap 0, not an impact
+ROUNDING_M = 1e-12  # a smaller overlap is a rounding error at gap 0, not an impact
 
-SQUEEZE_M = 1e-9  # with less room than this between both neighbours, contact counts as unavoidable
+SQUEEZE_M = 1e-9  # if less room than this remains between both neighbours, contact counts as unavoidable
 
-TOUCHING_M = 1e-5  # the same limit where contact with the front vehicle is forced, which may change the way by as much
+# The same limit if even full braking brings the vehicle to the front vehicle; that touch may move it by this much.
+TOUCHING_M = 1e-5
 
 AVOIDABLE, EARLY, FRONT, REAR = 0, 1, 2, 3
 
@@ -37,17 +39,17 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 
 @compiled
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
-    """Return the part of the gap that full braking from now does not need to stay behind the braking front vehicle, m.
+    """Return the part of the gap (m) that remains if the follower brakes fully from now on.
 
-    A negative value means that the two meet. If the follower stops last, the stopping distances decide, else the moment
-    of equal speeds.
+    The front vehicle also brakes fully. A negative result means that the two vehicles make contact. If the follower
+    comes to rest last, the stopping distances decide; otherwise the gap is smallest when both speeds are equal.
 
     Args:
         gap: gap between the two vehicles, m.
         v_l: speed of the front vehicle (leader), m/s.
-        a_l: its braking capacity, m/s2.
+        a_l: braking capacity of the leader, m/s2.
         v_f: speed of the follower, m/s.
-        a_f: its braking capacity, m/s2.
+        a_f: braking capacity of the follower, m/s2.
 
     """
     if v_f * a_l >= v_l * a_f:
@@ -61,20 +63,22 @@ def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> flo
 def drive_before_braking(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float
 ) -> tuple[float, float, bool]:
-    """Return how long a vehicle may drive with constant ``u >= 0`` so that full braking still keeps it behind the
-    leader.
+    """Return how long a vehicle can drive if full braking afterwards must still keep it behind the leader.
 
-    Returns the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles move at
-    that time (then ``a_f > a_l`` and the speeds are equal; else the follower stops at the standing leader). Both times
-    are infinite if the follower never moves. Assumes ``spare_gap >= 0``.
+    While it drives, the vehicle has the constant acceleration ``u >= 0``. The leader is the vehicle in front; it brakes
+    from now on. Requires ``spare_gap >= 0``.
+
+    The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
+    still move at that time. If both move, ``a_f > a_l`` and their speeds are equal; otherwise the follower stops at the
+    standing leader. Both times are infinite if the follower never moves.
 
     Args:
-        gap: gap to the leader (the vehicle in front, which brakes from now on), m.
+        gap: gap to the leader, m.
         v_l: speed of the leader, m/s.
         a_l: braking capacity of the leader, m/s2.
         v_f: speed of the following vehicle, m/s.
-        a_f: its braking capacity, m/s2.
-        u: its driving acceleration, m/s2.
+        a_f: braking capacity of the following vehicle, m/s2.
+        u: driving acceleration of the following vehicle, m/s2.
 
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
@@ -101,20 +105,19 @@ def drive_before_braking(
 def largest_behind(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
 ) -> tuple[float, float, bool]:
-    """Return how long a vehicle may drive, at most up to its speed limit, so that full braking still keeps it behind
-    the leader.
+    """Return how long a vehicle with a speed limit can drive if full braking afterwards must keep it behind the leader.
 
-    The leader is the front vehicle, which brakes from now on. Also returns the time at which the gap becomes 0 (s), and
-    whether both vehicles move then.
+    The leader is the vehicle in front; it brakes from now on. The further results are the time at which the gap becomes
+    0 (s), and whether both vehicles still move at that time.
 
     Args:
         gap: gap to the leader, m.
         v_l: speed of the leader, m/s.
         a_l: braking capacity of the leader, m/s2.
         v_f: speed of the following vehicle, m/s.
-        a_f: its braking capacity, m/s2.
-        u: its driving acceleration, m/s2.
-        limit: its speed limit, m/s.
+        a_f: braking capacity of the following vehicle, m/s2.
+        u: driving acceleration of the following vehicle, m/s2.
+        limit: speed limit of the following vehicle, m/s.
 
     """
     cap = time_to_limit(v_f, u, limit)
@@ -131,16 +134,16 @@ def largest_behind(
 
 @compiled
 def lowest_while_coasting(gap: float, v_f: float, v_r: float, a_r: float, onset_r: float, until: float) -> float:
-    """Return the smallest gap between a vehicle that coasts until ``until`` and the vehicle behind it, m.
+    """Return the smallest gap (m) between a coasting vehicle and the vehicle behind it until the time ``until``.
 
-    The gap is convex, so its minimum is at equal speeds or at an end.
+    The gap is a convex function of time, so it is smallest when both speeds are equal, or at one end of the interval.
 
     Args:
         gap: gap now, m.
         v_f: speed of the coasting vehicle, m/s.
         v_r: speed of the vehicle behind, m/s.
-        a_r: its braking capacity, m/s2.
-        onset_r: time from which on it brakes, s.
+        a_r: braking capacity of the vehicle behind, m/s2.
+        onset_r: time from which on the vehicle behind brakes, s.
         until: end of the coasting, s.
 
     """
@@ -162,15 +165,17 @@ def met(gap: float, closing: float) -> bool:
 def leader_at_onset(
     gap: float, v_l: float, a_l: float, onset_l: float, v_f: float, start: float
 ) -> tuple[float, float]:
-    """Return gap to the leader (m) and speed of the leader (m/s) at ``start``, if the follower coasts until then.
+    """Return the gap to the leader (m) and the speed of the leader (m/s) at ``start``, if the follower coasts until
+    then.
 
-    The leader brakes by then. The gap is concave until then: if it is not negative at the end, it never was.
+    The leader brakes by then. Until then the gap is a concave function of time: if it is not negative at ``start``, it
+    was not negative before.
 
     Args:
         gap: gap now, m.
         v_l: speed of the leader (front vehicle), m/s.
-        a_l: its braking capacity, m/s2.
-        onset_l: time from which on it brakes, s.
+        a_l: braking capacity of the leader, m/s2.
+        onset_l: time from which on the leader brakes, s.
         v_f: speed of the follower, m/s.
         start: time at which the follower may act, s.
 
@@ -181,16 +186,15 @@ def leader_at_onset(
 
 @compiled
 def decide_front(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Decide whether vehicle ``i`` stays behind the front vehicle by full braking; return False if it certainly does
-    not.
+    """Return whether full braking may keep vehicle ``i`` behind the front vehicle; False if contact is certain.
 
     Args:
         gap: [P] gaps, m.
         speed: [N] speeds, m/s.
-        onset: [N] times from which on the vehicles may brake, s.
+        onset: [N] times from which on the vehicles may act, s.
         braking: [N] braking capacities, m/s2.
         i: index of the controlled vehicle, at least 1.
-        out: [RESULT_WIDTH] receives columns REASON (a code), MARGIN and SPARE (both m) of the verdict.
+        out: [RESULT_WIDTH] verdict; receives the columns REASON (a code), MARGIN and SPARE (both m).
 
     """
     a_l, v_f, a_f = braking[i - 1], speed[i], braking[i]
@@ -211,9 +215,10 @@ def plan_behind(
     gap: Floats, speed: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, keep: float,
     plan: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write to ``plan`` the most forward trajectory of vehicle i among those that stay ``keep`` metres behind i - 1.
+    """Write to ``plan`` the trajectory of vehicle i that is farthest ahead, but stays ``keep`` metres behind vehicle i
+    - 1.
 
-    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle ahead at that distance.
+    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle in front at that distance.
 
     Args:
         gap: [P] gaps, m.
@@ -223,10 +228,10 @@ def plan_behind(
         driving: [N] driving capacities, m/s2.
         limit: [N] speed limits, m/s.
         i: index of the controlled vehicle.
-        keep: distance to keep to the vehicle ahead, m.
-        plan: [2, PIECES] receives the trajectory: ends (s) and accelerations (m/s2) of its pieces.
-        out: [RESULT_WIDTH] receives columns DRIVE (s; end of the drive), TOUCH (s; end of the full braking after it)
-            and FOLLOW (m/s2; the command after that).
+        keep: distance to keep to the vehicle in front, m.
+        plan: [2, PIECES] receives the trajectory: the ends (s) and the accelerations (m/s2) of its pieces.
+        out: [RESULT_WIDTH] verdict; receives the columns DRIVE (s; end of the drive), TOUCH (s; end of the full braking
+            after the drive) and FOLLOW (m/s2; the command after the braking).
 
     """
     a_f, u = braking[i], driving[i]
@@ -242,7 +247,7 @@ def plan_behind(
 
 @compiled
 def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats, i: int, out: Floats) -> bool:
-    """Return whether the vehicle behind vehicle ``i`` meets it before vehicle ``i`` may act.
+    """Return whether the vehicle behind vehicle ``i`` has contact with it before vehicle ``i`` may act.
 
     Args:
         gap: [P] gaps, m.
@@ -250,7 +255,7 @@ def meets_rear_early(gap: Floats, speed: Floats, onset: Floats, braking: Floats,
         onset: [N] times from which on the vehicles may act, s.
         braking: [N] braking capacities, m/s2.
         i: index of the controlled vehicle.
-        out: [RESULT_WIDTH] receives columns REASON and MARGIN if they meet.
+        out: [RESULT_WIDTH] verdict; receives the columns REASON and MARGIN if there is contact.
 
     """
     v_f, v_r, a_r, start = speed[i], speed[i + 1], braking[i + 1], onset[i]
@@ -269,9 +274,10 @@ def decide_world(
 ) -> None:  # fmt: skip
     """Decide whether vehicle ``i`` can avoid contact in one world, and write the verdict to ``out``.
 
-    Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m) as in ``Avoidability``, SPARE (m; part
-    of the gap that full braking does not need), DRIVE and TOUCH (s after vehicle ``i`` may act; end of the drive, and
-    of the full braking after it), FOLLOW (m/s2; the command after that).
+    Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m; as in ``Avoidability``), SPARE (m; part
+    of the gap that remains under full braking), DRIVE (s; end of the drive), TOUCH (s; end of the full braking after
+    the drive), FOLLOW (m/s2; the command after the braking). Both times count from the moment at which vehicle ``i``
+    may act.
 
     Args:
         gap: [P] gaps, m.
@@ -281,8 +287,8 @@ def decide_world(
         driving: [N] driving capacities, m/s2.
         limit: [N] speed limits, m/s.
         i: index of the controlled vehicle.
-        plan: [2, PIECES] working memory.
-        rear: [2, PIECES] working memory.
+        plan: working memory, [2, PIECES].
+        rear: working memory, [2, PIECES].
         out: [RESULT_WIDTH] receives the verdict.
 
     """
@@ -316,7 +322,7 @@ def decide_world(
 def decide_worlds(
     gaps: Floats, speeds: Floats, onset: Floats, braking: Floats, driving: Floats, limit: Floats, i: int, out: Floats
 ) -> None:
-    """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact; write the verdicts to ``out``.
+    """Decide for each of ``n`` worlds whether vehicle ``i`` can avoid contact, and write the verdicts to ``out``.
 
     Args:
         gaps: [n, P] gaps, m.
@@ -326,7 +332,7 @@ def decide_worlds(
         driving: [n, N] driving capacities, m/s2.
         limit: [n, N] speed limits, m/s.
         i: index of the controlled vehicle.
-        out: [n, RESULT_WIDTH] receives the verdicts, columns REASON to FOLLOW as in ``decide_world``.
+        out: [n, RESULT_WIDTH] receives the verdicts; ``decide_world`` explains the columns.
 
     """
     plan, rear = empty_plan(), empty_plan()
@@ -341,17 +347,19 @@ REASONS = ("", "early", "front", "rear")  # name of each reason code; "" if cont
 class Avoidability:
     """Verdict on each of ``n`` worlds: can the controlled vehicle avoid all contact?
 
-    The *largest trajectory* is the one that is farthest ahead at all times without contact with the front vehicle.
-    ``margin_m`` is the smallest gap between it and the rear vehicle (for two vehicles with the rear one controlled: the
-    part of the gap that full braking does not need). If contact is unavoidable it is negative: for *front* the missing
-    gap, for *early* the overlap before the vehicle may act.
+    The *largest trajectory* of the controlled vehicle is farther ahead at every time than any other trajectory that
+    stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
+    vehicle. (For two vehicles of which the rear one is controlled, ``margin_m`` is the part of the gap that remains
+    under full braking.) ``margin_m`` is negative if contact is unavoidable: for the reason *front* it is minus the
+    missing gap, for the reason *early* minus the overlap before the vehicle may act.
 
-    ``switch_s`` and ``command_mps2`` are a witness: a command profile without an impact in the physics. Each command
-    applies from its absolute time to the next (infinite: never). They are NaN if contact is unavoidable.
+    ``switch_s`` and ``command_mps2`` are a witness: commands that cause no impact in the physics. Each command applies
+    from its absolute time on, until the time of the next command. An infinite time means that the command never
+    applies. Both arrays are NaN in worlds where contact is unavoidable.
     """
 
-    # [n] 0: avoidable. 1, early: a pair meets before the controlled vehicle may act. 2, front: even full braking meets
-    # the front vehicle. 3, rear: the rear vehicle meets the largest trajectory
+    # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
+    # full braking leads to contact with the front vehicle. 3, rear: the rear vehicle reaches the largest trajectory
     reason: Ints
     margin_m: Floats  # [n] smallest gap to the rear vehicle, m; negative if contact is unavoidable
     switch_s: Floats  # [n, 3] times from which on the commands of the witness apply, s
@@ -359,7 +367,7 @@ class Avoidability:
 
     @property
     def avoidable(self) -> Bools:
-        """True for worlds in which some command profile avoids all contact, and so every impact, [n]."""
+        """Worlds in which some commands avoid all contact, and so every impact: boolean mask, [n]."""
         return np.asarray(self.reason == 0, np.bool_)
 
     @property
@@ -369,21 +377,22 @@ class Avoidability:
 
 
 def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str] | None = None) -> Avoidability:
-    """Decide in every world whether one vehicle can avoid all contact from now on.
+    """Decide for every world whether one vehicle can avoid all contact from now on.
 
-    Where it cannot, every command profile leads to contact, but not always to an impact: see
-    ``LowerBound.impact_proven``. Covers three vehicles with the middle one controlled, or two with either. The others
-    brake with their whole capacity from their latencies on. An overlap of the deciding trajectories of up to 1e-12 m
-    counts as gap 0, so as avoided.
+    If the vehicle cannot avoid contact, all its commands lead to contact, but not always to an impact
+    (``LowerBound.impact_proven`` shows where an impact is certain). The line must have three vehicles with the middle
+    one controlled, or two vehicles with either one controlled. The other vehicles brake fully from their latencies on.
+    An overlap of at most 1e-12 m between the deciding trajectories counts as a rounding error, not as contact.
 
     Args:
         worlds: the worlds now, [n].
         vehicle: index of the controlled vehicle, from 0.
-        scripts: name of each other vehicle's script by index, as in ``Scenario.roles``; only checked to be full_brake.
+        scripts: script name of each other vehicle, by index, as in ``Scenario.roles``. Every script must be full_brake.
+            None: all other vehicles brake fully.
 
-    Raises ``InvalidInput`` for another line, a script other than full_brake, a front vehicle that may brake only after
-    the controlled one acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1 could
-    reach before any contact.
+    Raises ``InvalidInput`` for any other line, a script other than full_brake, a front vehicle that may brake only
+    after the controlled vehicle acts, a vehicle that moves backward, or an obstacle (``obstacle_gap_m``) that vehicle_1
+    could reach before any contact.
 
     """
     worlds.refuse_build_up("avoidability")
@@ -406,16 +415,16 @@ def avoidability(worlds: Worlds, vehicle: int = 1, *, scripts: Mapping[int, str]
 
 
 def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | None) -> None:
-    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked.
+    """Raise ``InvalidInput`` for worlds that ``avoidability`` does not cover. Brake build-up is not checked here.
 
     Args:
         worlds: the worlds, [n].
-        vehicle: index of the controlled vehicle.
-        scripts: name of each other vehicle's script by index; None: all brake fully.
+        vehicle: index of the controlled vehicle, from 0.
+        scripts: script name of each other vehicle, by index; None: all other vehicles brake fully.
 
     """
-    # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring the vehicle
-    # there, and a push is an impact already.
+    # An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring Vehicle 1
+    # there, and a push begins with an impact.
     check_whole_number("avoidability: vehicle", vehicle, 0, worlds.N - 1)
     own = np.maximum(worlds.vehicles.latency_s[:, 0] - worlds.time_s, 0.0)
     v = worlds.vehicles
@@ -425,21 +434,29 @@ def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | Non
         worlds.obstacle_gap_m,
         "obstacle_gap_m",
         None,
-        "beyond full braking of vehicle_1",
+        "greater than the stopping distance of vehicle_1",
     )
     if vehicle == 0 and np.isfinite(worlds.obstacle_gap_m).any():
-        raise InvalidInput("avoidability: vehicle_1 controlled, with an obstacle ahead (obstacle_gap_m): not decided")
+        raise InvalidInput(
+            "avoidability: vehicle_1 is controlled with an obstacle ahead (obstacle_gap_m); must be without obstacle"
+        )
     if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
         raise InvalidInput(
-            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles; it is decided for vehicle_2 of 3 and for"
-            " either vehicle of 2"
+            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles is controlled; must be vehicle_2 of 3 vehicles"
+            " or either one of 2 vehicles"
         )
     for index, script in (scripts or {}).items():
         if index != vehicle and script != "full_brake":
-            raise InvalidInput(f"avoidability: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+            raise InvalidInput(f"avoidability: vehicle_{index + 1} follows the script {script!r}; must be 'full_brake'")
     if vehicle == 1:
         latency = np.maximum(worlds.vehicles.latency_s, worlds.time_s[:, None])
-        _refuse(latency[:, 0] > latency[:, 1], worlds.vehicles.latency_s[:, 0], "latency_s", 0, "not above vehicle_2's")
+        _refuse(
+            latency[:, 0] > latency[:, 1],
+            worlds.vehicles.latency_s[:, 0],
+            "latency_s",
+            0,
+            "at most the latency of vehicle_2",
+        )
     for i in range(worlds.N):
         _refuse(~(worlds.speeds_mps[:, i] >= 0.0), worlds.speeds_mps[:, i], "speeds_mps", i, ">= 0")
 

@@ -1,9 +1,9 @@
-"""Least harm over all first meetings with one neighbour, by branch and bound.
+"""Find the smallest harm over all first contacts with one neighbour, by branch and bound.
 
-A *meeting* is a first contact of the controlled vehicle with a neighbour: a time and a closing speed. Its harm is the
-squared closing speed and what must follow (``obstacle.after``). A *cell* is a range of times and closing speeds. Cells
-are halved until their bounds are close to the best meeting seen so far. The proof is in
-docs/internals/proofs/lower-bound.md.
+A first contact has a time and a closing speed. The harm of a first contact is its squared closing speed plus the harm
+that must follow (``obstacle.after``). A *cell* is a range of times and a range of closing speeds. The search halves
+cells until the smallest bound of any cell is close to the smallest harm found so far.
+docs/internals/proofs/lower-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -19,28 +19,29 @@ from ethbrake_marl.physics.state import Floats
 
 CELLS = 600  # size of the heap, which limits the number of divisions
 
-# Columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s); for meetings with the
-# rear vehicle also how much further than by full braking it has come (m).
+# Columns of a cell on the heap: bound (m2/s2); range of times (s); range of closing speeds (m/s); for contacts with the
+# rear vehicle also the range of its lead over its own full braking (m).
 HARM, EARLY, LATE, SOFT, HARD, NEAR, FAR, HEAP_WIDTH = range(8)
 
-_SPLITS = 64  # largest number of first cells, which decisions divide
+_SPLITS = 64  # largest number of cells at the start of the search, one for each decision step
 
-_PART_S = 0.05  # length of a first cell with brake build-up
+_PART_S = 0.05  # length of a cell at the start of the search with brake build-up, s
 
-_TRIED = 8  # number of meetings evaluated before the search, for a first best value
+_TRIED = 8  # number of first contacts evaluated before the search
 
 
 @compiled(apart=True)
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Return the least closing speed of first contacts between the times ``early`` and ``late``, m/s.
+    """Return the smallest closing speed (m/s) of first contacts between the times ``early`` and ``late``.
 
-    It falls with time, except if the leader (front vehicle) brakes harder than the controlled vehicle: it may then rise
-    by the difference.
+    Later first contacts can be gentler. The exception is a leader (front vehicle) that brakes harder than the
+    controlled vehicle: the smallest closing speed may then rise with time, at most at the difference of both braking
+    capacities.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
 
@@ -55,10 +56,15 @@ def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
 
 @compiled
 def decision_around(at: Floats, early: float, late: float) -> tuple[float, float]:
-    """Return start and end (s) of the decision step that holds both ``early`` and ``late``.
+    """Return start and end (s) of the decision step that contains both ``early`` and ``late``.
 
-    Returns ``late`` twice if there are no decision steps, or if the times lie in more than one step. ``at`` is one
-    world, an array with the columns of ``line.LINE``.
+    Both results are ``late`` if there are no decision steps, or if the two times lie in different steps.
+
+    Args:
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        early: earlier time, s.
+        late: later time, s.
+
     """
     step = at[LINE.TIME_STEP]
     if step <= 0.0:
@@ -71,20 +77,22 @@ def decision_around(at: Floats, early: float, late: float) -> tuple[float, float
 
 @compiled(apart=True)
 def lacking(kind: int, at: Floats, early: float, late: float, softest: float, hard: float, begin: float) -> float:
-    """Return a lower bound (m/s2) on how far the command during a first contact is from the best command after it.
+    """Return a lower bound (m/s2) on the difference between the command during a first contact and the best command
+    after it.
 
-    If the front vehicle is met first, the vehicle brakes before a gentle contact, and drives after it to soften the
-    impact from behind. If the rear vehicle is met first, it drives before and brakes after. The command is the same in
-    the whole decision step, so it cannot do both.
+    If the first contact is with the front vehicle, a gentle contact needs braking before it. Driving after the contact
+    softens the impact from behind. If the first contact is with the rear vehicle, driving is best before the contact
+    and braking after it. The command is the same in the whole decision step, so it cannot be the best one before and
+    after.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        softest: least closing speed of the contact, m/s.
-        hard: largest closing speed of the contact, m/s.
+        softest: smallest closing speed that any command reaches in this time, m/s.
+        hard: largest closing speed of the first contact, m/s.
         begin: start of the decision step, s.
 
     """
@@ -110,19 +118,19 @@ def harm_of(
     kind: int, at: Floats, early: float, late: float, soft: float, hard: float, floor: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound on the harm of the first contacts in a range of times and closing speeds, m2/s2.
+    """Return a lower bound (m2/s2) on the harm of the first contacts in a range of times and closing speeds.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        soft: least closing speed of the contact, m/s.
-        hard: largest closing speed of the contact, m/s.
-        floor: known lower bound on the harm at the other pair, m2/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        soft: smallest closing speed of the first contact, m/s.
+        hard: largest closing speed of the first contact, m/s.
+        floor: known lower bound on the harm of the other pair, m2/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: second working memory of the same kind.
 
     """
     begin, end = decision_around(at, early, late)
@@ -138,14 +146,14 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Make room on the heap for an entry with bound ``harm``; return its index. The caller fills in the other columns.
+    """Make room on the heap for a cell with bound ``harm``, and return the index of the free row.
 
-    Index 0 holds the entry with the least bound.
+    The function fills in only the column ``HARM`` of the row. Row 0 always holds the cell with the smallest bound.
 
     Args:
-        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
-        count: number of entries so far.
-        harm: bound of the new entry, m2/s2.
+        heap: [CELLS, NEAR] cells ordered as a binary heap; changed in place.
+        count: number of cells so far.
+        harm: bound of the new cell, m2/s2.
 
     """
     at = count
@@ -159,15 +167,15 @@ def room_for(heap: Floats, count: int, harm: float) -> int:
 
 @compiled(apart=True)
 def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: float, hard: float) -> int:
-    """Add a range of times and closing speeds to the heap; return the new number of entries.
+    """Add a cell (a range of times and closing speeds) to the heap, and return the new number of cells.
 
     Args:
-        heap: [CELLS, NEAR] entries ordered as a binary heap; changed in place.
-        count: number of entries so far.
-        harm: lower bound on the harm of first contacts in the range, m2/s2.
+        heap: [CELLS, NEAR] cells ordered as a binary heap; changed in place.
+        count: number of cells so far.
+        harm: lower bound on the harm of first contacts in the cell, m2/s2.
         early: earliest time, s.
         late: latest time, s.
-        soft: least closing speed, m/s.
+        soft: smallest closing speed, m/s.
         hard: largest closing speed, m/s.
 
     """
@@ -178,9 +186,12 @@ def put(heap: Floats, count: int, harm: float, early: float, late: float, soft: 
 
 @compiled(apart=True)
 def drop_first(heap: Floats, count: int) -> int:
-    """Remove the entry with the least bound, index 0, from the heap; return the new number of entries.
+    """Remove row 0, the cell with the smallest bound, from the heap, and return the new number of cells.
 
-    ``count`` is the number of entries on the heap before.
+    Args:
+        heap: cells ordered as a binary heap; changed in place.
+        count: number of cells before the removal.
+
     """
     count -= 1
     at, below = 0, 1
@@ -201,19 +212,20 @@ def drop_first(heap: Floats, count: int) -> int:
 def divide(
     kind: int, at: Floats, floor: float, count: int, plan: Floats, other: Floats, heap: Floats
 ) -> tuple[int, float]:
-    """Replace the first entry of the heap, a range of times and closing speeds of first contacts, by its halves.
+    """Replace the cell with the smallest bound by its two halves.
 
-    Returns the new number of entries, and a harm (m2/s2) that some contact in the range does not exceed.
+    Returns the new number of cells, and the bound (m2/s2) of one single contact in the cell. The smallest bound of all
+    contacts is not above this value.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        floor: known lower bound on the harm at the other pair, m2/s2.
-        count: number of entries on the heap.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: working memory of the search, [CELLS, NEAR].
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        floor: known lower bound on the harm of the other pair, m2/s2.
+        count: number of cells on the heap.
+        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: second working memory of the same kind.
+        heap: working memory for the cells of the search, [CELLS, NEAR].
 
     """
     harm, early, late, soft, hard = (heap[0, HARM], heap[0, EARLY], heap[0, LATE], heap[0, SOFT], heap[0, HARD])
@@ -244,28 +256,27 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound on the harm of all first contacts between two times (m2/s2), or ``best`` if none does less.
+    """Return a lower bound (m2/s2) on the harm of all first contacts between two times; at most ``best``.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         first: earliest time of the contact, s after the controlled vehicle may act.
         last: latest time of the contact, s.
-        floor: known lower bound on the harm at the other pair, m2/s2.
-        best: result if no contact does less harm, m2/s2.
-        enough: if some contact does no more harm than this (m2/s2), 0 is returned, because a bound of ``enough`` is
-            proven elsewhere.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: working memory of the search, [CELLS, NEAR].
+        floor: known lower bound on the harm of the other pair, m2/s2.
+        best: smallest harm of a first contact found so far, m2/s2.
+        enough: harm (m2/s2) that is proven in another way; the function returns 0 if some contact does no more harm.
+        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: second working memory of the same kind.
+        heap: working memory for the cells of the search, [CELLS, NEAR].
 
     """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)
         closing = gentlest(kind, at, time)[0]
         best = min(best, harm_of(kind, at, time, time, closing, closing, floor, plan, other))
-    # put the meetings between both times, with closing speeds up to ``hard``, on the heap: one cell for each step
+    # put the contacts between both times, with closing speeds up to ``hard``, on the heap: one cell for each step
     hard = math.sqrt(best)
     count, begin = 0, first
     while begin < last:
@@ -287,10 +298,18 @@ def least_harm(
 
 @compiled
 def next_split(kind: int, at: Floats, time: float, last: float) -> float:
-    """Return the next time (s) at which a decision is due or the front vehicle comes to rest, at most ``last``.
+    """Return the next time (s) after ``time`` at which a decision is due or the front vehicle comes to rest; at most
+    ``last``.
 
-    With brake build-up it is at most ``_PART_S`` later than ``time``. ``kind`` is the kind of contact (``FRONT_FIRST``,
-    ...), ``at`` one world, an array with the columns of ``line.LINE``.
+    With brake build-up the result is at most ``_PART_S`` later than ``time``.
+
+    Args:
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        time: start of the search, s.
+        last: largest possible result, s.
+
     """
     until = last if kind < RAMPED_FRONT else min(last, time + _PART_S)
     if at[LINE.TIME_STEP] > 0.0:

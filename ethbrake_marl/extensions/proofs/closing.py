@@ -1,8 +1,9 @@
-"""Least closing speed of a pair's first contact, whatever its vehicles and their neighbours do.
+"""Compute the smallest possible closing speed of a pair's first contact, whatever all vehicles do.
 
-The extreme motions: the leader goes as far ahead as it can (full drive if it is controlled, else full braking), and the
-follower stays as far behind as it can (full braking). If these meet, every motion of the pair meets no later.
-docs/internals/proofs/team-bound.md has the proof.
+The bound compares every motion of the pair with two extreme motions. The leader (front vehicle) goes as far ahead as it
+can: it drives fully if it is controlled, and brakes fully otherwise. The follower brakes fully, so it stays as far
+behind as it can. If the extreme motions lead to contact, every other motion of the pair leads to contact at the same
+time or earlier. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-# columns of a pair: gap; speed, onset and braking capacity of both vehicles; whether the leader is controlled, and then
-# its driving capacity and speed limit
+# columns of a pair: gap; speed, onset and braking capacity of both vehicles; whether the leader is controlled; driving
+# capacity and speed limit of a controlled leader
 PAIR_GAP, LEADER_V, LEADER_ONSET, LEADER_A, LEADER_FREE, LEADER_U, LEADER_LIMIT = range(7)
 
 FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)
@@ -23,7 +24,7 @@ FOLLOWER_V, FOLLOWER_ONSET, FOLLOWER_A, PAIR_WIDTH = range(7, 11)
 
 @compiled(apart=True)
 def least_on_piece(constant: float, pressing: float, since: float, until: float) -> float:
-    """Return the least value of ``(constant / t) + (pressing * t / 2)`` for ``t`` from ``since`` to ``until``."""
+    """Return the smallest value of ``(constant / t) + (pressing * t / 2)`` for ``t`` from ``since`` to ``until``."""
     least = constant / until + 0.5 * pressing * until
     if since > 0.0:
         least = min(least, constant / since + 0.5 * pressing * since)
@@ -38,15 +39,16 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 
 @compiled(apart=True)
 def least_before(at: Floats, met: float, squared: float) -> float:
-    """Return the least closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a script.
+    """Return the smallest closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a
+    script.
 
     At time t the closing speed is at least ``c(t) + (g(t) / t)``. Here c and g are closing speed and gap of the extreme
-    motions, and ``g(t) / t`` is the speed that must be added to close the gap by then.
+    motions: both vehicles brake fully. ``g(t) / t`` is the additional speed that closes the gap by time t.
 
     Args:
         at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
-        met: time at which the extreme motions of the pair meet, s.
-        squared: their squared closing speed at that time, m2/s2.
+        met: time at which the extreme motions lead to contact, s.
+        squared: squared closing speed of the extreme motions at that time, m2/s2.
 
     """
     if met <= 0.0:
@@ -74,15 +76,15 @@ def least_before(at: Floats, met: float, squared: float) -> float:
 
 @compiled(apart=True)
 def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the least closing speed (m/s) at a pair's first contact, and the latest time of that contact (s).
+    """Return the smallest closing speed (m/s) of a pair's first contact, and the latest time of that contact (s).
 
-    Returns 0 and infinity if no contact is forced by ``until``.
+    The results are 0 and infinity if contact before ``until`` is not certain.
 
     Args:
         at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
         until: horizon, s.
-        plan: working memory for one plan (``empty_plan``).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     onset = at[LEADER_ONSET]
@@ -100,10 +102,10 @@ def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats)
 
 @compiled
 def bound_pairs(pairs: Floats, until: Floats, out: Floats) -> None:
-    """Compute the least harm of each of ``n`` pairs, whatever its vehicles and their neighbours do.
+    """Compute a lower bound on the harm of each of ``n`` pairs, whatever all vehicles do.
 
     Args:
-        pairs: [n, PAIR_WIDTH] columns ``PAIR_GAP`` to ``FOLLOWER_A``.
+        pairs: [n, PAIR_WIDTH] pairs, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
         until: [n] horizon of each pair, s.
         out: [n] receives the bounds, m2/s2; a contact without impact counts as 0.
 

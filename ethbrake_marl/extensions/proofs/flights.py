@@ -1,8 +1,9 @@
-"""Bounds on how much faster than their common speed one of two vehicles in contact can be, and what that costs.
+"""Bound how much faster than the centre of mass of a pair one vehicle of the pair can be after their first contact.
 
-A *flight* is a time in which the two are apart. ``share`` is the partner's share of both masses. ``press`` is the
-acceleration with which they close under the best command (m/s2); ``reach`` is how much of it a command can hold back.
-``opening`` is the speed with which they separate. docs/internals/proofs/lower-bound.md has the proofs.
+A *flight* is a time in which the two vehicles are apart. ``share`` is the partner's share of the mass of both vehicles.
+``press`` is the acceleration (m/s2) at which the two vehicles close under the best command. ``reach`` is the part of
+``press`` (m/s2) that another command can take away. ``opening`` is the speed (m/s) at which the vehicles separate.
+docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from ethbrake_marl.physics.jit import compiled
 
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
-    """Return the speed (m/s) that a flight gains for the controlled vehicle over the common speed of both, less its
-    cost.
+    """Return the speed (m/s) that the controlled vehicle gains by a flight, less the speed that the flight costs.
 
-    A *flight* is a time in which the two vehicles are apart. For length L and opening speed o the lead over the common
-    speed is ``share (press L - o) - G``. G is the least loss of command, at most ``reach`` per second, that keeps the
-    two apart for L: ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. Returns -inf if nothing keeps them apart.
+    A *flight* is a time in which the two vehicles are apart. The gain is measured against the speed of their centre of
+    mass. For a flight of length L and opening speed o, the lead is ``share (press L - o) - G``. G is the smallest loss
+    of speed with which the vehicles stay apart for the time L: ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``,
+    where G grows by at most ``reach`` a second. The result is -inf if no command keeps the vehicles apart for so long.
 
     Args:
-        share: partner's share of both masses, 0 to 1.
-        press: acceleration with which the two close under the best command, m/s2.
-        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
-        opening: speed with which the two separate, m/s.
+        share: partner's share of the mass of both vehicles, 0 to 1.
+        press: acceleration at which the two vehicles close under the best command, m/s2.
+        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        opening: speed at which the two vehicles separate, m/s.
         flight: length of the flight, s.
 
     """
@@ -42,16 +43,16 @@ def flight_lead(share: float, press: float, reach: float, opening: float, flight
 
 @compiled
 def best_flight(share: float, press: float, reach: float, opening: float) -> float:
-    """Return the length (s) of the flight with the largest ``flight_lead``; infinite if the lead keeps rising with the
-    length.
+    """Return the length (s) of the flight with the largest ``flight_lead``; infinite if longer flights are always
+    better.
 
     A *flight* is a time in which the two vehicles are apart.
 
     Args:
-        share: partner's share of both masses, 0 to 1.
-        press: acceleration with which the two close under the best command, m/s2.
-        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
-        opening: speed with which the two separate, m/s.
+        share: partner's share of the mass of both vehicles, 0 to 1.
+        press: acceleration at which the two vehicles close under the best command, m/s2.
+        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        opening: speed at which the two vehicles separate, m/s.
 
     """
     if press <= 0.0:
@@ -74,15 +75,15 @@ def lead(
 ) -> float:
     """Return the largest ``flight_lead`` (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
-    A *flight* is a time in which the two vehicles are apart. The maximum is over all opening speeds up to ``opening``:
-    a smaller one may lead further if flights are cut short.
+    A *flight* is a time in which the two vehicles are apart. The result is the maximum over all opening speeds up to
+    ``opening``, because a smaller opening speed may give a larger lead if flights are cut short.
 
     Args:
-        share: partner's share of both masses, 0 to 1.
-        press: acceleration with which the two close under the best command, m/s2.
-        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
-        opening: speed with which the two separate, m/s.
-        shortest: least length of the flight, s.
+        share: partner's share of the mass of both vehicles, 0 to 1.
+        press: acceleration at which the two vehicles close under the best command, m/s2.
+        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
+        opening: largest speed at which the two vehicles separate, m/s.
+        shortest: smallest length of the flight, s.
         longest: largest length of the flight, s.
         lost: speed that is lost in any case, m/s.
 
@@ -102,14 +103,14 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Return whether it never pays to give up some acceleration in order to make a later bounce larger.
+    """Return whether giving up acceleration to make a later bounce larger never pays.
 
-    If so, ``reach`` bounds the speed that the vehicle gains while the two are apart.
+    If the result is True, ``reach`` limits the speed that the vehicle can gain in any flight.
 
     Args:
-        share: partner's share of both masses, 0 to 1.
-        press: acceleration with which the two close under the best command, m/s2.
-        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        share: partner's share of the mass of both vehicles, 0 to 1.
+        press: acceleration at which the two vehicles close under the best command, m/s2.
+        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
         bounce: coefficient of restitution.
 
     """
@@ -127,26 +128,26 @@ def largest_lead(
     share: float, press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float,
     since: float, until: float,
 ) -> float:  # fmt: skip
-    """Return an upper bound (m/s) on how much faster the controlled vehicle is than the speed of both vehicles' centre
-    of mass.
+    """Return an upper bound (m/s) on how much faster the controlled vehicle is than the centre of mass of a pair.
 
-    Both vehicles have met already. The centre of mass is the one that the best command alone would lead to. In the
-    *window* an earlier command still acts instead, which costs the speed ``lost``.
+    The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
+    computed for the best command from the first contact on. In the *window* (the rest of the decision step) the earlier
+    command still applies instead, which costs the speed ``lost``.
 
-    The bound covers three cases: the last time apart before the meeting with the other neighbour began with the first
-    impact, within the window, or after it.
+    A *flight* is a time in which the pair is apart. The bound is the maximum over three cases: the last flight before
+    the contact with the other neighbour began with the first impact, within the window, or after the window.
 
     Args:
-        share: partner's share of both masses, 0 to 1.
-        press: acceleration with which the two close under the best command, m/s2.
-        reach: part of ``press`` that a command can hold back, m/s2; infinite: no bound.
+        share: partner's share of the mass of both vehicles, 0 to 1.
+        press: acceleration at which the two vehicles close under the best command, m/s2.
+        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
         bounce: coefficient of restitution.
-        opening: speed with which the two separate, m/s.
+        opening: speed at which the pair separates after the first contact, m/s.
         lost: speed that is lost in the window, m/s.
         late: start of the window, s.
         end: end of the window, s.
-        since: earliest time of the meeting with the other neighbour, s.
-        until: latest time of that meeting, s.
+        since: earliest time of the contact with the other neighbour, s.
+        until: latest time of the contact with the other neighbour, s.
 
     """
     if since < end:
@@ -173,17 +174,18 @@ def widest_flight(
 ) -> float:
     """Return the largest ``sqrt(p^2 + 2 press s)`` (m/s) while a vehicle and a partner that brakes harder are apart.
 
-    p is the speed with which the two separate, s their gap. Returns infinity if no bound is known.
+    p is the speed at which the two vehicles separate (m/s), s the gap between them (m). The result is infinite if no
+    bound is known.
 
     Args:
-        share: partner's share of both masses, 0 to 1.
-        slack: by how much the partner brakes harder, m/s2.
-        press: acceleration with which the two close under the best command, m/s2.
+        share: partner's share of the mass of both vehicles, 0 to 1.
+        slack: braking capacity of the partner minus braking capacity of the vehicle, m/s2.
+        press: acceleration at which the two vehicles close under the best command, m/s2.
         drive: largest acceleration by a command, m/s2.
         bounce: coefficient of restitution.
         closing: closing speed of the first impact, m/s.
         back: backward speed of the vehicle after that impact, m/s.
-        time: time that is covered, s.
+        time: length of the time for which the bound holds, s.
 
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:

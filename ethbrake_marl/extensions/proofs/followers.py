@@ -1,12 +1,13 @@
-"""Harm at the other pair that must follow a first meeting, whatever the controlled vehicle does then.
+"""Bound the harm at the other pair that must follow a first contact of the controlled vehicle.
 
-A first meeting at a given time with closing speed ``closing`` leaves an exactly known state. From then on, no command
-beats the extreme one for the path of the two vehicles' centre of mass, and the controlled vehicle is faster (slower)
-than the centre only until it returns to its partner; ``flights.largest_lead`` bounds by how much. The
-proofs are in docs/internals/proofs/lower-bound.md.
+The time and the closing speed of the first contact determine the state of all three vehicles at that time. Afterwards
+the extreme command (full drive or full braking) is best for the centre of mass of the two vehicles in contact. The
+controlled vehicle is faster or slower than this centre of mass only until it returns to its partner;
+``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
 
-The meetings of a cell lie between ``early`` and ``late``; the state is taken at ``early``. From ``late`` to ``end`` the
-command of the earlier decision is still in force; it falls short of the extreme command by at least ``lack`` (m/s2).
+The functions bound all first contacts between the times ``early`` and ``late`` at once, starting from the state at
+``early``. From ``late`` to ``end`` the command of the earlier decision still applies. This command differs from the
+extreme command by at least ``lack`` (m/s2).
 """
 
 from __future__ import annotations
@@ -19,11 +20,12 @@ from ethbrake_marl.extensions.proofs.plans import fill_braking, fill_drive_then_
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-STRUCK_M = 1e-6  # below this distance a leader counts as in contact with the obstacle
+STRUCK_M = 1e-6  # a leader nearer to the obstacle than this counts as in contact with it
 
-HELD_M = 1e-6  # allowance for rounding in the gap to the leader
+HELD_M = 1e-6  # largest rounding error of the gap to the leader
 
-LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)  # s before the latest meeting; the time is divided there to bound both parts
+# times before the latest contact, s; the bound treats the times before and after each of them separately
+LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 
 @compiled
@@ -31,7 +33,7 @@ def least_of_line(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, since: float,
     until: float,
 ) -> float:  # fmt: skip
-    """Return the least value of a piecewise linear function of time from ``since`` to ``until``.
+    """Return the smallest value of a piecewise linear function of time from ``since`` to ``until``.
 
     The function is ``start + slope t + bend (t - turn)+ + other_bend (t - other_turn)+``, where ()+ is the positive
     part.
@@ -48,30 +50,30 @@ def least_closing(
     start: float, slope: float, turn: float, bend: float, other_turn: float, other_bend: float, share: float,
     press: float, reach: float, bounce: float, opening: float, lost: float, late: float, end: float, until: float,
 ) -> float:  # fmt: skip
-    """Return the least closing speed (m/s) at which the controlled vehicle meets its second neighbour, after it met the
-    first.
+    """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The *common speed* is the speed of the centre of mass of the two vehicles that met first. The result is the closing
-    speed that the second neighbour has to this centre, less the largest lead of the controlled vehicle over it
-    (``largest_lead``). The *window* is the time in which an earlier command still acts, which costs the speed ``lost``.
-    Times count from the first contact, in s.
+    The controlled vehicle had contact with its first neighbour before. Take the closing speed of the second neighbour
+    relative to the centre of mass of the controlled vehicle and its first neighbour. The result is this speed, minus
+    the largest difference between the controlled vehicle and the centre of mass (``largest_lead``). In the *window* the
+    command of the earlier decision still applies, which costs the speed ``lost``. Times count from the first contact,
+    in s.
 
     Args:
-        start: closing speed of the second neighbour to the centre of mass, at the first contact, m/s.
-        slope: its rate of change, m/s2.
+        start: closing speed of the second neighbour relative to the centre of mass at the first contact, m/s.
+        slope: rate of change of this closing speed, m/s2.
         turn: first time at which the rate changes, s.
         bend: change of the rate at ``turn``, m/s2.
         other_turn: second time at which the rate changes, s.
         other_bend: change of the rate at ``other_turn``, m/s2.
-        share: share of the partner of the first contact in both masses, 0 to 1.
-        press: acceleration with which these two close under the best command, m/s2.
-        reach: part of ``press`` that a command can hold back, m/s2.
+        share: first neighbour's share of the mass of both vehicles of the first contact, 0 to 1.
+        press: acceleration at which the two vehicles close under the best command, m/s2.
+        reach: part of ``press`` that another command can take away, m/s2; infinite: no limit is known.
         bounce: coefficient of restitution.
-        opening: speed with which the two separate after the first contact, m/s.
+        opening: speed at which the two vehicles separate after the first contact, m/s.
         lost: speed that is lost in the window, m/s.
         late: start of the window, s.
         end: end of the window, s.
-        until: latest time of the second meeting, s.
+        until: latest time of the second contact, s.
 
     """
     best = least_of_line(start, slope, turn, bend, other_turn, other_bend, 0.0, until)
@@ -92,20 +94,20 @@ def least_closing(
 def pushed_by_leader(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
+    """Return the smallest closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
-    The bound follows from the centre of mass of leader and controlled vehicle. Returns 0 if nothing is proven. If the
-    leader stands, a later first contact differs only in its time, so ``late``, ``end`` and ``lack`` are not used.
+    The bound uses the centre of mass of the leader and the controlled vehicle. The result is 0 if nothing is proven. If
+    the leader stands, a later first contact differs only in its time, so ``late``, ``end`` and ``lack`` are not used.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        closing: largest closing speed of the contact, m/s.
-        end: time until which the command of the earlier decision stays in force, s.
-        lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        closing: largest closing speed of the first contact, m/s.
+        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
+        lack: smallest possible difference between that command and the best command after the contact, m/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     share, rest, press = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.U_F] + at[LINE.A_L]
@@ -139,17 +141,18 @@ def pushed_by_leader(
 
 @compiled(apart=True)
 def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: Floats, other: Floats) -> float:
-    """Return the least closing speed (m/s) at the rear pair after a first contact with a leader that brakes harder.
+    """Return the smallest closing speed (m/s) at the rear pair after a first contact with a leader that brakes harder.
 
-    The controlled vehicle then stays near the leader (front vehicle). Returns 0 if nothing is proven.
+    The leader is the front vehicle. The controlled vehicle stays near the leader, because the leader brakes harder. The
+    result is 0 if nothing is proven.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        closing: largest closing speed of the contact, m/s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        closing: largest closing speed of the first contact, m/s.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     share, rest, bounce = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE], at[LINE.RESTITUTION]
@@ -190,20 +193,20 @@ def held_by_leader(at: Floats, early: float, late: float, closing: float, plan: 
 def after_front(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    It is the largest of several bounds. Those that rest on the centre of mass of both vehicles do not hold if an
-    obstacle may throw them back, and are then left out.
+    The result is the largest of several bounds. Bounds that use the centre of mass of both vehicles do not hold if an
+    obstacle may throw the vehicles back; they are then left out.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        closing: largest closing speed of the contact, m/s.
-        end: time until which the command of the earlier decision stays in force, s.
-        lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        closing: largest closing speed of the first contact, m/s.
+        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
+        lack: smallest possible difference between that command and the best command after the contact, m/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     share, rest = at[LINE.FRONT_SHARE], 1.0 - at[LINE.FRONT_SHARE]
@@ -229,15 +232,15 @@ def after_front(
 
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
-    """Return the least squared speed (m2/s2) at which the front vehicle hits the obstacle after the controlled vehicle
-    pushed it.
+    """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
 
-    Only its own brakes slow it. Returns 0 if it already stands at the obstacle, because all three are then one cluster.
+    After the push only its own brakes slow the front vehicle. The result is 0 if the front vehicle already stands at
+    the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        late: latest time of the first contact, s.
-        closing: least closing speed of the push, m/s.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        late: latest time of the push, s.
+        closing: smallest closing speed of the push, m/s.
 
     """
     if not STRUCK_M < at[LINE.OBSTACLE] - at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) < math.inf:
@@ -255,20 +258,20 @@ def obstacle_harm(at: Floats, late: float, closing: float) -> float:
 def braking_after(
     gap: float, least_gap: float, v_l: float, a_l: float, v_f: float, a_f: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared closing speed (m2/s2) with which a vehicle meets the front vehicle if it brakes with at
-    most ``a_f``.
+    """Return the smallest squared closing speed (m2/s2) at which a braking vehicle reaches the vehicle in front.
 
-    Returns 0 if no contact is certain.
+    The vehicle brakes with at most ``a_f``; the vehicle in front brakes fully. The result is 0 if no contact is
+    certain.
 
     Args:
         gap: largest possible gap, m.
-        least_gap: least possible gap, m; it matters if the front vehicle brakes harder.
-        v_l: speed of the front vehicle, m/s.
-        a_l: its braking capacity, m/s2.
+        least_gap: smallest possible gap, m; used only if the vehicle in front brakes harder.
+        v_l: speed of the vehicle in front, m/s.
+        a_l: braking capacity of the vehicle in front, m/s2.
         v_f: speed of the braking vehicle, m/s.
-        a_f: its braking capacity, m/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        a_f: braking capacity of the braking vehicle, m/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     fill_braking(plan, 0.0, a_l)
@@ -285,21 +288,21 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
 
-    The bound follows from the centre of mass of these two vehicles. The controlled vehicle must have brakes at least as
-    strong as the rear one.
+    The bound uses the centre of mass of the controlled vehicle and the rear vehicle. The braking capacity of the
+    controlled vehicle must be at least the braking capacity of the rear vehicle.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        closing: largest closing speed of the contact, m/s.
-        end: time until which the command of the earlier decision stays in force, s.
-        lack: least amount by which that command falls short of the best one, m/s2.
+        closing: largest closing speed of the first contact, m/s.
+        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
+        lack: smallest possible difference between that command and the best command after the contact, m/s2.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -324,18 +327,18 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Return the least closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
 
-    The bound follows because the controlled vehicle stays ahead of the rear one. The controlled vehicle must have
-    brakes at least as strong as the rear one. Returns 0 if the closing speed may rise.
+    The bound uses that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of the controlled
+    vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing speed may rise.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
-        closing: largest closing speed of the contact, m/s.
+        closing: largest closing speed of the first contact, m/s.
         gap: gap to the front vehicle at ``early``, m.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     share, v_l = at[LINE.REAR_SHARE], leader(at, early)[0]

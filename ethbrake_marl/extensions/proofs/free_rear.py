@@ -1,9 +1,9 @@
-"""Least harm over all first meetings with a rear vehicle that may act freely.
+"""Find the smallest harm over all first contacts with a rear vehicle that may act freely.
 
-The rear vehicle is never behind, nor slower than, its own full braking, but it may arrive earlier. So a meeting is
-described by its time, how much *further* the rear vehicle has come than by full braking, and the closing speed. Cells
-of these are halved until their bounds are close to the best meeting tried. docs/extensions/proofs.md, "Teams", has the
-proof.
+The rear vehicle is at least as far ahead and at least as fast as under its own full braking. The *lead* of the rear
+vehicle is the distance (m) by which it is farther ahead than under full braking. A first contact has a time, a lead and
+a closing speed; a *cell* is a range of each. The search halves cells until the smallest bound of any cell is close to
+the smallest harm found so far. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Floats
 
-# Columns of a search: SINCE and POWER are arguments of ``gained``; FLOOR is the front pair's own bound; BEST is the
-# least harm of a meeting so far.
+# Columns of a search: SINCE and POWER are arguments of ``gained``; FLOOR is the bound of the front pair alone; BEST is
+# the smallest harm of a first contact so far.
 SINCE, POWER, FLOOR, BEST, SEARCH = range(5)
 
 SEARCHED = 400  # largest number of divisions
 
-_SHORT_S = 1e-3  # least time to divide by
+_SHORT_S = 1e-3  # smallest time in a denominator
 
 
 @compiled
 def gained(near: float, time: float, since: float, power: float) -> float:
-    """Return by how much, at least, the rear vehicle is faster at ``time`` than by its own full braking, m/s.
+    """Return the smallest speed (m/s) by which the rear vehicle is faster at ``time`` than under its own full braking.
 
     Args:
-        near: by how much it has come further than by full braking, m.
+        near: distance by which the rear vehicle is farther ahead than under full braking, m.
         time: time of the comparison, s.
-        since: time from which on it may hold back its brakes, s.
-        power: largest acceleration by which it holds them back, m/s2; infinite if other vehicles push it.
+        since: time from which on the rear vehicle may brake less than fully, s.
+        power: largest acceleration that it can gain over full braking, m/s2; infinite if other vehicles push it.
 
     """
     if near <= 0.0 or time <= since:
@@ -59,10 +59,15 @@ def gained(near: float, time: float, since: float, power: float) -> float:
 
 @compiled
 def behind_full_braking(at: Floats, early: float, late: float) -> float:
-    """Return the least gap (m) to the rear vehicle if the controlled vehicle brakes until ``early``, the rear one until
-    ``late``.
+    """Return the gap (m) if the controlled vehicle brakes until ``early`` and the rear vehicle until ``late`` (s).
 
-    ``at`` is one world, an array with the columns of ``line.LINE``; the times are in s.
+    A negative gap is an overlap: the rear vehicle would be that far ahead of the controlled one.
+
+    Args:
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        early: end of the controlled vehicle's motion, s.
+        late: end of the rear vehicle's motion, s.
+
     """
     return float(
         at[LINE.GAP_R] + solo_motion(at[LINE.V_F], -at[LINE.A_F], 0.0, math.inf, early)[1] - follower(at, late)[1]
@@ -71,21 +76,23 @@ def behind_full_braking(at: Floats, early: float, late: float) -> float:
 
 @compiled
 def soft_behind(at: Floats, early: float, late: float, near: float, far: float, since: float, power: float) -> float:
-    """Return the least closing speed (m/s) of the first contacts with the rear vehicle in a range of times and
-    distances (``near`` to ``far``).
+    """Return the smallest closing speed (m/s) of the first contacts with the rear vehicle in a range of times and
+    leads.
+
+    The *lead* is the distance by which the rear vehicle is farther ahead than under its own full braking.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        near: least distance by which the rear vehicle has come further than by full braking, m.
-        far: largest such distance, m.
-        since: time from which on the rear vehicle may hold back its brakes, s.
-        power: largest acceleration by which it holds them back, m/s2.
+        near: smallest lead of the rear vehicle over its own full braking, m.
+        far: largest such lead, m.
+        since: time from which on the rear vehicle may brake less than fully, s.
+        power: largest acceleration that it can gain over full braking, m/s2; infinite if other vehicles push it.
 
     """
     faster = gained(near, late, since, power)
-    # the fastest way of the controlled vehicle to that place is to brake, then to drive
+    # the controlled vehicle arrives at that place with the largest speed if it brakes first and then drives
     brake = braking_to_rear(at, late, far + faster * (late - early))
     closing = follower(at, late)[0] - braked_then_driven(at, brake, late)[1]
     return max(closing + faster, 0.0)
@@ -96,22 +103,22 @@ def after_behind(
     at: Floats, early: float, late: float, near: float, far: float, hard: float, faster: float, moved: Floats,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
+    """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The bound starts from a state at ``early`` that is at every later time no further and no faster than after any of
-    these contacts.
+    The bound starts from one state at ``early``. After each of these contacts, the controlled vehicle is always at
+    least as far ahead and at least as fast as it would be from this state.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        near: least distance by which the rear vehicle has come further than by full braking, m.
-        far: largest such distance, m.
-        hard: largest closing speed of the contact, m/s.
-        faster: least speed by which the rear vehicle is faster than by full braking, m/s.
+        near: smallest lead of the rear vehicle over its own full braking, m.
+        far: largest such lead, m.
+        hard: largest closing speed of the first contact, m/s.
+        faster: smallest speed by which the rear vehicle is faster than under full braking, m/s.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     further = near - faster * (late - early)
@@ -141,25 +148,25 @@ def put_behind(
     at: Floats, early: float, late: float, near: float, far: float, soft: float, hard: float, search: Floats,
     count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats,
 ) -> int:  # fmt: skip
-    """Add a range of first contacts with the rear vehicle to the heap if it may do less harm than the best one known.
+    """Add a cell of first contacts with the rear vehicle to the heap, if the cell may contain the smallest harm.
 
-    Returns the new number of entries on the heap.
+    Returns the new number of cells on the heap.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        near: least distance by which the rear vehicle has come further than by full braking, m.
-        far: largest such distance, m.
-        soft: least closing speed, m/s.
-        hard: largest closing speed, m/s.
-        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
-            m2/s2) and ``BEST`` (least harm known so far, m2/s2).
-        count: number of entries on the heap.
+        near: smallest lead of the rear vehicle over its own full braking, m.
+        far: largest such lead, m.
+        soft: smallest closing speed of the first contact, m/s.
+        hard: largest closing speed of the first contact, m/s.
+        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
+            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2).
+        count: number of cells on the heap.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] cells ordered as a binary heap; changed in place.
 
     """
     since, power, floor = search[SINCE], search[POWER], search[FLOOR]
@@ -185,18 +192,20 @@ def try_behind(
     at: Floats, time: float, near: float, far: float, search: Floats, moved: Floats, plan: Floats, other: Floats
 ) -> None:
     """Lower ``search[BEST]`` to the harm of the gentlest first contact with the rear vehicle at ``time``, if that is
-    less.
+    smaller.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s.
-        near: distance by which the rear vehicle has come further than by full braking, m; raised if too small.
+        near: distance by which the rear vehicle is farther ahead than under full braking, m; raised if no contact has
+            it.
         far: largest such distance, m.
-        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
-            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
+            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
+            ``BEST``.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     near = max(near, behind_full_braking(at, time, time))
@@ -212,19 +221,21 @@ def try_behind(
 def divide_behind(
     at: Floats, search: Floats, count: int, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> int:
-    """Replace the first entry of the heap by its halves; return the new number of entries.
+    """Replace the cell with the smallest bound by its two halves, and return the new number of cells.
 
-    An entry is a range of times, distances and closing speeds of first contacts with the rear vehicle.
+    A cell is a range of times, leads and closing speeds of first contacts with the rear vehicle. The *lead* is the
+    distance by which the rear vehicle is farther ahead than under its own full braking.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
-            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
-        count: number of entries on the heap.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
+            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
+            ``BEST``.
+        count: number of cells on the heap.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: [SEARCHED + 4, HEAP_WIDTH] entries, the least bound first; changed in place.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
+        heap: [SEARCHED + 4, HEAP_WIDTH] cells ordered as a binary heap; changed in place.
 
     """
     early, late, near, far = heap[0, EARLY], heap[0, LATE], heap[0, NEAR], heap[0, FAR]
@@ -254,19 +265,20 @@ def divide_behind(
 def meetings_behind(
     at: Floats, last: float, search: Floats, moved: Floats, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound on the harm of all first contacts with the rear vehicle until ``last`` (s), m2/s2.
+    """Return a lower bound (m2/s2) on the harm of all first contacts with the rear vehicle until ``last`` (s).
 
-    The result is at most ``search[BEST]``, the least harm that is known before.
+    The result is at most ``search[BEST]``.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         last: latest time of the contact, s after the controlled vehicle may act.
-        search: [SEARCH] ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound of the front pair alone,
-            m2/s2) and ``BEST`` (least harm known so far, m2/s2); only ``BEST`` changes.
+        search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
+            of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
+            ``BEST``.
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: working memory of the search, [SEARCHED + 4, HEAP_WIDTH].
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
+        heap: working memory for the cells of the search, [SEARCHED + 4, HEAP_WIDTH].
 
     """
     since, hard, count = min(search[SINCE], last), math.sqrt(search[BEST]), 0

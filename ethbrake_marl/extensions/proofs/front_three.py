@@ -1,7 +1,7 @@
-"""Least harm of the first three vehicles: Vehicle 1 scripted, Vehicle 2 controlled, the third one arbitrary.
+"""Bound the harm of the first three vehicles: Vehicle 1 is scripted, Vehicle 2 controlled, Vehicle 3 may do anything.
 
-Meetings with the leader are bounded as for one controlled vehicle (``lower_bound.front_first``): a rear vehicle that
-arrives earlier only makes the rest worse. Meetings with the rear vehicle have their own search
+First contacts with the leader are bounded as for one controlled vehicle (``lower_bound.front_first``), because a rear
+vehicle that arrives earlier never lowers the harm. First contacts with the rear vehicle have their own search
 (``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
 """
 
@@ -35,18 +35,19 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Floats, other: Floats) -> float:
-    """Return the least harm (m2/s2) of a contact of all three vehicles at the same time; infinity if there can be none.
+    """Return the smallest harm (m2/s2) of a contact of all three vehicles at the same time; infinite if it is
+    impossible.
 
-    Front and rear vehicle then close with at least some speed W, which the two pairs share. The front pair's part of W
-    is at least its least closing speed of any first contact.
+    Let W be the smallest closing speed of the rear vehicle relative to the front vehicle. The closing speeds of the two
+    pairs add up to at least W. The closing speed of the front pair is at least its smallest value at any first contact.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         first: earliest first contact with the front vehicle, s.
         last: latest first contact with the front vehicle, s.
         pair: working memory for a pair, [PAIR_WIDTH].
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     pair[PAIR_GAP], pair[LEADER_ONSET], pair[LEADER_FREE] = at[LINE.GAP_L] + at[LINE.GAP_R], 0.0, 0.0
@@ -64,25 +65,24 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Return a code: may the rear vehicle first touch the controlled one after the time at which it would stand by
-    braking?
+    """Return whether the rear vehicle may first reach the controlled one after ``stand``, as a code.
 
-    0: it cannot. 1: it may, and the harm is then no less than if the front vehicle is met first. 2: it may, and nothing
-    is proven.
+    Code 0: no. Code 1: yes, but the harm is then at least the harm of some first contact with the front vehicle. Code
+    2: yes, and nothing is proven about the harm.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        first: earliest first contact with the front vehicle, s; infinite: none.
-        stand: time at which the rear vehicle stands by full braking, s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        first: earliest first contact with the front vehicle, s; infinite: there is none.
+        stand: time at which the rear vehicle comes to rest under full braking, s.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return 0
     _, end, leans = last_meeting(
         at, first, plan, other
-    )  # latest first meeting with the leader if the rear vehicle brakes fully
+    )  # latest first contact with the leader if the rear vehicle brakes fully
     if end <= stand and not leans:
         return 0
     leader_moves = at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_L] > at[LINE.A_L] * stand
@@ -97,24 +97,23 @@ def combined_bound_of_team(
     at: Floats, until: float, front: float, rear: float, since: float, power: float, pair: Floats, moved: Floats,
     plan: Floats, other: Floats, heap: Floats, heap_behind: Floats,
 ) -> float:  # fmt: skip
-    """Return the least harm (m2/s2) of the first three vehicles in a world with unavoidable contact, whoever is met
-    first.
+    """Return a lower bound (m2/s2) on the harm of the first three vehicles in a world with unavoidable contact.
 
-    Returns 0 if the harm may come after ``until``.
+    The bound covers first contacts with either neighbour. The result is 0 if the harm may come after ``until``.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        until: horizon, s; harm after it does not count.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        until: horizon, s; later harm does not count.
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
-        since: time from which on the rear vehicle may hold back its brakes, s.
-        power: largest acceleration by which it holds them back, m/s2.
+        since: time from which on the rear vehicle may brake less than fully, s.
+        power: largest acceleration that the rear vehicle can gain over full braking, m/s2.
         pair: working memory for a pair, [PAIR_WIDTH].
         moved: working memory for a second world, [LINE.WIDTH].
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: working memory for contacts with the front vehicle, [CELLS, NEAR].
-        heap_behind: working memory for contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
+        heap: working memory for the cells of contacts with the front vehicle, [CELLS, NEAR].
+        heap_behind: working memory for the cells of contacts with the rear vehicle, [SEARCHED + 4, HEAP_WIDTH].
 
     """
     rest, stand = last_rest(at)
@@ -146,14 +145,14 @@ def combined_bound_of_team(
 
 @compiled
 def bound_threes(states: Floats, until: Floats, pairs: Floats, since: Floats, power: Floats, out: Floats) -> None:
-    """Compute the combined bound of the first three vehicles for each of ``n`` worlds with unavoidable contact.
+    """Compute the combined bound of the first three vehicles in each of ``n`` worlds with unavoidable contact.
 
     Args:
-        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
         until: [n] horizon, s.
         pairs: [n, 2] bounds of the two pairs alone, m2/s2.
-        since: [n] time from which on the rear vehicle may hold back its brakes, s.
-        power: [n] largest acceleration by which it holds them back, m/s2.
+        since: [n] time from which on the rear vehicle may brake less than fully, s.
+        power: [n] largest acceleration that the rear vehicle can gain over full braking, m/s2.
         out: [n] receives the bounds, m2/s2.
 
     """

@@ -1,4 +1,4 @@
-"""One world as the proofs represent it, and the motion of its two neighbours without contact."""
+"""Columns of a world in the proofs, and the undisturbed motion of its front and rear vehicle."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from ethbrake_marl.physics.state import Floats
 
 
 class _Line(NamedTuple):
-    """Index of each column of a world array, at the moment when the controlled vehicle (follower, F) may act.
+    """Index of each column of a world array. The values hold at the moment when the controlled vehicle may act.
 
-    L is the front vehicle (leader), R the rear vehicle. V are speeds (m/s), A braking and U driving capacities (m/s2).
+    L marks the front vehicle (leader), F the controlled vehicle (follower), R the rear vehicle. V is a speed (m/s), A a
+    braking capacity and U a driving capacity (m/s2).
     """
 
     GAP_L: int = 0  # gap to the front vehicle, m
@@ -30,39 +31,38 @@ class _Line(NamedTuple):
     FRONT_SHARE: int = 11  # m_l / (m_l + m_f), with the masses m
     REAR_SHARE: int = 12  # m_r / (m_f + m_r), with the masses m
     RESTITUTION: int = 13  # coefficient of restitution
-    TIME_STEP: int = 14  # time between decisions (s), the first one now; 0 if commands may change at any time
-    OBSTACLE: int = (
-        15  # gap from the leader to an obstacle ahead (m), which it does not reach by itself; infinite without
-    )
-    # acceleration of the front vehicle in force, m/s2 (this and the next six only with brake build-up)
+    TIME_STEP: int = 14  # time between decisions, s; the first decision is now. 0 if commands may change at any time
+    # gap from the leader to an obstacle ahead that it does not reach by itself, m; infinite without an obstacle
+    OBSTACLE: int = 15
+    # present acceleration of the front vehicle, m/s2 (this column and the next six only with brake build-up)
     FORCE_L: int = 16
     FALL_L: int = 17  # rate at which the acceleration of the front vehicle falls, m/s3
-    FORCE_F: int = 18  # acceleration of the controlled vehicle in force, m/s2
-    FALL_F: int = 19  # rate at which it falls, m/s3
-    RISE_F: int = 20  # rate at which it rises, m/s3
-    FORCE_R: int = 21  # acceleration of the rear vehicle in force, m/s2
+    FORCE_F: int = 18  # present acceleration of the controlled vehicle, m/s2
+    FALL_F: int = 19  # rate at which the acceleration of the controlled vehicle falls, m/s3
+    RISE_F: int = 20  # rate at which the acceleration of the controlled vehicle rises, m/s3
+    FORCE_R: int = 21  # present acceleration of the rear vehicle, m/s2
     FALL_R: int = 22  # rate at which the acceleration of the rear vehicle falls, m/s3
     UNTIL: int = 23  # horizon (s); 0 if unknown
-    WALL: int = 24  # OBSTACLE if an impact with it counts and the rear vehicle brakes fully; else 0
+    WALL: int = 24  # OBSTACLE if an impact with the obstacle counts and the rear vehicle brakes fully; else 0
     WIDTH: int = 25  # number of columns
 
 
 LINE = _Line()
 
-FRONT_FIRST, REAR_FIRST = 0, 1  # kind of a meeting: which neighbour the controlled vehicle meets first
+FRONT_FIRST, REAR_FIRST = 0, 1  # neighbour with which the controlled vehicle has its first contact
 
-RAMPED_FRONT, RAMPED_REAR = 2, 3  # the same with brake build-up
+RAMPED_FRONT, RAMPED_REAR = 2, 3  # neighbour of the first contact, with brake build-up
 
 HALVINGS = 60
 
-AHEAD_M = 1e-9  # tolerance: a smaller overlap is no meeting with the other vehicle
+AHEAD_M = 1e-9  # an overlap below this does not count as contact with the other neighbour
 
 
 @compiled
 def leader(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) of the front vehicle at ``time`` (s) if nobody touches it.
+    """Return speed (m/s) and distance (m) of the front vehicle at ``time`` (s) if no other vehicle pushes it.
 
-    ``at`` is one world, an array with the columns of ``LINE``.
+    ``at`` is the state of one world, [LINE.WIDTH].
     """
     speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
     return speed, way
@@ -70,9 +70,9 @@ def leader(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def follower(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) of the rear vehicle at ``time`` (s) if nobody touches it.
+    """Return speed (m/s) and distance (m) of the rear vehicle at ``time`` (s) if no other vehicle pushes it.
 
-    ``at`` is one world, an array with the columns of ``LINE``.
+    ``at`` is the state of one world, [LINE.WIDTH].
     """
     speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
     return speed, way
@@ -82,8 +82,9 @@ LARGE = 1e6  # m2/s2; more than the harm of any impact
 
 FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 
-TOUCH_HARM = 2.0 * BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS  # harm that two contacts without impact may hide
+# largest harm of two contacts that do not count as impacts, m2/s2
+TOUCH_HARM = 2.0 * BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
 
-TOUCHING_M = 1e-9  # a smaller gap is a contact, up to rounding
+TOUCHING_M = 1e-9  # a smaller gap counts as contact, because of rounding
 
-FORCE_HALVINGS, ROUGHLY = 12, 20  # halvings of a force, and of a time, that need not be exact
+FORCE_HALVINGS, ROUGHLY = 12, 20  # bisections of a force, and of a time, for results that need not be exact

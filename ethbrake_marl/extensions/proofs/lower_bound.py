@@ -1,7 +1,7 @@
 """``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
 
-A *meeting* is a first contact of the controlled vehicle with a neighbour. In the compiled functions ``at`` is one world
-(columns of ``line.LINE``), and ``plan``, ``other`` and ``heap`` are working memory.
+In the compiled functions ``at`` is the state of one world (columns of ``line.LINE``); ``plan``, ``other`` and ``heap``
+are working memory.
 """
 
 from __future__ import annotations
@@ -54,21 +54,21 @@ from ethbrake_marl.physics.jit import by_parts, compiled
 from ethbrake_marl.physics.motion import solo_motion
 from ethbrake_marl.physics.state import Bools, Floats, Worlds
 
-_GRAZE_S = 1e-3  # allowance for rounding in the time of a contact without closing speed
+_GRAZE_S = 1e-3  # largest rounding error in the time of a contact at closing speed 0
 
-_PARTS = 8  # number of parts into which the times of soft meetings are divided
+_PARTS = 8  # number of parts into which the times of soft contacts are divided
 
 
 @compiled
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the least squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
+    """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
 
-    The controlled vehicle reaches both by full drive.
+    The controlled vehicle reaches both values by full drive. The time is infinite if full drive avoids contact.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
@@ -81,15 +81,15 @@ def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
 
 @compiled(apart=True)
 def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the other neighbour has not arrived before the gentlest first contact at ``time`` (s).
+    """Return whether the gentlest first contact with one neighbour at ``time`` comes before any contact with the other
+    one.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s after the controlled vehicle may act.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     if kind == FRONT_FIRST:
@@ -99,21 +99,20 @@ def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) ->
 
 @compiled(apart=True)
 def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time (s) of a first contact with one neighbour at which the other neighbour has not arrived
-    yet.
+    """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
+    one.
 
-    It is found by halving the time, because a later contact leaves less room. A later contact with the front vehicle
-    needs a shorter drive before it, so the rear vehicle comes nearer. A later contact with the rear vehicle needs
-    shorter braking, so the front vehicle comes nearer.
+    The function bisects the time, because a later first contact leaves less room to the other neighbour: a later
+    contact with the front vehicle needs a shorter drive before it, so the rear vehicle comes nearer; a later contact
+    with the rear vehicle needs shorter braking, so the front vehicle comes nearer.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        first: time of a first contact at which there is room, s.
-        last: latest time of a first contact with this neighbour, s; the result is at most this.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        first: time of a first contact before which the other neighbour has not arrived, s.
+        last: latest time of a contact with this neighbour, s; the result is at most this.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     if is_first(kind, at, last, plan, other):
@@ -129,16 +128,16 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest contact (s) with the front vehicle, and the latest one (s) that comes before the rear vehicle
-    arrives.
+    """Return the latest contact (s) with the front vehicle, and the latest one (s) before the rear vehicle arrives.
 
-    The third result says whether the front vehicle may be met first arbitrarily late and softly.
+    The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
+    speed.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         first: earliest contact with the front vehicle, s.
-        plan: working memory, from ``empty_plan``.
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
@@ -155,25 +154,26 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least harm (m2/s2), if below ``best``, where the front vehicle is met first or all three meet at once.
+    """Return a lower bound (m2/s2) on the harm if the front vehicle, or both neighbours at once, are contacted first.
 
-    If all three meet at once, front and rear vehicle close with W; the front pair's part of W is at least the least
-    closing speed at that time. This case counts only if the front vehicle can be met that late.
+    The result is at most ``best``. In a contact of all three vehicles at once, the closing speeds of the two pairs add
+    up to the closing speed W of front and rear vehicle. The front pair's part of W is at least its smallest closing
+    speed at that time. This case counts only if a first contact with the front vehicle can come so late.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        floor: known lower bound on the harm at the other pair, m2/s2.
-        best: least harm of a first contact that is known so far, m2/s2.
-        enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: working memory of the search, [CELLS, NEAR].
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        floor: known lower bound on the harm of the other pair, m2/s2.
+        best: smallest harm of a first contact found so far, m2/s2.
+        enough: harm (m2/s2) that is proven in another way; the function returns 0 if some contact does no more harm.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
+        heap: working memory for the cells of the search, [CELLS, NEAR].
 
     """
     first = meet_front(at, math.inf, plan, other)
     if (
         first == math.inf and at[LINE.GAP_L] <= TOUCHING_M
-    ):  # it stands in contact with the leader, so both are hit at once
+    ):  # the vehicle stands in contact with the leader, so the rear vehicle hits both at once
         return min(best, rear_bound(at, plan, other)[0])
     if first == math.inf or not stays_ahead(at, first, first, plan, other):
         return best
@@ -202,19 +202,19 @@ def front_first(
 def soft_harm(
     kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm (m2/s2), if below ``best``, of first contacts from ``early`` to ``late`` with any closing
-    speed.
+    """Return a lower bound (m2/s2) on the harm of first contacts from ``early`` to ``late`` with any closing speed.
+
+    The result is at most ``best``.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        floor: known lower bound on the harm at the other pair, m2/s2.
-        best: least harm of a first contact that is known so far, m2/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        floor: known lower bound on the harm of the other pair, m2/s2.
+        best: smallest harm of a first contact found so far, m2/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     soft = 0.0
@@ -232,16 +232,16 @@ def soft_harm(
 def rear_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least harm (m2/s2), if below ``best``, where the rear vehicle is met first.
+    """Return a lower bound (m2/s2) on the harm if the first contact is with the rear vehicle; at most ``best``.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        floor: known lower bound on the harm at the other pair, m2/s2.
-        best: least harm of a first contact that is known so far, m2/s2.
-        enough: if some contact does no more harm than this (m2/s2), 0 is returned at once.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: working memory of the search, [CELLS, NEAR].
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        floor: known lower bound on the harm of the other pair, m2/s2.
+        best: smallest harm of a first contact found so far, m2/s2.
+        enough: harm (m2/s2) that is proven in another way; the function returns 0 if some contact does no more harm.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
+        heap: working memory for the cells of the search, [CELLS, NEAR].
 
     """
     high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
@@ -275,14 +275,15 @@ def rear_first(
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
-    By then the rear vehicle has passed neither the front vehicle nor the controlled one. If it brakes harder than the
-    controlled vehicle by b, it was faster by ``b t`` at time t before the contact, from its onset on.
+    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. If the rear
+    vehicle brakes harder than the controlled one, by b (m/s2), it was faster than the controlled one by at least ``b
+    t`` at every time t before the contact. This is true only after the rear vehicle's onset.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        rest: time at which the controlled and the rear vehicle stand by full braking, s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        rest: time at which controlled and rear vehicle have both come to rest under full braking, s.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     fill_braking(plan, 0.0, at[LINE.A_L])
@@ -301,10 +302,13 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm has happened if all vehicles brake, and the time (s) at which the rear
-    vehicle stands.
+    """Return when (s) all harm of the combined bound has happened, and when (s) the rear vehicle comes to rest.
 
-    ``at`` is one world, an array with the columns of ``line.LINE``.
+    The rear vehicle comes to rest at the second time if it brakes fully and no other vehicle pushes it.
+
+    Args:
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+
     """
     stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
     way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
@@ -317,18 +321,18 @@ def last_rest(at: Floats) -> tuple[float, float]:
 def combined_bound(
     at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least harm (m2/s2) of a world with unavoidable contact, whoever is met first.
+    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, over first contacts of both kinds.
 
-    Returns 0 if the harm may come after ``until``.
+    The first contact may be with the front or the rear vehicle. The result is 0 if the harm may come after ``until``.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        until: horizon, s; harm after it does not count.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        until: horizon, s; later harm does not count.
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
-        heap: working memory of the search, [CELLS, NEAR].
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
+        heap: working memory for the cells of the search, [CELLS, NEAR].
 
     """
     if not last_rest(at)[0] < until:
@@ -348,15 +352,15 @@ def combined_bound(
 def bound_worlds(
     states: Floats, until: Floats, has_front: Bools, has_rear: Bools, unavoidable: Bools, out: Floats
 ) -> None:
-    """Compute lower bounds on the harm of ``n`` worlds: of each pair alone, and of both together.
+    """Compute lower bounds on the harm of ``n`` worlds: for each pair alone, and for both pairs together.
 
     Args:
-        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
         until: [n] horizon, s.
         has_front: [n] True if the front pair exists and its next impact counts.
         has_rear: [n] True if the rear pair exists and its next impact counts.
-        unavoidable: [n] True if contact is unavoidable; only there the combined bound is computed.
-        out: [n, BOUNDS] receives columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+        unavoidable: [n] True if contact is unavoidable; the combined bound is 0 in all other worlds.
+        out: [n, BOUNDS] receives the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
 
     """
     plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, NEAR))
@@ -394,25 +398,27 @@ def lower_bound(
 ) -> LowerBound:
     """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
 
-    ``harm = early + max((front_pair + rear_pair), combined)``, each part lowered by the largest possible rounding error
-    (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come only after the horizon
-    counts as 0.
+    ``harm = early + max((front_pair + rear_pair), combined)``. Each part is lowered by the largest possible rounding
+    error (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come only after the
+    horizon counts as 0. The function covers the same lines as ``avoidability``.
 
-    With brake build-up the bound holds for any command at any time and is looser. It has no verdict on contact:
-    ``contact`` is None if brakes build up in any of the worlds.
+    With brake build-up, the bound holds for any command at any time and is looser. ``contact``, the verdict on
+    avoidable contact, is then None, even if brakes build up in only one of the worlds.
 
     Args:
         worlds: the worlds now, [n].
         vehicle: index of the controlled vehicle, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
-        horizon_s: time until which harm counts, s (absolute).
-        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
-        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
-            the first one when the vehicle may act, then one every ``time_step_s``, as for every agent. That is sharper,
-            and takes ten times as long. None: commands may change at any time.
+        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts, even if it came
+            before now.
+        horizon_s: time until which harm counts, s after the alert.
+        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
+            brake fully.
+        time_step_s: time between two decisions, s. The bound is then larger, but holds only for commands that change at
+            decisions: the first decision when the vehicle may act, then one every ``time_step_s``, as for every agent.
+            The computation takes ten times as long. None: commands may change at any time.
 
-    Covers the same lines as ``avoidability``. Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, a
-    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
+    Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, for a time step below ``LEAST_TIME_STEP_S``,
+    and for a horizon that is not finite or lies before the vehicle may act.
 
     """
     check_asked("lower_bound", harm_count, horizon_s, time_step_s)
@@ -431,7 +437,7 @@ def lower_bound(
         return LowerBound(harm, early, front, rear, combined, None)
     if slow.any():
         check_covered(worlds, vehicle, scripts)
-        verdict, reason = None, np.full(worlds.n, 2)  # assume unavoidable contact: the bound itself finds out
+        verdict, reason = None, np.full(worlds.n, 2)  # assume unavoidable contact; ``bound_ramped`` checks it
     else:
         verdict = avoidability(worlds, vehicle, scripts=scripts)
         reason = verdict.reason
@@ -439,7 +445,7 @@ def lower_bound(
     none = np.zeros(worlds.n, dtype=np.bool_)
     has_front = counts[:, vehicle - 1] if vehicle > 0 else none
     has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
-    struck = at_onset.obstacle_hit & (harm_count == "first")  # a further impact with the obstacle is not counted
+    struck = at_onset.obstacle_hit & (harm_count == "first")  # further impacts with the obstacle do not count
     unavoidable = has_front & has_rear & (reason >= 2) & ~struck
     out = np.empty((worlds.n, BOUNDS))
     arguments: tuple[Any, ...] = (has_front, has_rear, unavoidable, out)

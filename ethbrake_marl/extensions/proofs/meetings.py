@@ -1,8 +1,8 @@
-"""The gentlest first meeting of the controlled vehicle with a neighbour at a given time.
+"""Compute the gentlest first contact of the controlled vehicle with a neighbour at a given time.
 
-A *meeting* is a first contact. Times count from the moment at which the controlled vehicle (f) may act. The front
-vehicle (leader, l) brakes by then; the rear vehicle (r) coasts to its onset and then brakes. All speeds and gaps are
->= 0. docs/internals/proofs/lower-bound.md has the proofs.
+Times count from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) brakes by then.
+The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
+docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -21,16 +21,21 @@ from ethbrake_marl.extensions.proofs.ramped_meetings import gentlest_ramped
 from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.state import Floats
 
-_GUARD = 2.0**-46  # relative allowance for rounding of positions, so that no meeting appears harder than it is
+_GUARD = 2.0**-46  # largest relative rounding error of positions; closing speeds are lowered accordingly
 
 
 @compiled(apart=True)
 def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed (m/s) of a contact with the front vehicle at ``time``, and how long to drive first
-    (s).
+    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and the length of the
+    drive.
 
-    The slowest way to be there at that time is to drive, then to brake. ``at`` is one world, an array with the columns
-    of ``line.LINE``.
+    The controlled vehicle arrives at this place and time most slowly if it drives first (for the second result, in s),
+    and then brakes.
+
+    Args:
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        time: time of the contact, s after the controlled vehicle may act.
+
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
@@ -51,10 +56,15 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled
 def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
-    """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes for ``brake`` s, then
-    drives.
+    """Return distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes first and then drives.
 
-    It brakes at most to rest. ``at`` is one world, an array with the columns of ``line.LINE``.
+    A vehicle that brakes to rest waits there until it drives.
+
+    Args:
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        brake: duration of the braking, s.
+        time: time of the result, s.
+
     """
     v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
     braking = min(brake, v / a)
@@ -69,13 +79,13 @@ def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, fl
 
 @compiled(apart=True)
 def braking_to_rear(at: Floats, time: float, further: float) -> float:
-    """Return for how long (s) the controlled vehicle must brake, then drive, so that the rear vehicle meets it at
+    """Return how long (s) the controlled vehicle must brake before it drives, for contact with the rear vehicle at
     ``time``.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s after the controlled vehicle may act.
-        further: by how much the rear vehicle has come further than by full braking, m.
+        further: distance by which the rear vehicle is farther ahead than under full braking, m.
 
     """
     place = follower(at, time)[1] - at[LINE.GAP_R] + further
@@ -91,11 +101,16 @@ def braking_to_rear(at: Floats, time: float, further: float) -> float:
 
 @compiled(apart=True)
 def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed (m/s) of a contact with the rear vehicle at ``time``, and how long to brake first
-    (s).
+    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and the length of the
+    braking.
 
-    The fastest way to be there at that time is to brake, then to drive. The braking is infinite if the vehicle is then
-    at its speed limit. ``at`` is one world, an array with the columns of ``line.LINE``.
+    The controlled vehicle arrives at this place and time with the largest speed if it brakes first (for the second
+    result, in s), and then drives. The second result is infinite if the vehicle reaches its speed limit by ``time``.
+
+    Args:
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        time: time of the contact, s after the controlled vehicle may act.
+
     """
     brake = braking_to_rear(at, time, 0.0)
     speed = braked_then_driven(at, brake, time)[1]
@@ -104,14 +119,14 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
-    """Return the least closing speed (m/s) of a first contact at ``time``, and how long to drive or brake first (s).
+    """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) to drive or brake first.
 
     With brake build-up the second result is 0.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s after the controlled vehicle may act.
 
     """
@@ -122,16 +137,15 @@ def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
 
 @compiled(apart=True)
 def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) at which the controlled vehicle, which drives for ``drive`` s and then brakes, meets the
-    front one.
+    """Return the time (s) of the controlled vehicle's contact with the front one if it drives first and then brakes.
 
-    Infinite if they never meet.
+    The result is infinite if there is no contact.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        drive: duration of the drive, s; infinite: drive all the time.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        drive: duration of the drive, s; infinite: the vehicle never brakes.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -141,16 +155,15 @@ def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) at which the rear vehicle meets the controlled one, which brakes for ``brake`` s, then
-    drives.
+    """Return the time (s) of the rear vehicle's contact with the controlled one, which brakes first and then drives.
 
-    Infinite if they never meet.
+    The result is infinite if there is no contact.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         brake: duration of the braking, s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
@@ -162,15 +175,14 @@ def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the controlled vehicle avoids the rear vehicle until ``until`` if it drives for ``drive`` s, then
-    brakes.
+    """Return whether the controlled vehicle avoids the rear vehicle until ``until`` if it drives first and then brakes.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         drive: duration of the drive, s.
         until: end of the comparison, s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
@@ -180,15 +192,15 @@ def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the controlled vehicle avoids the front vehicle until ``until`` if it brakes for ``brake`` s, then
+    """Return whether the controlled vehicle avoids the front vehicle until ``until`` if it brakes first and then
     drives.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         brake: duration of the braking, s.
         until: end of the comparison, s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])

@@ -1,8 +1,8 @@
-"""Harm that must follow a first meeting if an obstacle stands ahead of the leader.
+"""Bound the harm that must follow a first contact if an obstacle is ahead of the leader.
 
-``beyond`` is the squared speed with which the leader hits the obstacle; it bounds how far ahead the leader is.
-Positions count from the position of the controlled vehicle at its onset; masses are in units of its mass.
-docs/internals/proofs/lower-bound-obstacle.md has the proofs.
+``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. This speed limits how far ahead the
+leader can be at any time. Positions count from the controlled vehicle's position at its onset. Masses are in units of
+the controlled vehicle's mass. docs/internals/proofs/lower-bound-obstacle.md has the proofs.
 """
 
 from __future__ import annotations
@@ -24,24 +24,28 @@ from ethbrake_marl.physics.state import Floats
 
 CELL = 1e-3  # relative and absolute (m2/s2) precision of a minimum
 
-ZONE_M = 1.0  # distance from the obstacle within which a vehicle that was stopped there is assumed to stay
+ZONE_M = 1.0  # a vehicle that was stopped at the obstacle is assumed to stay within this distance of it
 
-_BEYOND_PARTS, _BEYOND_FINEST = 4, 4  # number of parts of the range of ``beyond``, and of a part that is divided again
+_BEYOND_PARTS, _BEYOND_FINEST = 4, 4  # number of parts of the range of ``beyond``, and largest number of their parts
 
-_MOST = 400.0  # m2/s2; harm at the rear pair is cut to this
+_MOST = 400.0  # m2/s2; a larger bound of the rear pair's harm is cut to this value
 
-_FLIGHTS = 6  # number of lengths of a last drive that are tried
+_FLIGHTS = 6  # number of lengths that are tried for the last drive
 
-_SHORTEST_S = 1e-3  # shortest time or last drive to divide by
+_SHORTEST_S = 1e-3  # smallest time in a denominator
 
 
 @compiled
 def all_three(at: Floats) -> tuple[float, float, float, float]:
-    """Return the masses of front and rear vehicle, and the largest deceleration of the centre of mass of all three
+    """Return the masses of front and rear vehicle, and two decelerations of the centre of mass of all three vehicles
     (m/s2).
 
-    Masses are in units of the controlled vehicle's mass. The fourth result is the part of that deceleration that comes
-    from the rear vehicle (m/s2). ``at`` is one world, an array with the columns of ``line.LINE``.
+    Masses are in units of the controlled vehicle's mass. The third result is the largest deceleration of the centre of
+    mass before the rear vehicle's onset, the fourth the further deceleration by the brakes of the rear vehicle.
+
+    Args:
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+
     """
     front, rear = at[LINE.FRONT_SHARE] / (1.0 - at[LINE.FRONT_SHARE]), at[LINE.REAR_SHARE] / (1.0 - at[LINE.REAR_SHARE])
     whole = front + 1.0 + rear
@@ -50,13 +54,12 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
-    """Return the speed (m/s) to which a push at ``early`` must bring the front vehicle, and the time (s) of its impact
-    with the obstacle.
+    """Return the speed (m/s) of the front vehicle after a push, and the time (s) at which it then hits the obstacle.
 
-    It then hits the obstacle with the speed ``sqrt(beyond)``.
+    The push is such that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: time of the push, s.
         beyond: squared speed at the obstacle, m2/s2.
 
@@ -69,20 +72,19 @@ def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float
 def least_beyond(
     at: Floats, early: float, late: float, place: float, speed: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared speed (m2/s2) with which the front vehicle, pushed at ``early``, hits the obstacle.
+    """Return the smallest squared speed (m2/s2) at which the front vehicle, pushed at ``early``, hits the obstacle.
 
-    It follows from the centre of mass of all three vehicles, which must not reach the obstacle before the front
-    vehicle.
+    The bound uses the centre of mass of all three vehicles: it cannot reach the obstacle before the front vehicle does.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: time of the push, s.
         late: time for which ``place`` and ``speed`` hold, s.
-        place: least position of the centre of mass of all three at ``late``, m.
-        speed: speed of that centre of mass at ``late``, m/s.
-        least: bound that is known before, m2/s2; the result is at least this.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        place: smallest position of the centre of mass of all three vehicles at ``late``, m.
+        speed: speed of this centre of mass at ``late``, m/s.
+        least: bound that is known already, m2/s2; the result is at least this.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     if not speed > 0.0:
@@ -101,16 +103,16 @@ def least_beyond(
 
 @compiled(apart=True)
 def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float, float, float]:
-    """Return the least position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
+    """Return the smallest position (m) and speed (m/s) at ``late`` of a vehicle that brakes after its first contact.
 
-    The third result is its deceleration (m/s2): the hardest of all three vehicles, so that no vehicle falls further
-    behind.
+    The third result is the deceleration of the vehicle (m/s2): the largest braking capacity of all three vehicles, so
+    that no command and no push brings the vehicle further behind.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        faster: speed by which it left the contact faster than the front vehicle, m/s.
+        faster: speed by which the vehicle is faster than the front vehicle after the contact, m/s.
 
     """
     v_l, way = leader(at, late)
@@ -122,17 +124,16 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
 
 @compiled
 def last_drive(room: float, speed: float, brakes: float, drive: float, time: float) -> float:
-    """Return for how long (s) a vehicle must drive at the end of ``time``, after braking, to have travelled ``room`` m
-    by then.
+    """Return how long (s) a vehicle must drive at the end of ``time``, after braking, to travel ``room`` metres in all.
 
-    Infinite if it cannot.
+    The result is infinite if the vehicle cannot travel so far.
 
     Args:
         room: distance to travel, m.
         speed: speed now, m/s.
-        brakes: deceleration while braking, m/s2.
-        drive: acceleration while driving, m/s2.
-        time: total time, s.
+        brakes: deceleration while the vehicle brakes, m/s2.
+        drive: acceleration while the vehicle drives, m/s2.
+        time: total time of braking and driving, s.
 
     """
     stand = speed / brakes
@@ -151,20 +152,20 @@ def stopped_there(
     """Return three limits for a vehicle that the front vehicle stops at the obstacle: distance, backward speed and
     time.
 
-    These are its largest distance from the obstacle (m; infinite if it is not known), its largest backward speed (m/s)
-    and the largest time it spends there (s).
+    The distance (m) is the vehicle's largest distance from the obstacle; it is infinite if no limit is known. The speed
+    (m/s) is the vehicle's largest backward speed. The time (s) is the longest time that it spends near the obstacle.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        hard: largest closing speed of the contact, m/s.
-        beyond: squared speed with which the front vehicle hits the obstacle, m2/s2.
-        struck: time of that impact, s.
+        hard: largest closing speed of the first contact, m/s.
+        beyond: squared speed at which the front vehicle hits the obstacle, m2/s2.
+        struck: time at which the front vehicle hits the obstacle, s.
         until: time by which the rear vehicle arrives, s.
-        place: least position of the vehicle at ``late``, m.
-        speed: its least speed at ``late``, m/s.
-        brakes: its deceleration, m/s2.
+        place: smallest position of the vehicle at ``late``, m.
+        speed: smallest speed of the vehicle at ``late``, m/s.
+        brakes: deceleration of the vehicle, m/s2.
 
     """
     bounce, drive, wall = at[LINE.RESTITUTION], at[LINE.U_F], at[LINE.GAP_L] + at[LINE.WALL]
@@ -174,7 +175,7 @@ def stopped_there(
     soonest = early + 2.0 * most / max(top + fastest, _SHORTEST_S)
     wait = max(until - max(soonest, struck, late), 0.0)
     back = bounce * max((1.0 - at[LINE.FRONT_SHARE]) * (1.0 + bounce), 1.0)
-    # what it arrives with falls with the time, until it can stop on the way
+    # the speed of its arrival falls with the time, until it can stop on the way
     time, stand, room = max(struck, late) - late, speed / brakes, wall - place
     flight = last_drive(room, speed, brakes, drive, time)
     if time < stand and flight <= time and room > (speed - 0.5 * brakes * time) * time:
@@ -194,27 +195,27 @@ def behind_leader(
     at: Floats, early: float, late: float, soft: float, hard: float, beyond: float, place: float, speed: float,
     plan: Floats, other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
+    """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    It assumes that the front vehicle hits the obstacle with at most ``sqrt(beyond)`` m/s, and that no vehicle passes
-    it. Returns LARGE (a huge number) if that is impossible.
+    The front vehicle is assumed to hit the obstacle with at most ``sqrt(beyond)`` m/s. No vehicle passes the front
+    vehicle or the obstacle. The result is LARGE (a huge number) if these assumptions contradict each other.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        soft: least closing speed of the contact, m/s.
-        hard: largest closing speed of the contact, m/s.
-        beyond: largest squared speed with which the front vehicle hits the obstacle, m2/s2.
-        place: least position of the centre of mass of all three at ``late``, m.
-        speed: speed of that centre of mass at ``late``, m/s.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        soft: smallest closing speed of the first contact, m/s.
+        hard: largest closing speed of the first contact, m/s.
+        beyond: largest squared speed at which the front vehicle hits the obstacle, m2/s2.
+        place: smallest position of the centre of mass of all three vehicles at ``late``, m.
+        speed: speed of this centre of mass at ``late``, m/s.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     wall, drive, onset = at[LINE.GAP_L] + at[LINE.WALL], at[LINE.U_F], at[LINE.ONSET_R]
     rest = 1.0 - at[LINE.FRONT_SHARE] * (1.0 + at[LINE.RESTITUTION])
-    # time by which the rear vehicle must have arrived: at the leader, or at the obstacle
+    # latest time at which the rear vehicle arrives at the leader, or at the obstacle
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
     v, struck = leader_pushed(at, early, beyond)
@@ -229,7 +230,7 @@ def behind_leader(
     time, stand = until - late, low / brakes
     if not _SHORTEST_S < time < math.inf:
         return 0.0
-    # largest speed of the controlled vehicle then: it was never further back than by braking, or where it was stopped
+    # largest speed of the controlled vehicle at that time, from the smallest position that it had before
     v_r, goal = follower(at, until)
     goal -= at[LINE.GAP_R]
     longest = last_drive(goal - least, low, brakes, drive, time)
@@ -254,7 +255,7 @@ def behind_leader(
         fastest = min(fastest, (goal - behind) / flight + 0.5 * drive * flight)
     closing = max(v_r - fastest, 0.0)
     if not at_wall:
-        # the drive that makes this meeting so soft brings all three nearer to the obstacle
+        # the drive that makes this contact so soft brings all three vehicles nearer to the obstacle
         fill_braking(plan, 0.0, brakes)
         fill_braking(other, max(onset - late, 0.0), at[LINE.A_R])
         v_r, way_r = follower(at, late)
@@ -279,17 +280,17 @@ def behind_leader(
 def after_at_obstacle(
     at: Floats, early: float, late: float, soft: float, hard: float, follows: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm (m2/s2) at rear pair and obstacle together after a first contact with the front vehicle.
+    """Return the smallest harm (m2/s2) of rear pair and obstacle together after a first contact with the front vehicle.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        soft: least closing speed of the contact, m/s.
-        hard: largest closing speed of the contact, m/s.
-        follows: known lower bound on the harm at the rear pair, m2/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        soft: smallest closing speed of the first contact, m/s.
+        hard: largest closing speed of the first contact, m/s.
+        follows: known lower bound on the harm of the rear pair, m2/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     share = at[LINE.FRONT_SHARE]
@@ -302,7 +303,7 @@ def after_at_obstacle(
     place = ((front + 1.0) * place + rear * (way_r - at[LINE.GAP_R])) / (front + 1.0 + rear)
     speed = ((front + 1.0) * speed + rear * v_r) / (front + 1.0 + rear)
     least = least_beyond(at, early, late, place, speed, least, plan, other)
-    # the harder the leader hits the obstacle, the softer the meeting with the rear vehicle can be
+    # the harder the leader hits the obstacle, the softer the contact with the rear vehicle can be
     first = min(max(behind_leader(at, early, late, soft, hard, least, place, speed, plan, other), follows), _MOST)
     step, begin, known = (first - follows) / _BEYOND_PARTS, least, least + first
     size, proven = step, known
@@ -321,16 +322,17 @@ def after_at_obstacle(
 def beyond_rear(
     at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least squared speed (m2/s2) of the front vehicle at the obstacle after the rear vehicle was met first.
+    """Return the smallest squared speed (m2/s2) of the front vehicle at the obstacle if the first contact is with the
+    rear.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        closing: largest closing speed of the contact, m/s.
-        least: bound that is known before, m2/s2; the result is at least this.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        closing: largest closing speed of the first contact, m/s.
+        least: bound that is known already, m2/s2; the result is at least this.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     v_l, way_l = leader(at, late)
@@ -347,17 +349,17 @@ def beyond_rear(
 def after_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats, other: Floats
 ) -> float:
-    """Return the least harm (m2/s2) at front pair and obstacle after a first contact with the rear vehicle.
+    """Return the smallest harm (m2/s2) of front pair and obstacle together after a first contact with the rear vehicle.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        closing: largest closing speed of the contact, m/s.
-        end: time until which the command of the earlier decision stays in force, s.
-        lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        closing: largest closing speed of the first contact, m/s.
+        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
+        lack: smallest possible difference between that command and the best command after the contact, m/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan``.
+        other: second working memory of the same kind.
 
     """
     share, rest = at[LINE.REAR_SHARE], 1.0 - at[LINE.REAR_SHARE]
@@ -388,19 +390,19 @@ def after(
     kind: int, at: Floats, early: float, late: float, closing: float, end: float, lack: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the least harm (m2/s2) at the other pair (and the obstacle) after a first contact with one neighbour.
+    """Return the smallest harm (m2/s2) of the other pair (and the obstacle) after a first contact with one neighbour.
 
     Args:
-        kind: which neighbour is met first: ``FRONT_FIRST`` or ``REAR_FIRST`` (``RAMPED_FRONT``, ``RAMPED_REAR`` with
-            brake build-up).
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
+            ``RAMPED_REAR``).
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        closing: largest closing speed of the contact, m/s.
-        end: time until which the command of the earlier decision stays in force, s.
-        lack: least amount by which that command falls short of the best one, m/s2.
-        plan: working memory, from ``empty_plan`` (``empty_legs`` with brake build-up).
-        other: further working memory of the same kind.
+        closing: largest closing speed of the first contact, m/s.
+        end: end of the decision step of the first contact, s; the command of this step stays in force until then.
+        lack: smallest possible difference between that command and the best command after the contact, m/s2.
+        plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
+        other: second working memory of the same kind.
 
     """
     if kind >= RAMPED_FRONT:

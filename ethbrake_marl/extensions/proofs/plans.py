@@ -1,8 +1,8 @@
-"""Two vehicles on plans of piecewise constant acceleration: how close they come, and where they first meet.
+"""Simulate two vehicles with piecewise constant acceleration: their smallest gap and their first contact.
 
-A *plan* is an array [2, PIECES]: row ENDS holds the end of each piece (seconds from now, the last one infinite), row
-ACCELERATIONS its acceleration (m/s2). A vehicle that brakes to rest stays at rest. There is no time step: each piece
-has a closed form.
+A *plan* is the motion of one vehicle, an array [2, PIECES]. Row ENDS has the end of each piece (s from now; the last
+piece never ends), row ACCELERATIONS the acceleration in it (m/s2). A vehicle that brakes to rest stays at rest. The
+motion has no time steps, because each piece has a closed form.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PIECES = 4
 
 @compiled
 def empty_plan() -> Floats:
-    """Return an uninitialised plan [2, PIECES] to fill in: row 0 the ends of its pieces (s), row 1 their accelerations
+    """Return an uninitialised plan, [2, PIECES]. Row 0 is for the ends of the pieces (s), row 1 for accelerations
     (m/s2).
     """
     return np.empty((2, PIECES))
@@ -32,10 +32,10 @@ def empty_plan() -> Floats:
 def fill_plan(
     plan: Floats, end_0: float, u_0: float, end_1: float, u_1: float, end_2: float, u_2: float, u_3: float
 ) -> None:
-    """Write a plan: acceleration ``u_0`` until ``end_0``, then ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, then
-    ``u_3``.
+    """Write a plan with four accelerations (m/s2) and their ends (s).
 
-    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    The acceleration is ``u_0`` until ``end_0``, ``u_1`` until ``end_1``, ``u_2`` until ``end_2``, and ``u_3``
+    afterwards. ``plan`` [2, PIECES] is overwritten.
     """
     plan[ENDS, 0], plan[ENDS, 1], plan[ENDS, 2], plan[ENDS, 3] = end_0, end_1, end_2, math.inf
     plan[ACCELERATIONS, 0], plan[ACCELERATIONS, 1] = u_0, u_1
@@ -46,16 +46,17 @@ def fill_plan(
 def fill_braking(plan: Floats, onset: float, braking: float) -> None:
     """Write a plan: coast until ``onset`` (s), then brake to rest with ``braking`` (m/s2, positive).
 
-    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    ``plan`` [2, PIECES] is overwritten.
     """
     fill_plan(plan, onset, 0.0, onset, 0.0, onset, 0.0, -braking)
 
 
 @compiled
 def fill_window(plan: Floats, u: float, late: float, end: float, change: float, turn: float, step: float) -> None:
-    """Write a plan: acceleration ``u``, plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to ``end``.
+    """Write a plan with acceleration ``u`` (m/s2), plus ``step`` from ``turn`` on, plus ``change`` from ``late`` to
+    ``end``.
 
-    ``plan`` [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+    ``step`` and ``change`` are in m/s2, the times in s. ``plan`` [2, PIECES] is overwritten.
     """
     first, second, third = min(turn, late), min(max(turn, late), end), max(turn, end)
     u_1 = u + step if turn < late else u + change
@@ -65,19 +66,19 @@ def fill_window(plan: Floats, u: float, late: float, end: float, change: float, 
 
 @compiled
 def time_to_limit(v: float, u: float, limit: float) -> float:
-    """Return for how long (s) the acceleration ``u`` (m/s2) acts until the speed rises from ``v`` to ``limit`` (m/s).
+    """Return the time (s) in which the acceleration ``u`` (m/s2) raises the speed from ``v`` to ``limit`` (m/s).
 
-    0 at or above the limit, and if ``u <= 0``.
+    The result is 0 if ``v`` is at or above the limit, or ``u <= 0``.
     """
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 
 @compiled
 def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive: float, braking: float) -> None:
-    """Write a plan: drive for ``drive`` s (at most to the speed limit), then brake to rest.
+    """Write a plan: drive for ``drive`` seconds, at most up to the speed limit, then brake to rest.
 
     Args:
-        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+        plan: [2, PIECES] receives the plan.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
@@ -91,10 +92,10 @@ def fill_drive_then_brake(plan: Floats, v: float, u: float, limit: float, drive:
 
 @compiled
 def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake: float, braking: float) -> None:
-    """Write a plan: brake for ``brake`` s (at most to rest), then drive to the speed limit and stay there.
+    """Write a plan: brake for ``brake`` seconds, at most to rest, then drive up to the speed limit and keep that speed.
 
     Args:
-        plan: [2, PIECES] receives the ends (s) and accelerations (m/s2) of its pieces.
+        plan: [2, PIECES] receives the plan.
         v: speed now, m/s.
         u: driving acceleration, m/s2.
         limit: speed limit, m/s.
@@ -108,11 +109,13 @@ def fill_brake_then_drive(plan: Floats, v: float, u: float, limit: float, brake:
 
 @compiled
 def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
-    """Return the acceleration in force at ``now`` (m/s2), the time at which it ends (s), and whether the vehicle then
-    stops.
+    """Return the acceleration at ``now`` (m/s2), the time until which it lasts (s), and whether the vehicle then stops.
 
-    ``plan`` [2, PIECES] holds the ends (s) and accelerations (m/s2) of the pieces of its motion, ``v`` its speed at
-    ``now`` (m/s).
+    Args:
+        plan: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of the motion.
+        now: present time, s.
+        v: speed at ``now``, m/s.
+
     """
     k = 0
     while now >= plan[ENDS, k]:
@@ -131,20 +134,20 @@ def piece_at(plan: Floats, now: float, v: float) -> tuple[float, float, bool]:
 def walk(
     gap: float, v_front: float, front: Floats, v_rear: float, rear: Floats, until: float
 ) -> tuple[float, float, float]:
-    """Return the smallest gap of two vehicles (m), the time of their first contact (s), and their squared closing speed
-    then (m2/s2).
+    """Return the smallest gap of two vehicles (m), the time (s) of their first contact, and the squared closing speed
+    (m2/s2).
 
-    If they do not touch, the time is infinite and the closing speed 0. The motion is computed as if they could pass
-    through each other, so a negative smallest gap is the depth of their overlap. A gap that reaches 0 and opens again
-    is no contact; a gap that reaches 0 and would become negative is a contact, even with closing speed 0. Both speeds
-    must be at least 0.
+    If there is no contact, the time is infinite and the closing speed 0. The motion is computed as if the vehicles
+    could pass through each other, so a negative smallest gap is the depth of their overlap. A gap that reaches 0 and
+    opens again does not count as contact. A gap that reaches 0 and would become negative counts as contact, even at
+    closing speed 0. Both speeds must be at least 0.
 
     Args:
         gap: gap now, m.
         v_front: speed of the front vehicle, m/s.
-        front: [2, PIECES] ends (s) and accelerations (m/s2) of the pieces of its motion.
+        front: plan of the front vehicle, [2, PIECES]: ends (s) and accelerations (m/s2) of the pieces.
         v_rear: speed of the rear vehicle, m/s.
-        rear: [2, PIECES] the same for the rear vehicle.
+        rear: plan of the rear vehicle, [2, PIECES].
         until: time at which the motion ends, s.
 
     """

@@ -1,4 +1,4 @@
-"""The lower bound with brakes that build up at finite rates."""
+"""Compute the lower bound on harm if brakes build up at finite rates."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ from ethbrake_marl.physics.state import Bools, Floats, Worlds
 def combined_ramped(
     at: Floats, until: float, front: float, rear: float, contact_s: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return the least harm of both pairs together (m2/s2), whoever is met first, with brake build-up.
+    """Return a lower bound (m2/s2) on the harm of both pairs together, with brake build-up.
 
-    Returns 0 if nothing is proven.
+    The first contact may be with the front or the rear vehicle. The result is 0 if nothing is proven.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        until: horizon, s; harm after it does not count.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        until: horizon, s; later harm does not count.
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
-        contact_s: time by which some contact is certain, s; infinite: unknown.
-        plan: working memory, from ``empty_legs``.
-        other: further working memory of the same kind.
-        heap: working memory of the search, [CELLS, NEAR].
+        contact_s: time by which some contact is certain, s; infinite: no contact is known to be certain.
+        plan: working memory for the motion of one vehicle, [3, LEGS].
+        other: second working memory of the same kind, [3, LEGS].
+        heap: working memory for the cells of the search, [CELLS, NEAR].
 
     """
     if min(at[LINE.GAP_L], at[LINE.GAP_R]) <= TOUCHING_M:
@@ -82,14 +82,14 @@ def combined_ramped(
 
 @compiled
 def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools, out: Floats) -> None:
-    """Compute lower bounds on the harm of ``n`` worlds with brake build-up: of each pair alone, and of both together.
+    """Compute lower bounds on the harm of ``n`` worlds with brake build-up: for each pair alone, and for both together.
 
     Args:
-        states: [n, LINE.WIDTH] the worlds, one row each, with the columns of ``line.LINE``.
+        states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
         has_front: [n] True if the front pair exists and its next impact counts.
         has_rear: [n] True if the rear pair exists and its next impact counts.
-        both: [n] True for worlds in which the combined bound is computed.
-        out: [n, BOUNDS] receives columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
+        both: [n] True for worlds whose combined bound is computed; it is 0 in all other worlds.
+        out: [n, BOUNDS] receives the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
 
     """
     plan, other, heap = empty_legs(), empty_legs(), np.empty((CELLS, NEAR))
@@ -110,14 +110,14 @@ def bound_ramped(states: Floats, has_front: Bools, has_rear: Bools, both: Bools,
 
 
 def ramped_states(worlds: Worlds, i: int, until: Floats) -> Floats:
-    """Return worlds with brake build-up in the columns of ``line.LINE``, [n, WIDTH].
+    """Return worlds with brake build-up as an array with the columns of ``line.LINE``, [n, LINE.WIDTH].
 
-    A controlled vehicle that already brakes or drives is treated as if its rates were infinite.
+    A controlled vehicle that already brakes or drives is treated as if its brakes built up and released at once.
 
     Args:
         worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
         i: index of the controlled vehicle.
-        until: [n] horizon, s from then; the bounds cover only harm within it.
+        until: [n] horizon, s after that moment; later harm does not count.
 
     """
     v, at = worlds.vehicles, onset_states(worlds, i, None)

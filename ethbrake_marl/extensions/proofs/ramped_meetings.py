@@ -1,8 +1,9 @@
-"""Meetings with brake build-up, and what must follow them; and the parts that all lower bounds share.
+"""First contacts with brake build-up, the harm that must follow them, and functions that all lower bounds share.
 
-A *meeting* is a first contact of the controlled vehicle. ``sign`` is 1 for meetings with the leader and -1 for meetings
-with the rear vehicle, which are the mirror image: forces times ``sign`` first rise (drive, or brake) and later fall.
-``place`` is a position times ``sign``. docs/internals/proofs/lower-bound-cases.md has the proofs.
+``sign`` is 1 for first contacts with the leader and -1 for first contacts with the rear vehicle. The second case is the
+mirror image of the first. A *force* is an acceleration (m/s2). The controlled vehicle's force times ``sign`` first
+rises and later falls: it drives and then brakes towards the leader, and does the reverse towards the rear vehicle.
+``place`` is a position times ``sign`` (m). docs/internals/proofs/lower-bound-cases.md has the proofs.
 """
 
 from __future__ import annotations
@@ -33,32 +34,34 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds
 
 @compiled
 def fill_leader(at: Floats, plan: Floats) -> None:
-    """Write the plan of the front vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+    """Write the motion of the front vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
 
-    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
-    ``line.LINE``.
+    A plan is a piecewise linear acceleration over time. ``at`` is the state of one world, [LINE.WIDTH].
     """
     fill_build_up(plan, 0.0, at[LINE.FORCE_L], -at[LINE.A_L], at[LINE.FALL_L])
 
 
 @compiled
 def fill_follower(at: Floats, plan: Floats) -> None:
-    """Write the plan of the rear vehicle, if nobody touches it, to ``plan`` [3, LEGS].
+    """Write the motion of the rear vehicle, if no other vehicle pushes it, to ``plan`` [3, LEGS].
 
-    A *plan* is a profile of piecewise linear acceleration. ``at`` is one world, an array with the columns of
-    ``line.LINE``.
+    A plan is a piecewise linear acceleration over time. ``at`` is the state of one world, [LINE.WIDTH].
     """
     fill_build_up(plan, at[LINE.ONSET_R], at[LINE.FORCE_R], -at[LINE.A_R], at[LINE.FALL_R])
 
 
 @compiled
 def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
-    """Return the range of ``sign`` times the controlled vehicle's force: largest force, rate up, size of the least
-    force, rate down.
+    """Return the limits of ``sign`` times the controlled vehicle's force: largest force, rate up, least force, rate
+    down.
 
-    A *force* is an acceleration in m/s2; the least one is returned with its sign dropped. Rates are in m/s3. With
-    ``sign`` 1 the largest force is full drive, with -1 it is full braking. ``at`` is one world, an array with the
-    columns of ``line.LINE``.
+    A *force* is an acceleration (m/s2); rates are in m/s3. The least force is negative and is returned without its
+    minus sign. With ``sign`` 1 the largest force is full drive, with -1 it is full braking.
+
+    Args:
+        sign: 1 or -1.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+
     """
     if sign > 0.0:
         return at[LINE.U_F], at[LINE.RISE_F], at[LINE.A_F], at[LINE.FALL_F]
@@ -67,17 +70,17 @@ def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
 
 @compiled
 def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: float, plan: Floats) -> None:
-    """Write a plan of the controlled vehicle: its force (times ``sign``) rises fully until ``switch``, then falls
-    fully.
+    """Write a plan of the controlled vehicle: ``sign`` times its force rises as fast as possible until ``switch``, then
+    falls.
 
-    A *force* is an acceleration in m/s2.
+    A *force* is an acceleration (m/s2). The force also falls as fast as possible.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        sign: 1 if the front vehicle is met, -1 for the rear vehicle.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        sign: 1 for a contact with the front vehicle, -1 with the rear vehicle.
         switch: time at which the force begins to fall, s.
         time: time of the contact, s.
-        final: force times ``sign`` at ``time``; -inf: no such condition.
+        final: force times ``sign`` at ``time``, m/s2; -inf: no condition.
         plan: [3, LEGS] receives the plan.
 
     """
@@ -89,19 +92,20 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
 def switch_for(
     at: Floats, sign: float, time: float, place: float, final: float, halvings: int, plan: Floats
 ) -> tuple[float, float, float]:
-    """Return two times (s) just before and after the switch that leads the controlled vehicle to ``place`` at ``time``.
+    """Return two times (s) just before and after the switch that brings the controlled vehicle to ``place`` at
+    ``time``.
 
-    The *switch* is the time at which its force (acceleration times ``sign``) turns from rising to falling. The third
-    result is the speed (m/s) at ``time`` after the earlier switch.
+    The *switch* is the time at which ``sign`` times the vehicle's force stops rising and begins to fall; a *force* is
+    an acceleration. The third result is the speed (m/s) at ``time`` for the earlier of the two switches.
 
     Args:
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
-        sign: 1 if the front vehicle is met, -1 for the rear vehicle.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
+        sign: 1 for a contact with the front vehicle, -1 with the rear vehicle.
         time: time of the contact, s after the controlled vehicle may act.
         place: position times ``sign`` at ``time``, m.
-        final: largest force at ``time``, m/s2; -inf: no limit.
-        halvings: number of halvings of the interval.
-        plan: [3, LEGS] working memory.
+        final: force times ``sign`` at ``time``, m/s2; -inf: no condition.
+        halvings: number of bisections.
+        plan: working memory for the motion of one vehicle, [3, LEGS].
 
     """
     low, high = (-1.0 if range_of(sign, at)[1] == math.inf else 0.0), time
@@ -118,15 +122,16 @@ def switch_for(
 
 @compiled
 def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, float, float]:
-    """Return sign, speed (m/s) and place (m) at ``time`` of the neighbour that is met, if nobody touches it before.
+    """Return sign, speed (m/s) and place (m) at ``time`` of the neighbour of the first contact, if no other vehicle
+    pushes it.
 
-    The *sign* is 1 for the front vehicle and -1 for the rear one; the *place* is the position times the sign.
+    The *sign* is 1 for the front vehicle and -1 for the rear one. The *place* is the position times the sign.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s after the controlled vehicle may act.
-        plan: [3, LEGS] working memory.
+        plan: working memory for the motion of one vehicle, [3, LEGS].
 
     """
     if kind == RAMPED_FRONT:
@@ -140,11 +145,11 @@ def met_at(kind: int, at: Floats, time: float, plan: Floats) -> tuple[float, flo
 
 @compiled(apart=True)
 def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
-    """Return the least closing speed (m/s) of a first contact at ``time``, with brake build-up.
+    """Return the smallest closing speed (m/s) of a first contact at ``time``, with brake build-up.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s after the controlled vehicle may act.
 
     """
@@ -157,19 +162,19 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return the largest distance (m) to the neighbour at ``early``, and by how much (m/s) the closing speed may then
-    exceed ``hard``.
+    """Return the largest distance (m) to the neighbour at ``early``, and the largest excess of the closing speed then.
 
-    The controlled vehicle meets the neighbour between ``early`` and ``late``.
+    The excess (m/s) is the closing speed at ``early`` minus ``hard``. The first contact comes between ``early`` and
+    ``late``.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         v: speed of the neighbour at ``early``, m/s.
-        hard: largest closing speed of the contact, m/s.
-        plan: [3, LEGS] working memory.
+        hard: largest closing speed of the first contact, m/s.
+        plan: working memory for the motion of one vehicle, [3, LEGS].
 
     """
     span = late - early
@@ -181,11 +186,11 @@ def slack_of(
 
 @compiled(apart=True)
 def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) -> float:
-    """Return the least closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up.
+    """Return the smallest closing speed (m/s) of first contacts between ``early`` and ``late``, with brake build-up.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
 
@@ -204,18 +209,18 @@ def gentlest_ramped_between(kind: int, at: Floats, early: float, late: float) ->
 
 @compiled(apart=True)
 def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: float) -> float:
-    """Return the largest acceleration (m/s2) of the controlled vehicle with which it can meet a neighbour at no more
-    than ``hard``.
+    """Return an upper bound (m/s2) on the controlled vehicle's acceleration at a first contact of closing speed
+    ``hard``.
 
-    For a contact with the rear vehicle, accelerations count with the opposite sign, so the largest one is the hardest
-    braking.
+    The bound covers all smaller closing speeds too. For a contact with the rear vehicle the acceleration has the
+    opposite sign, so the bound is on the braking.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        hard: largest closing speed of the contact, m/s.
+        hard: largest closing speed of the first contact, m/s.
 
     """
     plan = empty_legs()
@@ -239,25 +244,26 @@ def force_of_meeting(kind: int, at: Floats, early: float, late: float, hard: flo
 def after_ramped(
     kind: int, at: Floats, early: float, late: float, hard: float, plan: Floats, other: Floats
 ) -> float:  # fmt: skip
-    """Return the least squared closing speed (m2/s2) at the other neighbour after a first contact, with brake build-up.
+    """Return the smallest squared closing speed (m2/s2) at the other neighbour after a first contact, with brake
+    build-up.
 
     The bound uses the motion of the controlled vehicle alone.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        hard: largest closing speed of the contact, m/s.
-        plan: [3, LEGS] working memory.
-        other: [3, LEGS] working memory.
+        hard: largest closing speed of the first contact, m/s.
+        plan: working memory for the motion of one vehicle, [3, LEGS].
+        other: second working memory of the same kind, [3, LEGS].
 
     """
     sign = 1.0 if kind == RAMPED_FRONT else -1.0
     share = at[LINE.FRONT_SHARE] if kind == RAMPED_FRONT else at[LINE.REAR_SHARE]
     rest = 1.0 - share * (1.0 + at[LINE.RESTITUTION])
     if kind == RAMPED_FRONT and (rest < 0.0 or at[LINE.OBSTACLE] < math.inf):
-        return 0.0  # the controlled vehicle may be thrown back
+        return 0.0  # no bound: the controlled vehicle may be thrown back
     rest, span = max(rest, 0.0), late - early
     high, rise, _, _ = range_of(sign, at)
     force = high
@@ -293,14 +299,14 @@ def after_ramped(
 
 @compiled(apart=True)
 def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the other neighbour never arrives before a first contact at ``time`` or later.
+    """Return whether a first contact at ``time`` or later is possible before the other neighbour arrives.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s after the controlled vehicle may act.
-        plan: [3, LEGS] working memory.
-        other: [3, LEGS] working memory.
+        plan: working memory for the motion of one vehicle, [3, LEGS].
+        other: second working memory of the same kind, [3, LEGS].
 
     """
     sign, _, place = met_at(kind, at, time, plan)
@@ -321,18 +327,17 @@ def is_first_ramped(kind: int, at: Floats, time: float, plan: Floats, other: Flo
 
 @compiled(apart=True)
 def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats) -> tuple[float, float, float]:
-    """Return time and closing speed of the contact with a neighbour under full drive or full braking, with brake
-    build-up.
+    """Return time (s) and closing speed (m/s) of the contact with a neighbour under full drive or full braking.
 
-    The time (s) is infinite and the speed (m/s) 0 if they never meet. The third result is the least closing speed (m/s)
-    of any motion of the pair that is at no time farther apart than these two.
+    Brakes build up at finite rates. The time is infinite and the speed 0 if there is no contact. The third result is
+    the smallest closing speed (m/s) of any motion of the pair whose gap is never larger than in this one.
 
     Args:
-        kind: ``RAMPED_FRONT`` or ``RAMPED_REAR``: the neighbour that is met.
-        at: one world, an array [WIDTH] with the columns of ``line.LINE``.
+        kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
+        at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         sign: 1: the controlled vehicle drives fully; -1: it brakes fully.
-        plan: [3, LEGS] working memory.
-        other: [3, LEGS] working memory.
+        plan: working memory for the motion of one vehicle, [3, LEGS].
+        other: second working memory of the same kind, [3, LEGS].
 
     """
     fill_controlled(at, sign, math.inf, math.inf, -math.inf, plan)
@@ -349,32 +354,32 @@ def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats)
 
 EPS = 2.0**-52  # the spacing of doubles at 1
 
-# Bounds are lowered by this many eps of the largest squared speeds of a world: a segment of motion or a round of
-# impacts changes a squared closing speed by at most 8 eps of these, and an episode has up to 500 of them.
+# Bounds are lowered by this many EPS times the largest squared speed of a world. A segment of motion or a round of
+# impacts changes a squared closing speed by at most 8 EPS of this, and an episode has at most 500 of them.
 BOUND_EPS = 2.0**12
 
-LEAST_TIME_STEP_S = 1e-3  # least time between decisions, because shorter steps need more work
+LEAST_TIME_STEP_S = 1e-3  # shortest time between decisions; shorter steps would take too long
 
-LEAST_PART = 100  # least number of worlds per thread; fewer are not worth a thread
+LEAST_PART = 100  # smallest number of worlds for which another thread is started
 
 
 @dataclass(frozen=True, slots=True)
 class LowerBound:
-    """Proven bounds on the harm of each world, [n] m2/s2 each."""
+    """Proven lower bounds on the harm of each world; every array is [n], in m2/s2."""
 
-    harm: Floats  # lower bound on the total harm: no command profile does less
+    harm: Floats  # lower bound on the harm: no command does less
     early: Floats  # harm before the controlled vehicle may act
-    front_pair: Floats  # bound of the front pair alone, from that moment on
-    rear_pair: Floats  # bound of the rear pair alone, from that moment on
-    combined: Floats  # bound of both pairs together; 0 if nothing is proven
-    # verdict on contact, on which the combined bound rests; None if brakes build up in any world
+    front_pair: Floats  # bound on the harm of the front pair alone, after the early harm
+    rear_pair: Floats  # bound on the harm of the rear pair alone, after the early harm
+    combined: Floats  # bound on the harm of both pairs together; 0 if nothing is proven
+    # verdict on avoidable contact, which the combined bound uses; None if brakes build up in any world
     contact: Avoidability | None
 
     @property
     def impact_proven(self) -> Bools:
-        """True for worlds in which every command profile certainly has an impact, [n].
+        """Worlds in which every command of the controlled vehicle certainly leads to an impact: boolean mask, [n].
 
-        False means that none is proven, not that an impact can be avoided.
+        False means that no impact is proven. It does not mean that an impact can be avoided.
         """
         return np.asarray(self.harm > 0.0, np.bool_)
 
@@ -382,23 +387,26 @@ class LowerBound:
 def at_onset_of(
     where: str, worlds: Worlds, vehicles: Ints, harm_count: HarmCount, horizon_s: float
 ) -> tuple[Worlds, Floats, Floats, Bools]:
-    """Simulate worlds until the first of ``vehicles`` may act. Return these worlds, that time, the harm so far, and a
-    mask of pairs.
+    """Simulate worlds until the first of ``vehicles`` may act.
 
-    The time is [n] s, the harm [n] m2/s2. The mask [n, P] is True for pairs whose next impact counts and whose vehicles
-    move forward.
+    Returns the worlds at that moment, the time of that moment ([n] s), the harm so far ([n] m2/s2), and a mask of
+    pairs, [n, P]. The mask is True for pairs whose next impact counts and whose vehicles move forward.
 
     Args:
         where: name of the caller, for error messages.
         worlds: the worlds now, [n].
         vehicles: indices of the controlled vehicles.
         harm_count: ``first`` or ``total`` impacts.
-        horizon_s: horizon, s; ``InvalidInput`` if it is not finite or lies before that moment.
+        horizon_s: horizon, s.
+
+    Raises ``InvalidInput`` if the horizon is not finite, or lies before a vehicle may act.
 
     """
     start = np.maximum(worlds.vehicles.latency_s[:, vehicles].min(axis=1), worlds.time_s)
     if not (np.all(start <= horizon_s) and horizon_s < np.inf):
-        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be finite and at least {start.max():g} s")
+        raise InvalidInput(
+            f"{where}: horizon_s = {horizon_s!r}: must be finite and at least {start.max():g} s (first possible action)"
+        )
     now, impacts = advance(worlds, -worlds.vehicles.braking_capacity_mps2, until_s=start)
     early = empty_ledger(worlds).add(impacts).world_harm(harm_count)
     forward = now.speeds_mps >= 0.0
@@ -418,10 +426,10 @@ def check_asked(where: str, harm_count: str, horizon_s: object, time_step_s: obj
     """
     check_harm_count(harm_count)
     if not _is_number(horizon_s):
-        raise InvalidInput(f"{where}: horizon_s {horizon_s!r}: must be a number of seconds")
+        raise InvalidInput(f"{where}: horizon_s = {horizon_s!r}: must be a number of seconds")
     if time_step_s is not None and not (_is_number(time_step_s) and LEAST_TIME_STEP_S <= time_step_s < np.inf):  # type: ignore[operator]  # a number
         raise InvalidInput(
-            f"{where}: time_step_s {time_step_s!r}: must be a number of seconds from {LEAST_TIME_STEP_S:g} on, or None"
+            f"{where}: time_step_s = {time_step_s!r}: must be at least {LEAST_TIME_STEP_S:g} seconds, or None"
         )
 
 
@@ -430,17 +438,21 @@ def _is_number(value: object) -> bool:
 
 
 def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -> Floats:
-    """Return how far apart floating-point arithmetic can bring a bound and the simulated harm, at most; [n] m2/s2.
+    """Return the largest difference between a bound and the simulated harm that floating-point rounding can cause, [n]
+    m2/s2.
 
-    A squared closing speed is ``D = w^2 + 2 b g``. Let ``V`` be the largest speed in the line, ``G`` the sum of its
-    gaps (plus ``way_m`` [n]), ``A`` the largest closing acceleration and ``a`` the weakest brakes. Then ``w^2`` is at
-    most ``V^2``, and no gap grows beyond ``G + V^2 / 2a`` (plus ``V a / r`` if brakes build up at rate r), so all terms
-    of D stay below ``S = V^2 (1 + A / a) + 2 A G``. A segment of motion rounds each speed twice and each gap five
-    times; a round of impacts rounds each speed by up to 8 eps of the largest speed. Either changes D by at most 8 eps
-    S. These errors add up and do not multiply, because the proofs compare a motion with itself. ``BOUND_EPS`` covers
-    500 of them: an episode of 8 s has 80 steps, and the bound's own arithmetic is a few hundred roundings. For several
-    vehicles (a team) the largest speed is a speed limit if any of them may drive, and the largest closing acceleration
-    uses the strongest drive.
+    A squared closing speed is ``D = w^2 + 2 b g``, with closing speed w, closing acceleration b and gap g. Let ``V`` be
+    the largest speed in the line, ``G`` the sum of its gaps (plus ``way_m``), ``A`` the largest closing acceleration
+    and ``a`` the weakest brakes. Then ``w^2`` is at most ``V^2``. No gap grows beyond ``G + V^2 / 2a`` (plus ``V a /
+    r`` if brakes build up at rate r). So all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+
+    A segment of motion rounds each speed twice and each gap five times. A round of impacts rounds each speed by up to 8
+    eps of the largest speed. Each segment and each round changes D by at most 8 eps S (eps = 2^-52). These errors add
+    up and do not multiply, because the proofs compare a motion with itself. ``BOUND_EPS`` covers 500 segments and
+    rounds: an episode of 8 s has 80 steps, and the bound's own arithmetic is a few hundred roundings.
+
+    With several controlled vehicles (a team), the largest speed is a speed limit if any of them may drive, and the
+    largest closing acceleration uses the strongest drive.
 
     Args:
         worlds: the worlds, [n].
@@ -460,15 +472,15 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 
 
 def onset_states(worlds: Worlds, i: int, time_step_s: float | Floats | None) -> Floats:
-    """Return the worlds in the columns of ``line.LINE``, [n, WIDTH].
+    """Return the worlds as an array with the columns of ``line.LINE``, [n, LINE.WIDTH].
 
-    Columns of a missing neighbour stay 0.
+    Columns of a missing neighbour are 0.
 
     Args:
         worlds: the worlds, [n], at the moment when vehicle ``i`` may act.
         i: index of the controlled vehicle.
-        time_step_s: time between two decisions, a number or [n], s; None: commands may change at any time; the column
-            is then 0.
+        time_step_s: time between two decisions, a number or [n], s. None (0 in the array): commands may change at any
+            time.
 
     """
     v = worlds.vehicles

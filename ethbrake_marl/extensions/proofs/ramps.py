@@ -1,9 +1,10 @@
-"""Two vehicles whose forces change at finite rates: where they first meet, and the least closing speed there.
+"""Simulate two vehicles whose accelerations change at finite rates: their first contact and its closing speed.
 
-A *plan* is an array [3, LEGS]: row ENDS holds the end of each leg (s from now, the last one infinite), row FORCES the
-acceleration in force at its start (m/s2), row JERKS its rate of change (m/s3). A vehicle at rest stays until its force
-is above 0; a vehicle at its speed limit keeps that speed until its force is below 0. There is no time step: the gap is
-a sequence of cubics. docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
+A *force* is an acceleration (m/s2). A *plan* is the motion of one vehicle, an array [3, LEGS]. Row ENDS has the end of
+each leg (s from now; the last leg never ends), row FORCES the force at its start (m/s2), row JERKS the rate of change
+(m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its speed limit keeps that speed until
+its force is below 0. The motion has no time steps, because the gap is a sequence of cubic polynomials.
+docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ _MEETING_HALVINGS = 30
 
 @compiled
 def empty_legs() -> Floats:
-    """Return an uninitialised plan [3, LEGS] to fill in: the end (s), initial acceleration (m/s2) and jerk (m/s3) of
-    each leg.
+    """Return an uninitialised plan, [3, LEGS], with rows for the end (s), the initial acceleration and the jerk of each
+    leg.
     """
     return np.empty((3, LEGS))
 
 
 @compiled
 def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None:
-    """Write leg ``k`` of a plan [3, LEGS], in place: its end (s), its initial force (m/s2) and its jerk (m/s3).
+    """Write leg ``k`` of a plan [3, LEGS] in place: its end (s), its initial force (m/s2) and its jerk (m/s3).
 
     A *leg* is a time interval of constant jerk; a *force* is an acceleration.
     """
@@ -43,10 +44,9 @@ def put_leg(plan: Floats, k: int, end: float, force: float, jerk: float) -> None
 
 @compiled
 def fill_build_up(plan: Floats, since: float, force: float, wanted: float, rate: float) -> None:
-    """Write a plan [3, LEGS]: ``force`` until ``since`` (s), then towards ``wanted`` at ``rate`` (m/s3, may be
-    infinite).
+    """Write a plan: ``force`` until ``since`` (s), then a change at ``rate`` (m/s3) to ``wanted``.
 
-    Forces are accelerations in m/s2.
+    Forces are accelerations in m/s2. The rate may be infinite. ``plan`` [3, LEGS] is overwritten.
     """
     rise = abs(wanted - force) / rate
     put_leg(plan, 0, since, force, 0.0)
@@ -61,20 +61,21 @@ def fill_switch(
 ) -> None:  # fmt: skip
     """Write a plan: the force rises from ``force`` to at most ``high`` until ``switch``, then falls to ``-low``.
 
-    Before ``time`` the force turns up again, so that it is ``final`` at ``time``.
+    Before ``time`` the force rises again, and reaches ``final`` at ``time``. A *force* is an acceleration in m/s2; all
+    forces below are multiplied by ``sign``.
 
     Args:
         plan: [3, LEGS] receives the plan.
-        sign: 1 or -1; all forces below are times ``sign``. A force is an acceleration in m/s2.
+        sign: 1 or -1.
         force: force now.
         high: largest force.
         rise: rate at which the force rises, m/s3; may be infinite.
-        low: size of the least force.
+        low: least force, without its minus sign.
         fall: rate at which the force falls, m/s3.
-        switch: time at which it begins to fall, s. A value from -1 to 0, for an infinite ``rise``, means to start at
-            once from a part of the way up.
-        time: time at which ``final`` holds, s.
-        final: force at ``time``; -inf: no such condition.
+        switch: time at which the force begins to fall, s. With an infinite ``rise``, a value from -1 to 0 means that
+            the force falls at once, from the share ``1 + switch`` of the way from ``force`` to ``high``.
+        time: time at which the force is ``final``, s.
+        final: force at ``time``; -inf: no condition.
 
     """
     full = (high - force) / rise
@@ -97,10 +98,10 @@ def fill_switch(
 
 @compiled
 def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, float, float, float]:
-    """Return acceleration (m/s2) and jerk (m/s3) in force at ``now``, when they end (s), and the speed reached then
+    """Return acceleration (m/s2) and jerk (m/s3) at ``now``, the end of this interval (s), and the speed at its end
     (m/s).
 
-    That speed is NaN if the interval ends otherwise than at rest or at the speed limit.
+    The speed is NaN unless the interval ends at rest or at the speed limit.
 
     Args:
         plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg of the motion.
@@ -136,21 +137,24 @@ def leg_at(plan: Floats, now: float, v: float, limit: float) -> tuple[float, flo
 
 @compiled
 def speed_after(v: float, u: float, jerk: float, step: float, reached: float) -> float:
-    """Return the speed (m/s) after ``step`` seconds with initial acceleration ``u`` (m/s2) and constant ``jerk``
-    (m/s3).
+    """Return the speed (m/s) after ``step`` seconds of constant ``jerk`` (m/s3), from the initial acceleration ``u``
+    (m/s2).
 
-    ``v`` is the speed at the start. ``reached`` is the known speed at the end, or NaN if it is not known.
+    ``v`` is the speed at the start (m/s). ``reached`` is the speed at the end if it is known, otherwise NaN.
     """
     return max(v + (u + 0.5 * jerk * step) * step, 0.0) if math.isnan(reached) else reached
 
 
 @compiled(apart=True)
 def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, float]:
-    """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that starts with speed ``v`` and follows
-    ``plan``.
+    """Return speed (m/s) and distance (m) at ``until`` (s) of a vehicle that follows ``plan``.
 
-    ``plan`` [3, LEGS] holds end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg; ``limit`` is the speed
-    limit, m/s.
+    Args:
+        plan: [3, LEGS] end (s), initial acceleration (m/s2) and jerk (m/s3) of each leg.
+        v: speed at the start, m/s.
+        limit: speed limit, m/s.
+        until: end of the motion, s.
+
     """
     now, way = 0.0, 0.0
     while now < until:
@@ -165,17 +169,15 @@ def travel(plan: Floats, v: float, limit: float, until: float) -> tuple[float, f
 
 @compiled
 def force_of(plan: Floats, now: float) -> float:
-    """Return the force (acceleration, m/s2) that a plan [3, LEGS] commands at ``now`` (s), even for a vehicle at
-    rest.
-    """
+    """Return the force (acceleration, m/s2) of a plan [3, LEGS] at ``now`` (s), whether or not the vehicle moves."""
     return leg_at(plan, now, 1.0, math.inf)[0]
 
 
 @compiled(apart=True)
 def least_on_cubic(constant: float, pressing: float, jerk: float, since: float, until: float) -> float:
-    """Return the least ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
+    """Return the smallest ``(constant / t) + (pressing * t / 2) + (jerk * t^2 / 3)`` for t from ``since`` to ``until``.
 
-    The result is -inf if the function falls without bound towards t = 0.
+    The result is -inf if the function falls without bound as t approaches 0.
     """
     if since <= 0.0 and constant <= 0.0:
         return -math.inf
@@ -202,21 +204,23 @@ def meeting(
     gap: float, slack: float, v_front: float, front: Floats, front_limit: float, v_rear: float, rear: Floats,
     rear_limit: float, since: float, until: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return the time at which two vehicles first meet, their closing speed w then, and the least forced closing speed.
+    """Return the time (s) of two vehicles' first contact, its closing speed w (m/s), and the smallest forced closing
+    speed.
 
-    Returns inf, 0, 0 if they never meet. The last value is the least of ``w + (gap - slack) / t`` until then, t counted
-    from ``since``. It bounds every motion of the pair that is never behind these two, is ``slack`` nearer at ``since``,
-    and is faster by a growing amount.
+    The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of ``w + (gap -
+    slack) / t`` until the contact, with t counted from ``since``. It is also a lower bound on the closing speed of
+    other motions of the pair. The gap of such a motion may be smaller by ``slack`` at ``since``. Its closing speed must
+    exceed the closing speed here by an amount that never decreases.
 
     Args:
         gap: gap at ``since``, m.
-        slack: distance by which the pair may be nearer, m.
+        slack: distance by which the gap of another motion may be smaller, m.
         v_front: speed of the front vehicle at ``since``, m/s.
-        front: [3, LEGS] its plan.
-        front_limit: its speed limit, m/s.
+        front: plan of the front vehicle, [3, LEGS].
+        front_limit: speed limit of the front vehicle, m/s.
         v_rear: speed of the rear vehicle at ``since``, m/s.
-        rear: [3, LEGS] its plan.
-        rear_limit: its speed limit, m/s.
+        rear: plan of the rear vehicle, [3, LEGS].
+        rear_limit: speed limit of the rear vehicle, m/s.
         since: start, s.
         until: end, s.
 

@@ -1,7 +1,8 @@
 """``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
 
-The first three vehicles are bounded together if Vehicle 2 is the first controlled one. If Vehicle 1 is controlled, an
-obstacle ahead takes the place of a first vehicle that nothing moves. Proofs: docs/internals/proofs/team-bound.md.
+If Vehicle 2 is the first controlled vehicle, the first three vehicles are bounded together. If Vehicle 1 is controlled
+and an obstacle is ahead, the obstacle is treated as a first vehicle that nothing moves.
+docs/internals/proofs/team-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Vehicles, Worlds
 
 _MIDDLE, _REAR = 1, 2
 
-_UNMOVED_T = 1e30  # mass of an obstacle: its share of two masses is 1
+_UNMOVED_T = 1e30  # mass of an obstacle, t; the other mass is negligible
 
 
 def _combined_bound_of_line(
@@ -43,13 +44,13 @@ def _combined_bound_of_line(
 ) -> Floats:
     """Return the combined bound of the first two pairs, [n] m2/s2, or 0 if nothing is proven.
 
-    The first vehicle must brake by now. The second one is treated as if it may act from now on.
+    The combined bound is 0 unless the first vehicle brakes already. The second vehicle is treated as if it may act now.
 
     Args:
         now: the worlds now, [n].
         onset: [n, N] time from now at which each vehicle may act, s.
         counts: [n, P] True for pairs whose next impact counts and whose vehicles move forward.
-        chosen: indices of the controlled vehicles; the second vehicle is one of them.
+        chosen: indices of the controlled vehicles; they include the second vehicle.
         until: [n] horizon, s from now.
         pairs: [n, 2] bounds of both pairs alone, m2/s2.
         time_step_s: time between two decisions, s; None: commands may change at any time.
@@ -90,7 +91,7 @@ def _combined_bound_of_line(
     rows, three = rows[unavoidable], three.take(np.flatnonzero(unavoidable))
     steps = np.where(onset[rows, _MIDDLE] <= 0.0, 0.0 if time_step_s is None else time_step_s, 0.0)
     since, power = np.zeros(len(rows)), np.full(len(rows), np.inf)
-    if now.N == 3:  # nobody pushes the last vehicle
+    if now.N == 3:  # no vehicle pushes the last vehicle
         full = v.braking_capacity_mps2[rows, _REAR] + v.driving_capacity_mps2[rows, _REAR]
         since, power = onset[rows, _REAR], full if _REAR in chosen else np.zeros(len(rows))
     bounds, out = np.zeros(now.n), np.empty(len(rows))
@@ -101,18 +102,19 @@ def _combined_bound_of_line(
 
 @dataclass(frozen=True, slots=True)
 class TeamBound:
-    """Proven bounds on the harm of each world, [n] m2/s2 each."""
+    """Proven lower bounds on the harm of each world, in m2/s2; ``pairs`` is [n, P], every other array [n]."""
 
-    harm: Floats  # lower bound on the total harm, whatever the controlled vehicles do
+    harm: Floats  # lower bound on the harm, whatever the controlled vehicles do
     early: Floats  # harm before any controlled vehicle may act
-    obstacle: Floats  # bound of Vehicle 1 and the obstacle ahead, from that moment on
-    pairs: Floats  # [n, P] bound of each pair alone, from that moment on
-    combined: Floats  # bound of the first two pairs together (see ``team_bound``); 0 if nothing is proven
+    obstacle: Floats  # bound on the harm of Vehicle 1 and the obstacle ahead, after the early harm
+    pairs: Floats  # [n, P] bound on the harm of each pair alone, after the early harm
+    combined: Floats  # bound on the harm of the first two pairs together (see ``team_bound``); 0 if nothing is proven
 
     @property
     def impact_proven(self) -> Bools:
-        """True for worlds in which an impact is certain whatever the controlled vehicles do, [n]. False means that none
-        is proven.
+        """Worlds in which an impact is certain whatever the controlled vehicles do: boolean mask, [n].
+
+        False means that no impact is proven. It does not mean that an impact can be avoided.
         """
         return np.asarray(self.harm > 0.0, np.bool_)
 
@@ -128,41 +130,44 @@ def team_bound(
 ) -> TeamBound:
     """Return a proven lower bound on the harm of every world, whatever several controlled vehicles do together.
 
-    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``, each part
-    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle and
-    Vehicles 1 and 2: ``early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm that may come
-    only after the horizon counts as 0.
+    ``harm = early + obstacle + max((pairs[:, 0] + pairs[:, 1]), combined) + pairs[:, 2:].sum(axis=1)``. Each part is
+    lowered by the largest possible rounding error. If Vehicle 1 is controlled, ``combined`` covers the obstacle,
+    Vehicle 1 and Vehicle 2: ``harm = early + max((obstacle + pairs[:, 0]), combined) + pairs[:, 1:].sum(axis=1)``. Harm
+    that may come only after the horizon counts as 0.
 
-    All other vehicles brake with their whole capacity from their latencies on. A single controlled vehicle is allowed;
-    ``lower_bound`` is sharper where it covers the line.
+    All other vehicles brake fully from their latencies on. With a single controlled vehicle, ``lower_bound`` gives
+    larger bounds for the lines that it covers.
 
     Args:
         worlds: the worlds now, [n].
         vehicles: indices of the controlled vehicles, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, the next impact of a pair that was hit before counts as 0.
-        horizon_s: time until which harm counts, s (absolute).
-        scripts: name of each other vehicle's script by index; only checked to be full_brake. None: full_brake.
-        time_step_s: time between two decisions, s. The bound is then proven only for commands that change at decisions:
-            the first one when the first of the vehicles may act, then one every ``time_step_s``. That is sharper if
-            Vehicle 2 is the first one. None: commands may change at any time.
+        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts, even if it came
+            before now.
+        horizon_s: time until which harm counts, s after the alert.
+        scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
+            brake fully.
+        time_step_s: time between two decisions, s. The bound then holds only for commands that change at decisions: the
+            first decision when the first of the vehicles may act, then one every ``time_step_s``. The bound is larger
+            if Vehicle 2 is the first to act. None: commands may change at any time.
 
-    Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown count, a time
-    step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before any of them may act.
+    Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown harm count, a
+    time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the first of the vehicles may
+    act.
 
     """
     check_asked("team_bound", harm_count, horizon_s, time_step_s)
-    # sort the controlled vehicles, and refuse what the bound does not cover
+    # refuse vehicles that the bound does not cover
     if not isinstance(vehicles, Iterable):
-        raise InvalidInput(f"team_bound: vehicles {vehicles!r}: must be a list of vehicles, for instance (1, 2)")
+        raise InvalidInput(f"team_bound: vehicles = {vehicles!r}: must be a list of indices, for instance (1, 2)")
     team = tuple(vehicles)
     for vehicle in team:
-        check_whole_number("team_bound: a vehicle", vehicle, 0, worlds.N - 1)
+        check_whole_number("team_bound: an entry of vehicles", vehicle, 0, worlds.N - 1)
     if not team or len(set(team)) != len(team):
-        raise InvalidInput(f"team_bound: vehicles {team}: at least one is needed, each once")
+        raise InvalidInput(f"team_bound: vehicles = {team}: must have at least one vehicle and no vehicle twice")
     for index, script in (scripts or {}).items():
-        check_whole_number("team_bound: a vehicle of scripts", index, 0, worlds.N - 1)
+        check_whole_number("team_bound: a key of scripts", index, 0, worlds.N - 1)
         if index not in team and script != "full_brake":
-            raise InvalidInput(f"team_bound: vehicle_{index + 1} follows {script!r}; must be 'full_brake'")
+            raise InvalidInput(f"team_bound: vehicle_{index + 1} follows the script {script!r}; must be 'full_brake'")
     chosen = np.array(sorted(team), np.int64)
     worlds.refuse_build_up("team_bound")
     now, start, early, counts = at_onset_of("team_bound", worlds, chosen, harm_count, horizon_s)
@@ -203,7 +208,7 @@ def team_bound(
         behind = replace(line.vehicles, braking_capacity_mps2=braking, mass_t=mass)
         line = replace(
             line, vehicles=behind, obstacle_gap_m=np.ones(line.n)
-        )  # finite: disables the centre-of-mass bounds
+        )  # a finite obstacle_gap_m switches off the bounds by the centre of mass
         onsets, counted = np.column_stack([np.zeros(line.n), onset]), np.column_stack([ahead, counts])
         both = np.stack([obstacle, pairs[:, 0]], axis=1)
         combined = _combined_bound_of_line(line, onsets, counted, chosen + 1, until, both, time_step_s)
@@ -219,10 +224,10 @@ def team_bound(
 
 
 def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
-    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 where its next impact does not count.
+    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 in worlds where its next impact does not count.
 
     Args:
-        columns: maps a column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``) to its values; missing columns are 0.
+        columns: values of each column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``); columns that are left out are 0.
         until: [n] horizon, s.
         counts: [n] True for worlds in which the next impact of the pair counts.
 

@@ -1,4 +1,8 @@
-"""Vehicles at moments to rows: who follows whom, checks of gaps and positions against speeds, chains."""
+"""Form chains of vehicles that follow each other, and check recorded gaps and positions against recorded speeds.
+
+A *queue* is a sequence of vehicles, each of which follows the vehicle in front of it, at one moment of a recording. It
+is cut into *chains* of a fixed number of vehicles. Each chain is one row of gaps and speeds.
+"""
 
 from __future__ import annotations
 
@@ -17,53 +21,61 @@ from ethbrake_marl.extensions.recorded.reading import place_of
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.fields import QUANTITY
 
-# Allowed ratio of a change (of gaps, of positions) to the change by the speeds (3.28 if units mix feet and metres), and
-# the least correlation of the two for the check of gaps.
+# Allowed ratio: recorded change of gaps or positions / change that follows from the speeds. It is 3.28 if a file mixes
+# feet and metres. Gaps are checked only if the two changes have at least the correlation CORRELATED.
 SLOPE, CORRELATED = (0.5, 2.0), 0.7
 
 FARTHEST_M = QUANTITY.usual["gaps_m"].high  # longest gap that a scenario may have
 
-LEAST_M2 = 100.0  # least sum of squares of ways in a lane, to check positions against speeds: one way of 10 m
+LEAST_M2 = 100.0  # positions are checked if the squared distances driven in a lane sum up to this: one drive of 10 m
 
 
 class Link(NamedTuple):
-    """A vehicle and the gap ahead of it (m), with the speed at which the gap opens (m/s)."""
+    """A vehicle, and the gap between it and the vehicle ahead."""
 
-    gap_m: float
-    opens_mps: float
-    follower: Any  # its ``State``
+    gap_m: float  # length of the gap (m)
+    opens_mps: float  # speed at which the gap opens (m/s)
+    follower: Any  # ``State`` of the vehicle
 
 
 class Chains:
-    """Cuts the queues of vehicles of one file into chains, and checks the file at its end.
+    """Cuts the queues of vehicles in one file into chains, and checks the whole file.
 
     Args:
-        file: the file, for messages.
-        entry: its format.
-        every_s: time between two moments (s).
+        file: path of the file, for messages.
+        entry: format of the file.
+        every_s: time between two moments at which chains are formed (s).
         vehicles: number of vehicles in a chain.
-        names: name of each vehicle and lane by its number; a number without one is its own name.
+        names: names of vehicles and lanes by their numbers. A number without a name is shown as a number.
 
     """
 
     def __init__(self, file: Path, entry: Format, every_s: float, vehicles: int, names: dict[float, str]) -> None:
         self.file, self.entry, self.every_s, self.vehicles, self.names = file, entry, every_s, vehicles, names
         self.left_out = Counter[str]()
-        self.longest = 0  # number of vehicles of the longest queue
+        self.longest = 0  # number of vehicles in the longest queue
         self._first_fault, self._faults, self._states = "", 0, 0
-        self._gaps = np.zeros(3)  # sums of squares and product: change of gaps, change by the speeds
-        self._ways: dict[float, Floats] = defaultdict(lambda: np.zeros(4))  # the same of positions by lane; sum of ways
+        # sums over all gaps of a^2, b^2 and a b, for a recorded change a of a gap and the change b by the speeds
+        self._gaps = np.zeros(3)
+        # the same sums over changes of position, and the sum of b; by lane
+        self._ways: dict[float, Floats] = defaultdict(lambda: np.zeros(4))
 
     def cut(self, moments: Iterator[tuple[float, list[Any]]]) -> Iterator[tuple[list[float], str]]:
-        """Yield gaps (m) and speeds (m/s) of each chain, from the front, and its vehicles: ``2-3-4``.
+        """Yield, for each chain, its gaps (m) and speeds (m/s) from front to rear, and its vehicles (``2-3-4``).
 
-        Queues are cut from the front; a vehicle belongs to at most one chain of a moment. Raises ``InvalidInput`` at
-        the end if too many vehicles have a fault, or if gaps or positions do not change as speeds say.
+        Queues are cut from the front. At one moment, a vehicle belongs to at most one chain.
+
+        Raises ``InvalidInput`` at the end of the file if too many vehicles have a fault, or if gaps or positions do not
+        change as the speeds say.
+
+        Args:
+            moments: time, in units of ``every_s``, and states of all vehicles at each moment.
+
         """
         last, before, before_by_id = math.nan, dict[float, Link](), dict[float, Any]()
         for tick, there in moments:
             by_id = {state.id: state for state in reversed(there)}
-            row = tick == round(tick)  # else a moment that only checks
+            row = tick == round(tick)  # else the moment is used for the checks only
             behind = self._links(there, by_id, row)
             if tick - last == 1.0 or (not row and tick - last < 1.0):
                 self._compare(behind, before, by_id, before_by_id, (tick - last) * self.every_s)
@@ -91,15 +103,15 @@ class Chains:
         return self.names.get(number) or f"{number:.0f}"
 
     def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
-        """Return by the id of each vehicle the one that follows it, at one moment; count faults.
+        """Return the follower of each vehicle at one moment, by the id of the vehicle ahead. Count faults.
 
         Args:
             there: states of all vehicles.
-            by_id: the same by id, of a vehicle that is there twice the first.
-            row: whether the moment becomes rows; only then what is left out counts.
+            by_id: states by the id of the vehicle. If a vehicle is recorded twice, its first state.
+            row: whether chains are formed at this moment. If not, data that are left out are not counted.
 
         """
-        behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: the vehicle ahead, if no file names it
+        behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
         if self.entry.by_lane:
             for first, second in pairwise(sorted(there, key=lambda state: (state.lane, -state.front))):
                 if first.lane == second.lane and first.id != second.id:
@@ -110,8 +122,9 @@ class Chains:
             gap, slowest = _gap(ahead, state) if ahead else math.nan, min(ahead.speed, state.speed) if ahead else 0.0
             noise = gap <= 0.0 and slowest < self.entry.standing_mps
             fault = (
-                f"is there at that time in {self._line(by_id[state.id])}, too" if by_id[state.id] is not state
-                else f"follows vehicle {self._name(number)}, which is not there" if number >= 0.0 and not ahead
+                f"is recorded twice for this time (see {self._line(by_id[state.id])})" if by_id[state.id] is not state
+                else f"follows vehicle {self._name(number)}, which is not recorded at this time"
+                if number >= 0.0 and not ahead
                 else f"overlaps vehicle {self._name(ahead.id)} ahead by {-gap:.2f} m"
                 if gap <= 0.0 and ahead.lane == state.lane and not noise
                 else ""
@@ -142,7 +155,16 @@ class Chains:
         by_id_before: dict[float, Any],
         passed_s: float,
     ) -> None:
-        """Add to the sums how gaps and positions changed in ``passed_s`` seconds, and how they should by the speeds."""
+        """Add changes of gaps and positions, and the changes that follow from the speeds, to the sums for the checks.
+
+        Args:
+            behind: followers at this moment, as from ``_links``.
+            before: followers at the previous moment.
+            by_id: states at this moment, by the id of the vehicle.
+            by_id_before: states at the previous moment.
+            passed_s: time between the two moments (s).
+
+        """
         for each in behind.keys() & before.keys():
             now, then = behind[each], before[each]
             if now.follower.id == then.follower.id:
@@ -159,26 +181,29 @@ class Chains:
         for lane, (_, said, product, way) in sorted(self._ways.items()):
             if said >= LEAST_M2 and not (SLOPE[0] < product / said < SLOPE[1] and way > 0.0):
                 raise InvalidInput(
-                    f"{file}: in lane {self._name(lane)}, front changes {product / said:.2f} times as much as"
-                    f" {'speed says' if way > 0.0 else 'a speed below 0 says'}; front must grow along travel (turn its"
-                    f" sign for the other direction), speed be above 0, and both in {entry.units}"
+                    f"{file}: in lane {self._name(lane)}, positions (front) change {product / said:.2f} times as much"
+                    f" as they should by the speeds{'' if way > 0.0 else ', which are below 0'}; front must increase in"
+                    f" the direction of travel, speed must be above 0, and both must be in {entry.units}"
                 )
         if self._faults > entry.impossible * self._states:
             raise InvalidInput(
-                f"{self._first_fault}; {self._faults:,} of {self._states:,} are like that, at most"
-                f" {entry.impossible:.0%} may be"
+                f"{self._first_fault}; {self._faults:,} of {self._states:,} vehicles have such faults, but at most"
+                f" {entry.impossible:.0%} are accepted"
             )
-        self.left_out["vehicles that overlap, are there twice, or follow one that is not there"] += self._faults
+        self.left_out["vehicles that overlap, are recorded twice, or follow one that is not recorded"] += self._faults
         opened, said, product = self._gaps.tolist()
         if product > CORRELATED * math.sqrt(opened * said) > 0.0 and not SLOPE[0] < product / said < SLOPE[1]:
             raise InvalidInput(
-                f"{file}: gaps change {product / said:.2f} times as much as speeds say (feet beside m/s give 3.28,"
-                f" metres beside km/h 0.28); {entry.title} has {entry.units}"
+                f"{file}: gaps change {product / said:.2f} times as much as they should by the speeds (3.28: gaps in"
+                f" feet and speeds in m/s; 0.28: gaps in m and speeds in km/h); the file must be in {entry.units}"
             )
 
 
 def _gap(ahead: Any, state: Any) -> float:
-    """Return the gap from the rear of ``ahead`` to the front of ``state``, along the travel of ``state`` (m)."""
+    """Return the gap (m) from the rear of the vehicle ``ahead`` to the front of the vehicle ``state``.
+
+    The gap is measured in the direction of travel of ``state``.
+    """
     along = ahead.front - ahead.length * ahead.dx - state.front
     across = ahead.side - ahead.length * ahead.dy - state.side
     return float(along * state.dx + across * state.dy)

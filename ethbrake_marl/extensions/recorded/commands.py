@@ -1,4 +1,4 @@
-"""The command ``scenario from-data``: make a scenario from recorded traffic."""
+"""The command ``scenario from-data``: create a scenario from recorded traffic."""
 
 from __future__ import annotations
 
@@ -15,46 +15,48 @@ from ethbrake_marl.registry import Part
 
 def from_data_command(
     folder: Annotated[
-        Path,
-        typer.Argument(metavar="FOLDER", help="Folder of the recordings (subfolders are searched, too), or one file."),
+        Path, typer.Argument(metavar="FOLDER", help="Folder of the recordings, with its subfolders, or one file.")
     ],
     format: Annotated[
         Literal["highd", "exid", "ngsim", "openacc", "table"],
-        typer.Option(help="Format of the recordings; table: CSV or Parquet whose columns you name."),
+        typer.Option(help="Format of the recordings; table: CSV or Parquet files, with --columns."),
     ],
-    output: Annotated[Path, typer.Option(metavar="FILE", help="The .yaml to write; its rows go to a .csv beside it.")],
+    output: Annotated[
+        Path, typer.Option(metavar="FILE", help="Scenario file (.yaml) to write; its rows go to a .csv file beside it.")
+    ],
     columns: Annotated[
         str,
         typer.Option(
             metavar="ROLE=COLUMN,...",
-            help="For --format table: time=T,vehicle=V,lane=L,front=X,length=B,speed=S,units=m|ft|km/h. time is in s"
-            " (T/1000: in ms, T/25: frames at 25 Hz); front is the position of the front bumper and must grow in the"
-            " direction of travel: change its sign for the other direction. With m, speed is in m/s; with ft, in ft/s;"
-            " with km/h, lengths are in m.",
+            help="For --format table: names of columns, as time=T,vehicle=V,lane=L,front=X,length=B,speed=S,units=m."
+            " time is in s; write T/1000 for ms, or T/25 for frames at 25 Hz. front is the position of the front bumper"
+            " and must increase in the direction of travel. units=m: lengths in m, speeds in m/s; ft: in ft and ft/s;"
+            " km/h: in m and km/h.",
         ),
     ] = "",
     based_on: Annotated[
         str,
         typer.Option(
             metavar="NAME|PATH",
-            help="Scenario for what is not recorded, and for the number of vehicles: realistic-pair for two.",
+            help="Scenario that provides the number of vehicles and all quantities that are not recorded;"
+            " realistic-pair has two vehicles.",
         ),
     ] = "realistic-motorway",
     every: Annotated[
-        float, typer.Option(help="Seconds between the moments at which rows are taken from the recordings.")
+        float, typer.Option(help="Time between two moments of a recording from which rows are taken (s).")
     ] = 1.0,
     draw: Annotated[
         Literal["rows", "normal", "lognormal", "quantiles"],
-        typer.Option(help="Draw whole rows, or each quantity from a fit to it."),
+        typer.Option(help="Draw whole rows, or each quantity from a distribution that is fitted to it."),
     ] = "rows",
-    strict: Annotated[bool, typer.Option("--strict", help="Write nothing if one of the files is refused.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Write no scenario if a file is refused.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a scenario of recorded traffic: highD, NGSIM, OpenACC.
+    """Create a scenario from recorded traffic: highD, exiD, NGSIM, OpenACC, or a table of trajectories.
 
-    Also reads exiD, and any table of trajectories (--format table). Vehicles that follow each other in a lane become
-    rows: speeds, and gaps from bumper to bumper.
+    Vehicles that follow each other in a lane become rows of the scenario. A row has the speeds of the vehicles, and the
+    gaps between them from bumper to bumper.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.extensions.recorded.scenario import scenario_from_data

@@ -1,4 +1,7 @@
-"""Fits to recorded rows: independent distributions of time gaps, mean speed of a row, and deviations from it."""
+"""Distributions that are fitted to recorded rows.
+
+They are independent distributions of the time gaps, of the mean speed of a row, and of the deviations from the mean.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.physics.elementary import exp, log
 from ethbrake_marl.physics.state import Floats
 
-DataDraw = Literal["rows", "normal", "lognormal", "quantiles"]  # how the scenario draws its worlds
+DataDraw = Literal["rows", "normal", "lognormal", "quantiles"]  # how the scenario draws worlds: rows, or kind of a fit
 
 QUANTILES = 40
 
@@ -18,15 +21,23 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 
 
 def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
-    """Return keys of a scenario with independent fits to time gaps, mean speed of a row, and deviations from it.
+    """Return keys of a scenario with distributions of time gaps, of the mean speed of a row, and of deviations from it.
 
-    ``rows`` [k, 2 N - 1] holds the gaps (m) and speeds (m/s) of each chain; ``draw`` is the kind of fit.
+    Raises ``InvalidInput`` if too few rows have time gaps that can be used.
+
+    Args:
+        rows: [k, 2 N - 1] gaps (m) and speeds (m/s) of k chains of N vehicles.
+        draw: kind of the distributions.
+
     """
     gaps, speeds = np.split(rows, [rows.shape[1] // 2], axis=1)
     times = gaps / np.maximum(speeds[:, 1:], SLOWEST_MPS)
     used = (speeds >= SLOWEST_MPS).all(axis=1) & ((times > 0.0) & (times <= LONGEST_S)).all(axis=1)
     if used.sum() < QUANTILES:
-        raise InvalidInput(f"draw = {draw}: {used.sum()} rows have time gaps to fit; at least {QUANTILES} are needed")
+        raise InvalidInput(
+            f"draw = {draw}: only {used.sum()} rows have time gaps above 0 and up to {LONGEST_S:g} s; a fit needs at"
+            f" least {QUANTILES}"
+        )
     line = speeds[used].mean(axis=1)
     off = speeds[used] - line[:, None]
     signed: DataDraw = "normal" if draw == "lognormal" else draw
@@ -34,15 +45,15 @@ def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
         "time_gaps_s": [_fit(each, draw) for each in times[used].T],
         "line_speed_mps": _fit(
             np.clip(line, -off.min(), speeds.max() - off.max()), signed
-        ),  # so that mean plus deviation stays in range
+        ),  # clipped, to keep mean plus deviation between 0 and the highest recorded speed
         "speed_deviations_mps": [_fit(each, signed) for each in off.T],
     }
 
 
 def _fit(values: Floats, draw: DataDraw) -> Any:
-    """Return a distribution for a scenario file, fitted to ``values`` [k] and limited to their range.
+    """Return a distribution for a scenario file, fitted to ``values`` [k] and limited to the range of these values.
 
-    ``draw`` is its kind: ``normal``, ``lognormal`` or ``quantiles``.
+    ``draw`` is the kind of distribution: ``normal``, ``lognormal`` or ``quantiles``.
     """
     low, high = float(values.min()), float(values.max())
     if draw == "quantiles" or low == high:

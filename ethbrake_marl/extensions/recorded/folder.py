@@ -1,7 +1,8 @@
-"""A folder of recordings to rows: which files are recordings, and what became of each.
+"""Read all recordings of a folder, and return rows of gaps and speeds.
 
-Each file is read once, in pieces. Its states at regular times go into a private file on disk, which returns them
-ordered by time. So memory holds only one piece of a file, one moment, and the rows of the result.
+Each file is read once, some lines at a time. The states of its vehicles at regular times are stored in a temporary
+database on disk, which returns them in order of time. Memory therefore contains only some lines of a file, the states
+at one time, and the resulting rows.
 """
 
 from __future__ import annotations
@@ -27,28 +28,30 @@ from ethbrake_marl.scenario.vehicle_types import MOST_NUMBERS
 
 
 class Rows(NamedTuple):
-    """Rows of all recordings of a folder, and what became of its files."""
+    """Rows from all recordings of a folder, and information on its files."""
 
     numbers: list[list[float]]  # gaps (m) and speeds (m/s) of each row
     of: list[tuple[str, str]]  # recording and vehicles of each row
-    seen: int  # number of chains
-    longest: int  # number of vehicles of the longest queue
-    left_out: Counter[str]  # number of what was left out, by description
-    refused: list[str]  # error of each refused file
-    skipped: list[str]  # files that are no recordings
+    seen: int  # number of chains in the recordings; there can be fewer rows
+    longest: int  # number of vehicles in the longest queue
+    left_out: Counter[str]  # description of data that were left out -> their number
+    refused: list[str]  # error message for each refused file
+    skipped: list[str]  # names of files that are not recordings, or are copies of other files
 
 
 def read_rows(
     folder: Path, entry: Format, every_s: float, vehicles: int, progress: Callable[[str, int, int], None]
 ) -> Rows:
-    """Read the chains of all recordings in a folder and below it; a file that is refused adds no row.
+    """Read the chains of vehicles in all recordings of a folder and its subfolders.
+
+    A file with an error is refused: it adds no row, and its error is returned.
 
     Args:
         folder: the folder, or one file.
         entry: format of the files.
-        every_s: time between two moments (s).
+        every_s: time between two moments at which chains are read (s).
         vehicles: number of vehicles in a chain.
-        progress: called with the name of a file, the KiB read of it, and its size in KiB.
+        progress: function that receives the name of a file, how much of it was read (KiB), and its size (KiB).
 
     Raises ``InvalidInput`` for a folder without recordings.
 
@@ -56,7 +59,7 @@ def read_rows(
     files, refused, twice = _search(folder, entry)
     if not files and (not refused or not folder.is_dir()):
         patterns = " or ".join(entry.files)
-        raise InvalidInput(f"{folder}: must be a folder with {patterns}, the files of {entry.title}")
+        raise InvalidInput(f"{folder}: must be a folder with files of {entry.title}, whose names match {patterns}")
     numbers, longest, left_out, others = 2 * vehicles - 1, 0, Counter[str](), dict[str, str]()
     with closing(sqlite3.connect("")) as store:  # a temporary file on disk
         store.execute(f"CREATE TABLE chain({','.join(f'n{k}' for k in range(numbers))},file,vehicles)")
@@ -78,25 +81,25 @@ def read_rows(
             except InvalidInput as error:
                 refused.append(str(error))
             except sqlite3.Error as error:
-                raise InvalidInput(f"{folder}: cannot be ordered by time ({error})") from None
+                raise InvalidInput(f"{folder}: its data cannot be ordered by time in a database ({error})") from None
         if len(others) == len(files) and not refused:
-            raise InvalidInput(f"{folder}: holds no recording of {entry.title}: {'; '.join(others.values())}")
+            raise InvalidInput(f"{folder}: contains no recording of {entry.title}: {'; '.join(others.values())}")
         ((seen,),) = store.execute("SELECT COUNT(*) FROM chain")
         each_of = seen * numbers // MOST_NUMBERS + 1
-        # Every k-th row of a trio, because k-th rows of a moment would be the same trios again and again.
+        # Rows of the same vehicles are next to each other in this order, so every k-th row keeps all vehicles.
         counted = "SELECT *, rowid AS row, ROW_NUMBER() OVER (ORDER BY file, vehicles, rowid) AS at FROM chain"
         chosen = store.execute(f"SELECT * FROM ({counted}) WHERE at % ? = 0 ORDER BY row", (each_of,)).fetchall()
-    left_out[f"chains: a table holds {MOST_NUMBERS:,} numbers, so one in {each_of} is kept"] = seen - len(chosen)
+    left_out[f"chains: a table has at most {MOST_NUMBERS:,} numbers, so one in {each_of} is used"] = seen - len(chosen)
     lines, of = [list(row[:-4]) for row in chosen], [row[-4:-2] for row in chosen]
     return Rows(lines, of, seen, longest, left_out, refused, [*others, *twice])
 
 
 def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], list[str]]:
-    """Find the files of a format in a folder and below it, each once, by their names.
+    """Find the files of a format in a folder and its subfolders by their names.
 
-    Return them by their printable path below the folder, the errors of folders that cannot be read, and names that
-    stand for a file that is there already: links, copies, and a text without header beside its CSV. Names that begin
-    with a dot are left out, and links to folders are not followed.
+    Returns the files by their printable path below the folder, the errors for subfolders that cannot be read, and the
+    names of further files with the same content. These are links, copies, and text files without a header if there is
+    a CSV file of the same name. Names that begin with a dot are ignored, and links to folders are not followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
@@ -128,7 +131,7 @@ def _size(file: Path) -> int:
 
 
 def _content(file: Path) -> object:
-    """Return a value that only files of the same content share; for what is no readable file, its real path."""
+    """Return a value that is equal for files with the same content: a hash, or the real path of an unreadable file."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             return hashlib.file_digest(stream, "sha256").digest()

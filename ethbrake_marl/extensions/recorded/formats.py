@@ -1,4 +1,4 @@
-"""The formats of recorded traffic: files, columns, units, licence, and how many faults are accepted."""
+"""Formats of recorded traffic: files, columns, units, licence, and the share of faulty data that is accepted."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ DataFormat = Literal["highd", "exid", "ngsim", "openacc", "table"]
 
 FOOT_M = 0.3048
 
-NUMBER = "<number>"  # in the name of a column: the number of a vehicle
+NUMBER = "<number>"  # placeholder for the number of a vehicle in the name of a column
 
 
 class Format(NamedTuple):
-    """One format of recorded traffic; lengths and speeds become m and m/s by ``metres`` and ``mps``."""
+    """One format of recorded traffic. The factors ``metres`` and ``mps`` convert lengths to m and speeds to m/s."""
 
-    title: str  # name of the data set, for users
+    title: str  # name of the data set
     files: tuple[str, ...]  # patterns of the names of its files, in lower case
-    # Names of the columns to read, by what they hold (fields of ``states.State``; ``gap``: the gap behind a vehicle,
-    # recorded instead of positions and lengths). A name with ``NUMBER`` stands for one column per vehicle: Speed1, ...
+    # Quantity -> name of its column. A quantity is a field of ``states.State``, or ``gap``, the gap behind a vehicle. A
+    # name with ``NUMBER`` means one column for each vehicle: Speed1, Speed2, ...
     columns: dict[str, str]
     units: str  # units of lengths and speeds, for messages
-    licence: str  # sentence about its licence, for the scenario's ``source``
-    metres: float = 1.0  # number of metres in a unit of length of the files
-    mps: float = 1.0  # number of m/s in a unit of speed of the files
-    ticks: float = 1.0  # number of ticks (intervals between recorded moments) per unit of time of the files
-    hertz: float = 10.0  # number of ticks in a second; 0 if each file shows it by its times, in ``ticks`` per second
-    # Largest accepted share of vehicles with a fault (overlap, missing leader). Faulty vehicles are left out.
+    licence: str  # sentence on the licence, for the key ``source`` of the scenario
+    metres: float = 1.0  # length in m of the files' unit of length
+    mps: float = 1.0  # speed in m/s of the files' unit of speed
+    ticks: float = 1.0  # number of ticks (intervals between recorded moments) in the files' unit of time
+    hertz: float = 10.0  # number of ticks in a second; 0: computed from the times in each file
+    # Largest accepted share of vehicles with a fault (overlap, missing vehicle ahead). Faulty vehicles are left out.
     impossible: float = 0.0
-    # A gap at or below 0 is noise, and no fault, if one of both vehicles is slower than this (m/s).
+    # If one of two vehicles is slower than this (m/s), a gap of 0 or less is noise and not a fault.
     standing_mps: float = -math.inf
-    elsewhere: tuple[str, ...] = ()  # lines of a file that contain one of these texts (names of streets) are left out
-    alone: float = 0.0  # what the column of the vehicle ahead holds if there is none
-    mixed: bool = False  # True if other tables may stand beside the recordings, under any name
-    headless: tuple[str, ...] = ()  # names of the columns of a file with blanks between them and without a header
-    texts: tuple[int, ...] = ()  # positions in ``columns`` of those whose cells are names, not numbers
-    separators: str = ","  # possible separators of cells
+    elsewhere: tuple[str, ...] = ()  # names of streets; rows that contain one of them are left out
+    alone: float = 0.0  # value in the column of the vehicle ahead if no vehicle is ahead
+    mixed: bool = False  # True if the folder may contain other tables besides recordings
+    headless: tuple[str, ...] = ()  # names of the columns of a text file without a header, separated by blanks
+    texts: tuple[int, ...] = ()  # positions in ``columns`` of the columns with names instead of numbers
+    separators: str = ","  # characters that may separate cells
 
     @property
     def gaps(self) -> bool:
-        """Whether the files have gaps, not positions and lengths; an empty cell was then not measured."""
+        """Whether the files contain gaps instead of positions and lengths. An empty cell then means "not measured"."""
         return "gap" in self.columns
 
     @property
     def by_lane(self) -> bool:
-        """Whether the vehicle ahead is the next one in the lane; otherwise the files name it."""
+        """Whether the vehicle ahead must be derived from lanes and positions, because the files do not name it."""
         return "preceding" not in self.columns and not self.gaps
 
 
@@ -90,38 +90,40 @@ FORMATS: dict[DataFormat, Format] = {
     ),
 }  # fmt: skip
 
-REFUSED = {  # formats without lanes to follow, by columns that they have and columns that they have not
+REFUSED = {  # format without lanes -> columns that its files have, columns that they do not have
     "inD or rounD": ({"trackid", "xcenter", "lonvelocity"}, {"leadid"})
 }
 
-# Metres in a unit of length, m/s in a unit of speed, and both in words.
+# Value of ``units`` -> length in m of the unit of length, speed in m/s of the unit of speed, names of both units.
 _UNITS = {"m": (1.0, 1.0, "m and m/s"), "ft": (FOOT_M, FOOT_M, "feet and feet/s"), "km/h": (1.0, 1 / 3.6, "m and km/h")}
 
-# What each key of ``--columns`` names.
+# Key of ``--columns`` -> quantity, a field of ``states.State``.
 _ROLES = {"time": "tick", "vehicle": "id", "lane": "lane", "front": "front", "length": "length", "speed": "speed"}
 
 
 def format_of(name: DataFormat, columns: str = "") -> Format:
-    """Return the format of that name; for ``table``, with the columns that ``columns`` names.
+    """Return the format with the name ``name``.
 
     Args:
         name: name of the format.
-        columns: of ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. Each value is a column
-            of the files. ``time=t/1000`` if a second has 1000 of its units; ``units`` are ``m`` (and m/s), ``ft`` (and
-            ft/s) or ``km/h`` (and m).
+        columns: for the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. Each value
+            except the last is the name of a column. ``time=t/1000`` means that the times are in 1/1000 s. ``units`` is
+            ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
 
-    Raises ``InvalidInput`` for missing, repeated and unknown keys and units.
+    Raises ``InvalidInput`` for missing, repeated and unknown keys, and for unknown units.
 
     """
     if name != "table":
         if columns:
-            raise InvalidInput(f"columns: only --format table takes columns; those of {FORMATS[name].title} are known")
+            raise InvalidInput(
+                f"columns: the columns of {FORMATS[name].title} are known; leave out --columns, or use --format table"
+            )
         return FORMATS[name]
     pairs = [[each.strip() for each in part.partition("=")[::2]] for part in columns.split(",")]
     settings = {key: value for key, value in pairs if value}
     known, example = (*_ROLES, "units"), ",".join(f"{key}=..." for key in _ROLES)
     if Counter(key for key, _ in pairs) != Counter(known) or len(settings) < len(known):
-        raise InvalidInput(f"columns = {columns!r}: must be {example},units={'|'.join(_UNITS)}, each once")
+        raise InvalidInput(f"columns = {columns!r}: must be {example},units={'|'.join(_UNITS)}, with each key once")
     if settings["units"] not in _UNITS:
         raise InvalidInput(f"columns: units = {settings['units']!r}: must be one of {', '.join(_UNITS)}")
     metres, mps, units = _UNITS[settings["units"]]
@@ -130,10 +132,12 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
     if second is not None:
         settings["time"] = column
         if not 0.0 < second < math.inf:
-            raise InvalidInput(f"columns: time = .../{divisor}: must be the number of units of time in a second")
+            raise InvalidInput(
+                f"columns: time = .../{divisor}: the number after / must be the number of time units in a second"
+            )
     return Format(
         "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[key] for key, role in _ROLES.items()},
         units,
-        "Its licence is not known here: look where the data come from.", metres, mps, 1.0 / (second or 1.0), 0.0, 0.01,
+        "Its licence is unknown: look it up where the data come from.", metres, mps, 1.0 / (second or 1.0), 0.0, 0.01,
         mixed=True, texts=(1, 2), separators=",;\t",
     )  # fmt: skip

@@ -1,6 +1,6 @@
-"""Files of recorded traffic to numbers, piece by piece: CSV, text with blanks, Parquet.
+"""Read files of recorded traffic (CSV, text with blanks, Parquet), some lines at a time.
 
-Each number keeps the line (of Parquet: the row) in which it stands, so that a message can name it.
+Each row of numbers has the number of its line in the file (Parquet: of its row), for error messages.
 """
 
 from __future__ import annotations
@@ -25,39 +25,39 @@ from ethbrake_marl.files.plain import open_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import Bools, Floats
 
-PIECE, HEAD = 50_000, 11  # lines read at once; number of first lines in which the header is searched
+PIECE, HEAD = 50_000, 11  # number of lines that are read at once; number of first lines that may be the header
 
 LONGEST_LINE, LARGEST_BYTES = 1 << 16, 1 << 40  # limits of a line (characters) and of a file
 
 _OTHER_NAMES = {"preceeding": "preceding"}  # misspelt column in some files of NGSIM
 
-_THOUSANDS = re.compile(r"-?\d{1,3}(,\d{3})+(\.\d*)?")  # in quotes, where commas are separators, too
+_THOUSANDS = re.compile(r"-?\d{1,3}(,\d{3})+(\.\d*)?")  # number with a comma after every thousand
 
-_Row = tuple[int, Sequence[str]]  # line, and cells
+_Row = tuple[int, Sequence[str]]  # number of the line, and its cells
 
-_Table = tuple[Sequence[str], Sequence[int], Iterator[_Row]]  # names of columns, indices of those to read, rows
+_Table = tuple[Sequence[str], Sequence[int], Iterator[_Row]]  # names of all columns, indices of columns to read, rows
 
 
 class NotARecording(InvalidInput):
-    """A file that has fewer than half of the format's columns, and so is something else beside the recordings."""
+    """Raised for a file that is not a recording, because it lacks more than half of the format's columns."""
 
 
 class Piece(NamedTuple):
-    """Some rows of a file: ``values`` [rows, columns] and ``lines`` [rows], the line of each row."""
+    """Some rows of a file."""
 
-    file: Path
-    columns: Sequence[str]
-    values: Floats
-    lines: Floats
+    file: Path  # path of the file
+    columns: Sequence[str]  # names of the columns that were read
+    values: Floats  # [rows, columns] numbers in these columns
+    lines: Floats  # [rows] number of the line of each row
 
     def refuse(self, bad: Bools, k: int, right: str, shown: Floats | None = None) -> None:
-        """Raise ``InvalidInput`` with file, line and column for the first row in which ``bad`` [rows] is true.
+        """Raise ``InvalidInput`` with file, line and column if a value is wrong.
 
         Args:
-            bad: rows to refuse, [rows].
+            bad: [rows] whether the value in each row is wrong. The error names the first such row.
             k: index of the column.
-            right: what would be right.
-            shown: values to show, [rows]; None: those of the column.
+            right: what a right value would be, for the message.
+            shown: [rows] values for the message; None: the values of the column.
 
         """
         if bad.any():
@@ -67,7 +67,7 @@ class Piece(NamedTuple):
 
 
 def place_of(file: Path, line: float) -> str:
-    """Return file and line as messages name them; Parquet has rows instead of lines."""
+    """Return file and number of a line as text for messages (Parquet: file and number of a row)."""
     return f"{file}, {'row' if _is_parquet(file) else 'line'} {line:.0f}"
 
 
@@ -78,19 +78,19 @@ def read_pieces(
     names: dict[str, float] | None = None,
     progress: Callable[[int, int], None] = lambda *_: None,
 ) -> Iterator[Piece]:
-    """Yield the numbers of a file piece by piece.
+    """Yield the numbers in some columns of a file, with up to ``PIECE`` rows at a time.
 
-    All values are finite numbers, except that an empty cell of a format with gaps is NaN.
+    All values are finite numbers. In a format with gaps, an empty cell is NaN.
 
     Args:
-        file: the file.
-        entry: its format.
+        file: path of the file.
+        entry: format of the file.
         columns: names of the columns to read, in this order.
-        names: number of each name in columns of names; new names are added.
-        progress: called with the KiB read, and the size of the file in KiB.
+        names: name -> its number, for columns with names instead of numbers; new names are added.
+        progress: function that receives how much was read (KiB), and the size of the file (KiB).
 
-    Raises ``InvalidInput`` with file, line and column for a missing column or a cell that is not a number, and
-    ``NotARecording`` for a file that is something else.
+    Raises ``InvalidInput`` with file, line and column for a missing column or a cell that is not a number. Raises
+    ``NotARecording`` for a file that is not a recording.
 
     """
     with open_plain(file, LARGEST_BYTES) as stream:
@@ -110,7 +110,7 @@ def read_pieces(
             empty = False
             yield piece
         if empty:
-            raise InvalidInput(f"{file}: has no rows")
+            raise InvalidInput(f"{file}: contains no rows of data")
 
 
 def _is_parquet(file: Path) -> bool:
@@ -120,11 +120,14 @@ def _is_parquet(file: Path) -> bool:
 def _numbers(
     file: Path, rows: Iterable[_Row], shown: Sequence[str], readers: Sequence[tuple[int, Callable[[str], float]]]
 ) -> Iterator[tuple[int, list[float]]]:
-    """Yield the line of each row, and the numbers in its cells of which ``readers`` has the index and a reader."""
+    """Yield the number of the line of each row, and the numbers in some of its cells.
+
+    ``readers`` has, for each number, the index of the cell and the function that reads the cell.
+    """
     for line, cells in rows:
         if len(cells) != len(shown):
-            right = f"but the header has {len(shown)} columns; is the file whole?"
-            raise InvalidInput(f"{place_of(file, line)}: {len(cells)} values, {right}")
+            right = f"but the header has {len(shown)} columns; is the file complete?"
+            raise InvalidInput(f"{place_of(file, line)}: the line has {len(cells)} values, {right}")
         k = 0
         try:
             yield line, [reader(cells[k := at]) for at, reader in readers]
@@ -135,7 +138,7 @@ def _numbers(
 
 
 def _parquet(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]) -> _Table:
-    """Return the names of the columns to read of a Parquet file, their indices, and its rows."""
+    """Open a Parquet file; return the names of the columns to read, their indices, and an iterator over the rows."""
     with naming_extras():
         import pyarrow
         from pyarrow.parquet import ParquetFile
@@ -164,15 +167,18 @@ def _parquet(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[s
 
 
 def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]) -> _Table:
-    """Find the header among the first lines; return the names of all columns, the indices of ``columns``, and rows."""
+    """Find the header of a text file in its first lines.
+
+    Returns the names of all columns, the indices of ``columns``, and an iterator over the rows.
+    """
     lines, best, have = _lines(file, text), list(columns), list[str]()
     for number, line in islice(lines, HEAD):
         row = line.split()
         numbers = sum(parse_numeral(cell) is not None for cell in row)
         if entry.headless and number == 1 and 2 * numbers > len(row) > 1:
             if len(row) != len(entry.headless):
-                right = f"the text files of {entry.title} have {len(entry.headless)}"
-                raise InvalidInput(f"{file}, line {number}: {len(row)} values without a header; {right}")
+                right = f"a text file of {entry.title} without a header has {len(entry.headless)}"
+                raise InvalidInput(f"{file}, line {number}: the line has {len(row)} values; {right}")
             used, _ = _match(file, columns, entry.headless)
             return entry.headless, used, _rows(file, chain([(number, line)], lines), " ", entry.elsewhere)
         for separator in entry.separators:
@@ -185,7 +191,7 @@ def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]
 
 
 def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets: Sequence[str]) -> Iterator[_Row]:
-    """Yield the cells of each line that is not blank, and not of one of the ``streets``."""
+    """Yield number and cells of each line that is not blank and does not contain one of the texts ``streets``."""
     elsewhere = seen = 0
     for number, line in lines:
         if streets and any(street in line for street in streets):
@@ -194,48 +200,59 @@ def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets:
             seen += 1
             yield number, _cells(line, separator)
     if elsewhere and not seen:
-        why = f"{' or '.join(streets)}: streets with crossings, which are left out"
-        raise InvalidInput(f"{file}: all {elsewhere:,} rows are of {why}")
+        why = f"{' or '.join(streets)}, streets with crossings, which are left out"
+        raise InvalidInput(f"{file}: all {elsewhere:,} rows are from {why}")
 
 
 def _lines(file: Path, text: TextIOWrapper) -> Iterator[tuple[int, str]]:
     for number, line in zip(count(1), iter(partial(text.readline, LONGEST_LINE), ""), strict=False):
         if len(line) == LONGEST_LINE:
-            raise InvalidInput(f"{file}, line {number}: longer than {LONGEST_LINE:,} characters")
+            raise InvalidInput(f"{file}, line {number}: the line must have fewer than {LONGEST_LINE:,} characters")
         yield number, line
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    """Return the cells of a line, without quotes and separators of thousands; the separator " " stands for blanks."""
+    """Return the cells of a line, without quotes and without commas between thousands.
+
+    The separator " " means any number of blanks.
+    """
     if '"' not in line:
         return line.split(None if separator == " " else separator)
     cells = next(csv.reader([line], delimiter=separator))
-    commas = separator == ","  # in other files a comma may be that of a decimal
+    commas = separator == ","  # with other separators, a comma may be a decimal comma
     return [cell.replace(",", "") if commas and "," in cell and _THOUSANDS.fullmatch(cell) else cell for cell in cells]
 
 
 def _number(cell: str) -> float:
-    if "_" in cell:  # Python reads 1_000
+    if "_" in cell:  # ``float`` accepts 1_000
         raise ValueError
     return float(cell)
 
 
 def _measured(cell: str) -> float:
-    """Return the number in a cell, NaN if it is empty."""
+    """Return the number in a cell; NaN if the cell is empty."""
     return _number(cell) if cell.strip() else math.nan
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number of a name: 1 for the first one, 2 for the next. Raise ``ValueError`` for an empty name."""
+    """Return the number of a name: 1 for the first name, 2 for the next one. Raise ``ValueError`` for an empty name."""
     if not (name := cell.strip()):
         raise ValueError
     return names.setdefault(name, len(names) + 1.0)
 
 
 def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[list[int], list[str]]:
-    """Return the indices in ``shown`` of the columns to read, and those of ``columns`` that are not there.
+    """Find columns of a file by name; return the indices of the found columns, and the names of the missing ones.
 
-    Numbered columns are in the order of their numbers. Raises ``InvalidInput`` for a column that is there twice.
+    Numbered columns (Speed1, Speed2, ...) are in the order of their numbers.
+
+    Raises ``InvalidInput`` if a column occurs twice.
+
+    Args:
+        file: path of the file, for the message.
+        columns: names of the columns to find.
+        shown: names of all columns of the file.
+
     """
     small = [_OTHER_NAMES.get(name.lower(), name.lower()) for name in shown]
     ordered = sorted((len(name), name, k) for k, name in enumerate(small))  # Speed2 before Speed10
@@ -243,21 +260,21 @@ def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[li
     at = [[k for _, name, k in ordered if each.fullmatch(name)] for each in patterns]
     used, missing = [k for each in at for k in each], [name for name, each in zip(columns, at, strict=True) if not each]
     if not missing and len({small[k] for k in used}) < len(used):
-        raise InvalidInput(f"{file}: {', '.join(shown[k] for k in used)}: each column must be there once")
+        raise InvalidInput(f"{file}: columns {', '.join(shown[k] for k in used)}: each name must occur only once")
     return used, missing
 
 
 def _unknown(file: Path, entry: Format, missing: list[str], have: Sequence[str]) -> InvalidInput:
-    """Return the error for a file without ``missing`` columns; ``have``: the cells of its first lines."""
+    """Return the error for a file that lacks the columns ``missing``. ``have`` are the cells of its first lines."""
     small = {name.lower() for name in have}
     for title, (there, absent) in REFUSED.items():
         if small >= there and not small & absent:
-            return InvalidInput(f"{file}: this is {title}, which has no lanes to follow")
+            return InvalidInput(f"{file}: is a file of {title}, which cannot be used because it has no lanes")
     for each in FORMATS.values():
         if each is not entry and not _match(file, list(each.columns.values()), sorted(small))[1]:
-            return InvalidInput(f"{file}: is not {entry.title}; this is {each.title}")
-    hint = "; columns are separated by commas" * any(";" in name for name in have)
-    text = f"{file}: has no column {', '.join(missing)}, as files of {entry.title} have{hint}"
+            return InvalidInput(f"{file}: is not a file of {entry.title}, but of {each.title}")
+    hint = "; commas must separate the columns" * any(";" in name for name in have)
+    text = f"{file}: lacks columns that files of {entry.title} have: {', '.join(missing)}{hint}"
     return (
         NotARecording(text)
         if entry.mixed and not hint and 2 * len(missing) > len(entry.columns)

@@ -1,4 +1,4 @@
-"""Make scenarios from folders of recorded traffic: the scenario file, and its rows of initial states."""
+"""Create a scenario from a folder of recorded traffic: the scenario file, and its rows of gaps and speeds."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _LISTED = 10  # largest number of skipped files that a note names
 
 
 class FromData(NamedTuple):
-    """What was made of a folder of recordings."""
+    """A scenario from a folder of recordings, and information on the files."""
 
-    text: str  # the scenario, as YAML
-    csv: str  # its rows: gaps (m), speeds (m/s), and the column ``recording``
-    found: list[str]  # sentences about what was found and left out
-    refused: list[str]  # error of each refused file
-    skipped: list[str]  # files that are no recordings
+    text: str  # content of the scenario file (YAML)
+    csv: str  # content of the file of its rows (CSV): gaps (m), speeds (m/s), and the column ``recording``
+    found: list[str]  # sentences that say what the recordings contain, and what was left out
+    refused: list[str]  # error message for each refused file
+    skipped: list[str]  # names of files that are not recordings, or are copies of other files
 
 
 def scenario_from_data(
@@ -51,25 +51,26 @@ def scenario_from_data(
     strict: bool = False,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> FromData:
-    """Make a scenario from the recordings in a folder and in all its subfolders.
+    """Create a scenario from the recordings in a folder and in all its subfolders.
 
-    At regular times, queues of vehicles are cut from the front into chains of as many vehicles as ``based_on`` has; a
-    vehicle belongs to at most one chain. Each chain is a row of speeds and gaps. If there are more rows than a table
-    may hold, every k-th row is kept. A file that is refused is listed, and the others are used.
+    At regular times, queues of vehicles are cut from the front into chains. A chain has as many vehicles as the
+    scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each chain is a row of speeds and gaps.
+    If there are more rows than a table may have, every k-th row is used. Files with errors are refused; all others are
+    used.
 
     Args:
         name: name of the scenario.
         folder: folder with the files, or one file.
         format: format of the files.
-        columns: for the format ``table``: what each column means, in the form that ``format_of`` takes.
-        based_on: scenario for everything that is not recorded, and for the number of vehicles.
-        every_s: time between the moments at which rows are taken from the recordings (s).
-        draw: how the scenario draws worlds: whole ``rows``, or each quantity from a fit to the rows.
-        strict: refuse the folder if one of its files is refused.
-        progress: called with the name of a file, the KiB read of it, and its size in KiB.
+        columns: for the format ``table``: the columns of the files, in the form that ``format_of`` takes.
+        based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
+        every_s: time between two moments of a recording from which rows are taken (s).
+        draw: how the scenario draws worlds: whole ``rows``, or each quantity from a distribution fitted to the rows.
+        strict: raise an error if a file is refused.
+        progress: function that receives the name of a file, how much of it was read (KiB), and its size (KiB).
 
-    Raises ``InvalidInput`` with file, line and column if no file can be used; its notes describe the other refused
-    files.
+    Raises ``InvalidInput`` with file, line and column if no file can be used. The notes of the exception describe the
+    other refused files.
 
     """
     entry, base = format_of(format, columns), load_scenario(based_on)
@@ -77,9 +78,9 @@ def scenario_from_data(
     if entry.hertz:
         check_every(every_s, entry, entry.title)
     if not 0.0 < every_s < math.inf:
-        raise InvalidInput(f"every = {every_s:g} s: must be above 0")
+        raise InvalidInput(f"every = {every_s:g} s: the time between two rows must be above 0")
     if base.members or base.table is not None:
-        raise InvalidInput(f"based_on = {based_on!r}: must be a scenario that has neither a mixture nor a table")
+        raise InvalidInput(f"based_on = {based_on!r}: must be a scenario without a mixture and without a table")
     vehicles = base.vehicles
     rows = read_rows(folder, entry, every_s, vehicles, progress)
     if rows.refused and (strict or not rows.seen):
@@ -90,10 +91,11 @@ def scenario_from_data(
         raise error
     if not rows.seen:
         longest = (
-            f"; the longest queue has {rows.longest}: --based-on takes a scenario of so many, as realistic-pair of 2"
+            f"; the longest queue has {rows.longest} vehicles: give a scenario with at most as many (--based-on), for"
+            " instance realistic-pair with 2"
         )
         raise InvalidInput(
-            f"{folder}: no {vehicles} vehicles follow each other in a lane at any moment looked at"
+            f"{folder}: contains no queue of {vehicles} vehicles at the times that were read"
             f"{longest * (rows.longest > 1)}"
         )
     recordings, summary = count_of(len({file for file, _ in rows.of}), "recording"), _found(rows, vehicles, every_s)
@@ -105,8 +107,8 @@ def scenario_from_data(
     content = {key: value for key, value in base.declared().items() if key not in _REPLACED} | {
         "name": name,
         "title": f"{entry.title}, {'row by row' if draw == 'rows' else f'{draw} of each quantity'}",
-        "description": f"Speeds and gaps of {recordings} of {entry.title}. Brakes, masses and latencies, which nobody"
-        f" recorded, are as in {base.name}.",
+        "description": f"Speeds and gaps of {recordings} of {entry.title}. Brakes, masses and latencies were not"
+        f" recorded; they are as in {base.name}.",
         "source": f"{entry.title}, recorded in {entry.units}, folder {plain_text(folder.resolve().name)}."
         f" {'; '.join(summary)}. {entry.licence}",
         "horizon_s": max(base.horizon_s, math.ceil(at_rest_s) + 1.0),
@@ -124,23 +126,23 @@ def scenario_from_data(
 
 
 def _name(file: str, vehicles: str) -> str:
-    """Return the recording of a row, such as ``drive_1.csv: 2-3-4``; a long one keeps its end."""
+    """Return the name of a row: recording and vehicles, such as ``drive_1.csv: 2-3-4``. A long name loses its start."""
     return f"{file}: {vehicles}".strip()[-MOST_CHARACTERS:].strip()
 
 
 def _found(rows: Rows, vehicles: int, every_s: float) -> list[str]:
-    """Return sentences that say what was found in a folder, and what was left out."""
+    """Return phrases that say what the recordings of a folder contain, and what was left out."""
     groups = {2: "pair", 3: "trio"}.get(vehicles, "queue")
     parts = [
-        f"{count_of(rows.seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s, each vehicle in one of them at"
-        " most",
+        f"{count_of(rows.seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s; at one time, a vehicle is in at"
+        " most one chain",
         f"rows of {count_of(len(set(rows.of)), f'different {groups}')} of vehicles in"
         f" {count_of(len({file for file, _ in rows.of}), 'recording')}",
     ]
     parts += [f"left out: {number:,} {what}" for what, number in sorted(rows.left_out.items()) if number]
     if rows.skipped:
         more = f" and {len(rows.skipped) - _LISTED:,} more" if len(rows.skipped) > _LISTED else ""
-        parts += [f"skipped, no recordings or there already: {', '.join(rows.skipped[:_LISTED])}{more}"]
+        parts += [f"skipped, because they are no recordings or copies: {', '.join(rows.skipped[:_LISTED])}{more}"]
     if rows.refused:
         parts += [f"refused: {count_of(len(rows.refused), 'file')}"]
     return parts

@@ -1,6 +1,6 @@
-"""Numbers of a recording to vehicles at moments: position along the direction of travel, length and speed in m and m/s.
+"""Convert the numbers of a recording to states of vehicles: position, direction, length and speed, in m and m/s.
 
-The vehicles at regular moments go into a table of a private file on disk, which returns them ordered by time.
+The states at regular times are stored in a temporary database on disk, which returns them in order of time.
 """
 
 from __future__ import annotations
@@ -21,34 +21,37 @@ from ethbrake_marl.extensions.recorded.reading import Piece, read_pieces
 from ethbrake_marl.physics.state import Floats
 from ethbrake_marl.scenario.fields import QUANTITY
 
-FASTEST_MPS, LONGEST_M = 75.0, 40.0  # limits of a road vehicle: 270 km/h, and more than any road train in the data
+FASTEST_MPS, LONGEST_M = 75.0, 40.0  # largest speed (270 km/h) and length of a road vehicle
 
-CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3  # range of lengths of cars and vans, and their least share, to detect feet
+# Range of the lengths of cars and vans (m), and the least share of such vehicles. Lengths in feet violate it.
+CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3
 
-# A moment this long after each one that becomes rows is read too, to check gaps and positions against speeds: from one
-# row to the next, speeds may change too much.
+# Time (s) after each moment that becomes rows at which the vehicles are read again, to check gaps and positions against
+# speeds. The time to the next row may be too long for this check.
 CHECK_S = 1.0
 
 OFF = 0.05  # largest accepted distance of a time from a tick, in ticks
 
-# A vehicle at a moment, in m and m/s. ``front`` and ``side`` are x and y of its front, ``dx`` and ``dy`` its direction
-# of travel: 1 and 0 where positions are along the road. ``preceding`` is the vehicle ahead, below 0 for none.
-# ``length`` is 0 if the data hold gaps. ``tick`` is the time in intervals between two moments that become rows; only
-# whole ones do. ``line`` is that of the file.
+# State of a vehicle at one moment, in m and m/s. ``front`` and ``side`` are x and y of its front, ``dx`` and ``dy`` its
+# direction of travel (1 and 0 if positions are along the road). ``preceding`` is the id of the vehicle ahead, negative
+# if there is none. ``length`` is 0 if the data contain gaps. ``tick`` is the time, in units of the time between two
+# moments that become rows. A moment becomes rows if ``tick`` is whole. ``line`` is the number of the line in the file.
 State = namedtuple("State", "tick id lane preceding front side dx dy length speed line")
 
 STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
 
 
 def check_every(every_s: float, entry: Format, what: str) -> int:
-    """Return the number of ticks of a format in ``every_s``; raise ``InvalidInput`` if it is no whole number.
+    """Return how many ticks (intervals between recorded moments) ``every_s`` has.
 
-    ``what`` names the data for the message.
+    Raises ``InvalidInput`` if this is not a whole number. ``what`` is the name of the data for the message.
     """
     stride = every_s * entry.hertz
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
     if not (1.0 - 1e-6 <= stride < 1e9 and abs(stride - round(stride)) <= off):
-        raise InvalidInput(f"every = {every_s:g} s: must be a multiple of {1 / entry.hertz:g} s, as {what} has it")
+        raise InvalidInput(
+            f"every = {every_s:g} s: must be a multiple of {1 / entry.hertz:g} s, the time step of {what}"
+        )
     return round(stride)
 
 
@@ -60,15 +63,15 @@ def keep_states(
     names: dict[str, float],
     progress: Callable[[int, int], None],
 ) -> None:
-    """Write the vehicles of a file at every moment that is looked at into the table ``state`` of ``store``.
+    """Write the states of the vehicles of a file at regular times into the table ``state`` of a database.
 
     Args:
         store: database with an empty table ``state``.
-        file: the file.
-        entry: its format.
-        every_s: time between two moments that are looked at (s).
-        names: number of each name of a vehicle or lane, if the file has names; new names are added.
-        progress: called with the KiB read, and the size of the file in KiB.
+        file: path of the file.
+        entry: format of the file.
+        every_s: time between two moments that become rows (s).
+        names: name of a vehicle or lane -> its number, if the file has names; new names are added.
+        progress: function that receives how much was read (KiB), and the size of the file (KiB).
 
     Raises ``InvalidInput`` with file, line and column for an impossible value.
 
@@ -81,7 +84,7 @@ def keep_states(
             stride = check_every(every_s, entry, entry.title)
             turned = _directions(file, entry) if entry.title == "highD" else turned
         ticks = (times - first) * entry.ticks
-        right = f"must be a multiple of {1 / entry.hertz:g} s from the first on"
+        right = f"must be a multiple of {1 / entry.hertz:g} s after the first time"
         piece.refuse(~(abs(ticks - np.rint(ticks)) <= OFF), 0, right)
         near = max(1, min(stride, int(CHECK_S * entry.hertz)))
         taken = np.isin(np.rint(ticks) % stride, (0.0, near % stride))
@@ -92,29 +95,30 @@ def keep_states(
         cars, states = cars + int(((lengths > CAR_M[0]) & (lengths < CAR_M[1])).sum()), states + len(kept_states)
     if not entry.gaps and cars < LEAST_CARS * states:
         raise InvalidInput(
-            f"{file}: {cars:,} of {states:,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, fewer than a third; its"
-            f" lengths and speeds must be in {entry.units}"
+            f"{file}: {cars:,} of {states:,} vehicles are {CAR_M[0]:g} to {CAR_M[1]:g} m long, which is less than a"
+            f" third; lengths and speeds must be in {entry.units}"
         )
 
 
 def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
-    """Yield each moment of the table ``state`` in order of time: its tick and its vehicles in the order of the file."""
+    """Yield each moment in the table ``state``, in order of time: its tick, and the states in the order of the file."""
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
 
 
 def _directions(file: Path, entry: Format) -> Floats:
-    """Return id and driving direction of each vehicle of a file of highD, [vehicles, 2], sorted by id."""
+    """Return id and driving direction of each vehicle in a file of highD, [vehicles, 2], sorted by id."""
     meta = read_pieces(Path(f"{str(file)[:-4]}Meta.csv"), entry, ("id", "drivingDirection"))
     turned = np.concatenate([piece.values for piece in meta])
     return turned[np.argsort(turned[:, 0])]
 
 
 def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
-    """Return the format with the rate that ``times`` [rows] show: their smallest difference is a tick.
+    """Return the format with the rate of a file: its tick is the smallest difference between two of ``times`` [rows].
 
-    If not all times are multiples of it they are rounded, and a rate within 2 % of a whole number is that number: 0.033
-    and 0.067 s are 30 Hz.
+    If some times are not multiples of the tick, the recorded times are rounded. A rate within 2 % of a whole number is
+    then replaced by this number: times of 0.033 and 0.067 s mean 30 Hz. ``every_s`` is the tick of a file with a single
+    time.
     """
     seconds = np.unique(np.round(times * entry.ticks, 6))
     steps = np.diff(seconds)
@@ -130,9 +134,9 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 
     Args:
         piece: rows of a file.
-        entry: its format.
-        ticks: number of the moment of each row, [rows].
-        turned: of highD: id and driving direction of each vehicle, [vehicles, 2], sorted by id.
+        entry: format of the file.
+        ticks: [rows] time of each row, in units of the time between two moments that become rows.
+        turned: [vehicles, 2] for highD: id and driving direction of each vehicle, sorted by id.
 
     """
     if entry.gaps:
@@ -148,7 +152,7 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
     ahead = np.where(ahead == entry.alone, -1.0, ahead)
     front, side, length = (columns.get(role, zero) * entry.metres for role in ("front", "side", "length"))
     dx, dy, speed = zero + 1.0, zero, columns["speed"] * entry.mps
-    right = f"m of length: must be in (0, {LONGEST_M:g}]; {entry.title} has {entry.units}"
+    right = f"m: the length must be above 0 and at most {LONGEST_M:g} m; {entry.title} is in {entry.units}"
     piece.refuse((length <= 0.0) | (length > LONGEST_M), at("length"), right, length)
     if entry.title == "highD":
         place = np.searchsorted(turned[:, 0], who).clip(max=len(turned) - 1)
@@ -156,28 +160,29 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
         piece.refuse(odd, at("id"), "must have the drivingDirection 1 or 2 in its tracksMeta.csv")
         right_hand = turned[place, 1] == 2.0  # x is the left edge of the vehicle and grows to the right
         front, speed = np.where(right_hand, front + length, -front), speed * np.where(right_hand, 1.0, -1.0)
-    elif entry.title == "exiD":  # x and y are those of the centre
+    elif entry.title == "exiD":  # x and y are the centre of the vehicle
         dx, dy = np.cos(np.deg2rad(columns["heading"])), np.sin(np.deg2rad(columns["heading"]))
         front, side = front + length / 2.0 * dx, side + length / 2.0 * dy
-    right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
+    right = f"m/s: the speed must be at most {FASTEST_MPS:g} m/s; {entry.title} is in {entry.units}"
     piece.refuse(speed > FASTEST_MPS, at("speed"), right, speed)
     return np.column_stack([ticks, who, lane, ahead, front, side, dx, dy, length, speed, piece.lines])
 
 
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
-    """Return the states of OpenACC: car k follows car k - 1 where both speeds and IVS k - 1 are there.
+    """Return the fields of ``State`` for OpenACC, [rows, fields].
 
-    The position of the first car of a queue is 0, that of each other the sum of the gaps ahead of it.
+    Car k follows car k - 1 if both speeds and the gap IVS k - 1 are recorded. The first car of a queue is at position
+    0. The position of another car is minus the sum of the gaps ahead of it.
     """
     at = {name.lower(): k for k, name in enumerate(piece.columns)}
     cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))
     ivs = {k: f"ivs{k - 1}" for k in cars if f"ivs{k - 1}" in at and k - 1 in cars}
     if not ivs:
         raise InvalidInput(
-            f"{piece.file}: no car follows another in the columns {', '.join(piece.columns[1:])}; must have the"
-            " columns Speed k, Speed k+1 and IVS k for at least one k"
+            f"{piece.file}: no car follows another in the columns {', '.join(piece.columns[1:])}; the file must have"
+            " the columns Speed1, Speed2 and IVS1, or the like with other numbers"
         )
-    right = f"m/s; must be at most {FASTEST_MPS:g}; {entry.title} has {entry.units}"
+    right = f"m/s: the speed must be at most {FASTEST_MPS:g} m/s; {entry.title} is in {entry.units}"
     for k in cars:
         column = at[f"speed{k}"]
         piece.refuse(piece.values[:, column] > FASTEST_MPS, column, right)
@@ -186,7 +191,7 @@ def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
     gaps = np.column_stack([piece.values[:, at[ivs[k]]] if k in ivs else np.full(len(ticks), np.nan) for k in cars])
     farthest = QUANTITY.usual["gaps_m"].high
     for k, name in ivs.items():
-        piece.refuse(abs(gaps[:, cars.index(k)]) > farthest, at[name], f"m; must be at most {farthest:g}")
+        piece.refuse(abs(gaps[:, cars.index(k)]) > farthest, at[name], f"m: the gap must be at most {farthest:g} m")
     linked = np.isfinite(gaps) & np.isfinite(speeds)
     linked[:, 1:] &= np.isfinite(speeds[:, :-1])
     behind, numbers = np.cumsum(np.where(linked, gaps, 0.0), axis=1), np.tile(np.array(cars, float), (len(ticks), 1))

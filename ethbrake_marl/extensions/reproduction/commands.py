@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.registry import Part
 
-REMAINS = "the same command goes on with what is in the folder"
+REMAINS = "repeat the command to continue with the results in the folder"
 
 PAPER_EPISODES = 10_000
 
@@ -24,26 +24,30 @@ def reproduce_command(
             metavar="ITEM", help="Figures and tables to make; --list names them.", show_default="everything"
         ),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Train nothing, use shipped policies (the default).")] = False,
-    full: Annotated[bool, typer.Option("--full", help="Train learning curves and a policy stopped early.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Use shipped policies, without training (default).")] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Also train policies, for learning curves and a policy stopped early.")
+    ] = False,
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[
-        int, typer.Option(help="The most worlds of any list; the paper has 10,000.", min=2, max=PAPER_EPISODES)
+        int, typer.Option(help="Most worlds for a figure or table; the paper has 10,000.", min=2, max=PAPER_EPISODES)
     ] = PAPER_EPISODES,
     docs: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="Also write the results as JSON, figures beside it.")
+        Path | None,
+        typer.Option(metavar="FILE.json", help="Also write the results to this file, and the figures beside it."),
     ] = None,
     cost: Annotated[
-        bool, typer.Option("--cost", help="Print what is left to do and how long it takes, and exit.")
+        bool, typer.Option("--cost", help="Print which work is left and how long it takes, and exit.")
     ] = False,
-    listed: Annotated[bool, typer.Option("--list", help="List the items, and exit.")] = False,
+    listed: Annotated[bool, typer.Option("--list", help="List all figures and tables, and exit.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make the paper's figures and tables again.
+    """Reproduce the paper's figures and tables, and compare them with the paper.
 
-    Says what agrees, what differs and what cannot agree. Writes one page (index.html), and for each item its figures,
-    its data and its result. Prints first how long it will take. The same command goes on after an interruption.
+    An item is a figure or a table of the paper. The command prints how long the work takes, then makes each item. It
+    writes one page (index.html), and for each item its figures, its data and a verdict: the results agree with the
+    paper, differ, or cannot agree. After an interruption, repeat the command to continue.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         from ethbrake_marl.extensions.reproduction.folder import Reproduction
@@ -51,7 +55,7 @@ def reproduce_command(
         from ethbrake_marl.extensions.studies.machine import this_machine
 
         if quick and full:
-            raise InvalidInput("--quick and --full: give one of the two")
+            raise InvalidInput("--quick and --full exclude each other; give one of them")
         chosen = choose_items(names or ())
         if listed:
             rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
@@ -72,7 +76,7 @@ def reproduce_command(
         out.result([result.in_words() for result in results], Sheet("", ("Item", "Verdict", "Because"), verdicts))
         out.note(f"page: {output / 'index.html'}")
         if not finished:
-            out.interrupted(f"interrupted: items are made of the trainings that were finished; {REMAINS}")
+            out.interrupted(f"interrupted: the items use the trainings that are finished; {REMAINS}")
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

@@ -1,4 +1,7 @@
-"""The paper's learning curves at high and low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``)."""
+"""Reproduce the paper's learning curves at high and low delay.
+
+These are the figures ``fig:ppo_sac_high_latency`` and ``fig:ppo_sac_low_latency``.
+"""
 
 from __future__ import annotations
 
@@ -57,9 +60,9 @@ _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digi
 
 @lru_cache(maxsize=1)  # both figures show the same results
 def _shipped_ends(settings: Reproduction) -> Made:
-    """Evaluate shipped policies at low and high delay, under both assumptions on when Vehicle 2 may act.
+    """Evaluate shipped policies at low and high delay; return verdicts, a table and data.
 
-    The result has verdicts, a table and data, but no figure.
+    The evaluation uses both assumptions on when Vehicle 2 may act (``READINGS``).
     """
     episodes = min(2_000, settings.episodes)
     verdicts, rows, data = [], [], []
@@ -97,46 +100,46 @@ class Course:
 
     @property
     def last_returns(self) -> Floats:
-        """Mean return over the last tenth of the updates, [seeds]."""
+        """Mean return of each seed over the last tenth of its updates, [seeds]."""
         return np.asarray(self.returns.values[:, -max(len(self.returns.steps) // 10, 1) :].mean(axis=1))
 
     @property
     def rise(self) -> float:
-        """Rise of the return from the first update to the last tenth of the training, mean over seeds."""
+        """Mean over the seeds of (return in the last tenth of the updates - return in the first update)."""
         return float((self.last_returns - self.returns.values[:, 0]).mean())
 
     @property
     def decisions_to_converge(self) -> Floats:
-        """Number of decisions until 90 % of the whole fall of the harm is reached, [seeds] (``_DONE``)."""
+        """Number of decisions until the harm has fallen by 90 % (``_DONE``) of its whole fall, [seeds]."""
         first, least = self.harm.values[:, :1], self.harm.values.min(axis=1, keepdims=True)
         there = self.harm.values <= first - _DONE * (first - least)
         return np.asarray(self.harm.steps[np.argmax(there, axis=1)])
 
     def returns_at(self, shares: Floats) -> Floats:
-        """Return the return of each seed at given points of the training, [seeds, k].
+        """Return each seed's return at k points of the training, [seeds, k].
 
-        ``shares`` [k] are these points, as shares of the whole training from 0 to 1.
+        ``shares`` [k] are the points: 0 is the start and 1 the end of the training.
         """
         steps = shares * self.returns.steps[-1]
         return np.array([np.interp(steps, self.returns.steps, own) for own in self.returns.values])
 
     def unrest(self, points: int) -> Floats:
-        """Return how much the return of each seed fluctuates in the second half of the training, [seeds].
+        """Return how much each seed's return fluctuates in the second half of the training, [seeds].
 
-        The return is taken at ``points`` equally distant times. The result is the standard deviation of the changes
-        from one time to the next, divided by ``rise``, so that trainings of different lengths can be compared.
+        The result is the standard deviation of the change of the return between neighbouring points, divided by
+        ``rise``. There are ``points`` equally spaced points, which makes trainings of different lengths comparable.
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
     @property
     def still_rising(self) -> float:
-        """Rise of the return in the last quarter of the training, as a share of ``rise``; mean over seeds."""
+        """Mean rise of the return in the last quarter of the training, as a share of ``rise``."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return over seeds, at each step of the second half of the training, [k]."""
+        """Standard deviation of the return over the seeds, at k steps in the second half of the training, [k]."""
         return np.asarray(self.returns.values[:, len(self.returns.steps) // 2 :].std(axis=0, ddof=1))
 
 
@@ -146,8 +149,7 @@ Courses = Mapping[str, Course]  # trainings by recipe
 def reproduce_curves(delay: str, settings: Reproduction) -> Made:
     """Reproduce the learning curves at one delay (``high`` or ``low``) from the trainings of ``--full``.
 
-    Returns verdicts, tables, figures and data. Without these trainings, the results of shipped policies at this delay
-    take their place.
+    Returns verdicts, tables, figures and data. Without these trainings, the tables show results of shipped policies.
     """
     courses = {
         each: {
@@ -219,9 +221,9 @@ def reproduce_curves(delay: str, settings: Reproduction) -> Made:
 
 
 def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
-    """Return verdicts on the paper's statements about the learning curves at one delay.
+    """Return verdicts on the paper's statements about the learning curves at one delay (``high`` or ``low``).
 
-    ``courses`` holds the trainings by delay and recipe.
+    ``courses`` maps delay and recipe to trainings.
     """
     own, high, low = courses[delay], courses[HIGH], courses[LOW]
     if not own:
@@ -282,7 +284,7 @@ def _higher_when_low(courses: Mapping[str, Courses]) -> Verdict:
     what, parts = "both algorithms reach higher returns at low delay than at high", []
     for name in sorted(courses[HIGH].keys() & courses[LOW].keys()):
         high, low, where = courses[HIGH][name].last_returns, courses[LOW][name].last_returns, name
-        # with shaping, returns include the potential of the first state and differ between delays, so compare harm
+        # with shaping, the return includes the potential of the first state, which depends on the delay: compare harm
         if load_recipe(name).reward.shaping > 0.0:
             high, low = (-courses[each][name].harm.values[:, -1] for each in (HIGH, LOW))
             where = f"{name} (minus its harm: its return holds shaping)"

@@ -23,14 +23,14 @@ _ROW_CHARACTERS = 52  # characters in a line of a row's label
 def estimates_figure(
     panels: Mapping[str, Mapping[str, Mapping[Any, Estimate]]], *, y_label: str, caption: str, x_label: str = ""
 ) -> Figure:
-    """Draw estimates with their 95 % intervals: one panel per title, and in it one series per label.
+    """Draw estimates with their 95 % intervals, in one or more panels.
 
     Args:
-        panels: title of a panel -> label of a series -> x (a number or a text) -> estimate.
+        panels: nested mapping: title of the panel -> label of the series -> x (a number or a text) -> estimate.
         y_label: label of the y axis.
         caption: text below the figure.
-        x_label: label of the x axis if x is a number: lines with bands are drawn. Empty: x is a text, and groups of
-            bars are drawn.
+        x_label: label of the x axis. With a label, each x is a number, and lines with bands are drawn. Without one,
+            each x is a text, and groups of bars are drawn.
 
     """
     figure, every = new_panels((4.6 * len(panels), 4.2), columns=len(panels), sharey=True)
@@ -56,12 +56,15 @@ def estimates_figure(
 
 
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
-    """Draw trajectories as the paper does: vehicle against position on the road, with an arrow every ten time steps.
+    """Draw the positions of all vehicles on the road as the paper does: one panel per episode, one row per vehicle.
 
-    Dashed lines join the positions of all vehicles at the same time. ``records`` are episodes by the title of their
-    panel; there are two panels in a row.
+    An arrow marks the position every ten time steps. Dashed lines connect the positions of the vehicles at the same
+    time.
 
-    ``caption`` is the text below the figure.
+    Args:
+        records: episodes, by the title of their panel.
+        caption: text below the figure.
+
     """
     figure, panels = _in_pairs(len(records), 1.9, "Position along the road (m)", "Vehicle")
     for axes, (title, record) in zip(panels, records.items(), strict=False):
@@ -80,9 +83,14 @@ def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure
 
 
 def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with ``panels`` panels on common scales, two in a row, and its axes.
+    """Return a figure with panels side by side in pairs, and the panels. All panels have the same scales.
 
-    ``height_in`` is the height of a row in inches; ``x`` and ``y`` are the labels of the axes.
+    Args:
+        panels: number of panels.
+        height_in: height of one panel in inches.
+        x: label of the x axes.
+        y: label of the y axes.
+
     """
     rows = (panels + 1) // 2
     figure, every = new_panels((10.0, height_in * rows + 1.0), rows, 2, sharex=True, sharey=True)
@@ -94,9 +102,12 @@ def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, li
 
 
 def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, caption: str) -> Figure:
-    """Draw the command of the controlled vehicle over time: one panel per title, one line per label.
+    """Draw the command of the controlled vehicle over time, in one or more panels.
 
-    ``panels`` maps the title of a panel to recorded episodes by the label of their line; ``caption`` is the text below.
+    Args:
+        panels: nested mapping: title of the panel -> label of the curve -> recorded episode.
+        caption: text below the figure.
+
     """
     figure, every = _in_pairs(len(panels), 2.3, "Time since Vehicle 1 began to brake (s)", "Command (m/s²)")
     for axes, (title, records) in zip(every, panels.items(), strict=False):
@@ -110,11 +121,13 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
 
 
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
-    """Draw by how much each change moves a number: one row per change, one mark per label, with its 95 % interval.
+    """Draw the effects of several changes, with their 95 % intervals: one row per change, one mark per label.
 
-    ``changes`` maps the name of a change to the differences, by label.
+    Args:
+        changes: nested mapping: name of the change -> label -> effect.
+        x_label: label of the x axis.
+        caption: text below the figure.
 
-    ``x_label`` is the label of the x axis, ``caption`` the text below the figure.
     """
     rows = list(changes)
     labels = list(dict.fromkeys(label for each in changes.values() for label in each))

@@ -1,4 +1,7 @@
-"""The folder of a reproduction: its settings, and the types that describe its items and their results."""
+"""Settings of a reproduction, and the types of its items and results.
+
+An item is a figure or a table of the paper.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,7 @@ SETTINGS, RESULT = "reproduction.json", "result.json"
 
 FORMAT = {"format": "ethbrake-reproduction", "format_version": 2}
 
-LIMIT_BYTES = 16 << 20  # largest size of a figure file that is read again
+LIMIT_BYTES = 16 << 20  # size limit of a figure file that is read
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,22 +47,23 @@ class Reproduction:
 
     mode: Mode  # ``quick``: train nothing, use shipped policies; ``full``: also use trainings
     folder: Path  # folder of all results, and of the trainings
-    episodes: int = MOST_EPISODES  # largest number of worlds of a list; the paper has 10,000
-    tell: OnProgress = lambda progress: None  # called with the progress
-    machine: str = ""  # description of the machine, for the results
-    docs: Path | None = None  # JSON file of the results to write; None: no such file
+    episodes: int = MOST_EPISODES  # largest number of worlds for a figure or table; the paper has 10,000
+    tell: OnProgress = lambda progress: None  # function that receives the progress
+    machine: str = ""  # description of the machine, which is stored with the results
+    docs: Path | None = None  # JSON file to which all results are written; None: no such file
 
     def __post_init__(self) -> None:
-        """Raise ``InvalidInput`` if the name of the JSON file does not end in ``.json``, or it cannot be written."""
+        """Raise ``InvalidInput`` if the name of ``docs`` does not end in ``.json``, or the file cannot be written."""
         if self.docs is not None:
             if self.docs.suffix != ".json":
-                raise InvalidInput(f"{self.docs}: must end in .json")
+                raise InvalidInput(f"{self.docs}: the name of the file must end in .json")
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
-        """Return the trainings of the groups named in ``wanted``, as (group, name of the recipe, folder of each seed).
+        """Return the trainings of some groups, as (group, name of the recipe, folder of each seed).
 
-        There is one entry for each recipe of each group. The list is empty in mode ``quick``.
+        ``wanted`` are the names of the groups. The result has one entry for each recipe of each group. In mode
+        ``quick`` it is empty.
         """
         return [
             (
@@ -73,9 +77,9 @@ class Reproduction:
         ]
 
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
-        """Return the recipes whose seeds are all trained, as ``group/recipe``, with the folder of each seed.
+        """Return the recipes whose trainings are finished for every seed: ``group/recipe`` -> folder of each seed.
 
-        ``wanted`` are names of groups.
+        ``wanted`` are the names of the groups to look at.
         """
         return {
             f"{group.name}/{name}": paths
@@ -86,7 +90,7 @@ class Reproduction:
     def seconds_left(self, wanted: Collection[str]) -> float:
         """Return the time (s) that one core needs for the remaining trainings of the groups named in ``wanted``.
 
-        Unfinished trainings count in full.
+        A training that has begun counts with its whole time.
         """
         return sum(
             group.trained[name][0].decisions / group.trained[name][0].per_s
@@ -96,9 +100,7 @@ class Reproduction:
         )
 
     def train(self, wanted: Collection[str]) -> bool:
-        """Run the remaining trainings of the groups named in ``wanted``, in order. Return False if Ctrl-C stopped
-        them.
-        """
+        """Run the remaining trainings of the groups named in ``wanted``. Return False if Ctrl-C stopped them."""
         from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 
         for group in groups().values():
@@ -110,7 +112,7 @@ class Reproduction:
         return True
 
     def cost(self, items: Sequence[Item]) -> str:
-        """Return one line of text on the work left to do for ``items`` and the time it takes."""
+        """Return a message on the work that is left for ``items``, and how long it takes."""
         wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
         cost = (
             f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
@@ -121,7 +123,7 @@ class Reproduction:
 
 @model(frozen=True, config=WRITTEN)
 class Parameter:
-    """A quantity that affects an item (a figure or table of the paper), and the origin of its value."""
+    """A quantity that affects a figure or table of the paper, and the origin of its value."""
 
     name: str  # name of the quantity
     value: str  # its value as text, with unit
@@ -129,65 +131,65 @@ class Parameter:
 
 
 def stated(name: str, value: str, where: str) -> Parameter:
-    """Return a parameter with the place where the paper states it; if ``where`` is empty, the value is our default."""
+    """Return a parameter whose value the paper states at the place ``where``; empty: the value is our default."""
     return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
 
 
 @model(frozen=True, config=WRITTEN)
 class Table:
-    """A table as text, as it is stored in a result."""
+    """A table as it is stored in a result: headings, and cells as text."""
 
     title: str  # title above the table
     head: Sequence[str]  # headings of the columns
-    rows: Sequence[Sequence[Shown]]  # cells of each row: a value and, if there is one, an interval
+    rows: Sequence[Sequence[Shown]]  # cells of each row; a cell is a value, with an interval if it has one
     note: str = ""  # text below the table
 
 
 @model(frozen=True, config=WRITTEN)
 class Drawn:
-    """Names of a figure of an item: the stem of its files, its title, and a description in words."""
+    """Name, title and description of a figure in a result."""
 
-    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # name of its files without ending
+    stem: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]  # name of the figure's files without ending
     title: str  # title above the figure
-    text: str  # description of what the figure shows
+    text: str  # description of the figure in words
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """Result of reproducing an item (a figure or table of the paper), before it is written to files."""
+    """Result of reproducing a figure or table of the paper, before it is written to files."""
 
     verdicts: Sequence[Verdict]  # verdict on each comparison with the paper
-    parameters: Sequence[Parameter]  # quantities that affect the item
+    parameters: Sequence[Parameter]  # quantities that affect the result
     tables: Sequence[Sheet] = ()  # tables to show
-    figures: Mapping[Drawn, Figure] = field(default_factory=dict)  # figures to show, each with its names
-    data: Mapping[str, str] = field(default_factory=dict)  # CSV files: stem of the file name -> its text
-    notes: Sequence[str] = ()  # sentences on what was run and what was not
+    figures: Mapping[Drawn, Figure] = field(default_factory=dict)  # figures to show, by name and description
+    data: Mapping[str, str] = field(default_factory=dict)  # name of a CSV file without ending -> content of the file
+    notes: Sequence[str] = ()  # sentences that say what was run and what was not
 
 
 @model(frozen=True, config=WRITTEN, kw_only=True)
 class Result:
-    """An item (a figure or table of the paper) and its result, as stored in its file and shown on pages."""
+    """Result of reproducing a figure or table of the paper, as stored in a file and shown on pages."""
 
-    name: str  # name on the command line and of its folder
-    labels: Sequence[str]  # labels in the paper's source
-    title: str  # title of the item
+    name: str  # name on the command line; also the name of the folder
+    labels: Sequence[str]  # labels in the source of the paper
+    title: str  # title of the result
     what: str  # description of the paper's figure or table, one sentence
     mode: Mode = "quick"  # ``quick`` or ``full`` (with trainings)
-    episodes: int = MOST_EPISODES  # largest number of worlds of a list
+    episodes: int = MOST_EPISODES  # largest number of worlds for a figure or table
     trained: Sequence[str]  # trainings that were used, as ``group/recipe``
     processor_s: float  # processor time without the trainings, s
-    made_utc: str  # date and time (UTC, ISO 8601)
+    made_utc: str  # date and time at which the result was made (UTC, ISO 8601)
     machine: str  # description of the machine
     verdict: Verdict  # summary of all verdicts
     comparisons: Sequence[Verdict]  # verdict on each comparison with the paper
-    parameters: Sequence[Parameter]  # quantities that affect the item
+    parameters: Sequence[Parameter]  # quantities that affect the result
     tables: Sequence[Table]  # tables to show
-    figures: Sequence[Drawn]  # names of the figures
+    figures: Sequence[Drawn]  # names and descriptions of the figures
     data: Sequence[str]  # names of the CSV files
-    notes: Sequence[str]  # sentences on what was run and what was not
+    notes: Sequence[str]  # sentences that say what was run and what was not
 
     def in_words(self) -> dict[str, Any]:
-        """Return the result as plain data (mappings, lists and texts), in which each cell of a table is one text."""
+        """Return the result as mappings, lists and texts, for a JSON file. Each cell of a table is one text."""
         tables = [
             {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
         ]
@@ -198,20 +200,20 @@ class Result:
 class Item:
     """One figure or table of the paper, and the function that reproduces it."""
 
-    name: str  # name on the command line and of its folder
-    labels: tuple[str, ...]  # labels in the paper's source
+    name: str  # name on the command line; also the name of the folder
+    labels: tuple[str, ...]  # labels in the source of the paper
     title: str  # title of the item
     what: str  # description of the paper's figure or table, one sentence
-    make: Callable[[Reproduction], Made]  # function that reproduces it with these settings
-    most_s: float  # upper estimate of processor seconds with the paper's numbers of worlds
-    trained: tuple[str, ...] = ()  # groups of trainings that it shows with ``--full``
-    play: Callable[[], Part] | None = None  # function that returns the player of episodes for its page; None: no player
+    make: Callable[[Reproduction], Made]  # function that reproduces the item
+    most_s: float  # upper estimate of the processor time (s) with as many worlds as in the paper
+    trained: tuple[str, ...] = ()  # names of the groups of trainings that the item uses with ``--full``
+    play: Callable[[], Part] | None = None  # function that returns a player of episodes for the page; None: no player
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a CSV file as text: the line ``head``, then ``rows``.
+    """Return the content of a CSV file with the headings ``head`` and these rows.
 
-    An ``Estimate`` in a row fills three columns: value, low, high; ``head`` needs a name for each of them.
+    An ``Estimate`` in a row fills three columns (value, low, high), each with its own heading.
     """
     parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
     return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
@@ -238,10 +240,13 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 
 
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
-    """Return the quantities of a scenario as parameters, each with its origin.
+    """Return the quantities of a scenario as parameters. The origin of each is the place where the paper states it.
 
-    The origin is the place in the paper that states the quantity (``_QUANTITIES``). ``places`` replaces it: key of the
-    scenario -> other place; an empty text marks our default.
+    Args:
+        scenario: the scenario.
+        places: key of the scenario -> place in the paper, instead of the place in ``_QUANTITIES``. An empty text means
+            that the value is our default.
+
     """
     content = scenario.model_dump(mode="json", exclude_none=True)
     parameters = [
@@ -254,10 +259,14 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:
-    """Return the number of worlds, ``episodes``, and the seed of their list as a parameter.
+    """Return the number of worlds and the seed of their evaluation list as one parameter.
 
-    The paper states the number at ``where`` (empty: our default). The seed is ours: the paper only says "a fixed random
-    seed".
+    The seed is our choice, because the paper only says "a fixed random seed".
+
+    Args:
+        episodes: number of worlds.
+        where: place where the paper states this number; empty: the number is our default.
+
     """
     return stated("worlds", f"{episodes:,}, the first of the list of seed {LIST_SEED}", where)
 
@@ -280,14 +289,14 @@ def json_text(content: Mapping[str, Any]) -> bytes:
 
 
 def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> Result:
-    """Return the result that an item's file holds.
+    """Return the result that is stored in a result file.
 
-    Raises ``InvalidInput`` if an entry is missing or has another type than pages need, or if it is another item's.
+    Raises ``InvalidInput`` if an entry is missing or wrong, or if the result belongs to another figure or table.
 
     Args:
         content: content of the file.
         where: path of the file, for the error message.
-        name: name of the item.
+        name: name of the figure or table, such as ``harm-delays``.
 
     """
     try:
@@ -304,5 +313,5 @@ def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> 
         }
         wrong = next((what for what, is_right in checks.items() if not is_right), "")
     if wrong:
-        raise InvalidInput(f"{where}: {wrong}: is not what a reproduction writes; make it again (--force)")
+        raise InvalidInput(f"{where}: {wrong}: is missing or wrong; make the result again (--force)")
     return result

@@ -1,4 +1,7 @@
-"""Harm in groups of worlds: by distance (``Fig:Harm-ivds``, ``Fig:hybrid illu``), or by delay (``Fig:harm-delay``)."""
+"""Reproduce the harm in groups of worlds, by distance or by delay.
+
+By distance: the paper's ``Fig:Harm-ivds`` and ``Fig:hybrid illu``. By delay: ``Fig:harm-delay``.
+"""
 
 from __future__ import annotations
 
@@ -48,14 +51,14 @@ _HARM_TITLE = "First-impact harm (m²/s²)"
 
 DISTANCE, _DISTANCE_WORLDS = "paper-distance", 5_000
 
-_ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups of d_1 + d_2
+_ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups, for the sum of both gaps
 
 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
-    """Group worlds by the sum of both gaps. Return the mean sum of each group (m), and the harm by group and strategy.
+    """Group worlds by the sum of both gaps. Return the mean sum in each group (m), and the harm in each group.
 
-    The second result has the form ``{"10-12 m": {"PPO": harm, ...}, ...}`` with the harm of each world in the group.
-    Empty groups are left out.
+    The harm has the form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for
+    each world of the group. Empty groups are left out.
     """
     total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}
@@ -67,9 +70,9 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
 
 
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
-    """Return comparisons: does strategy ``smaller`` do less harm than each of ``larger``, in every group of worlds?
+    """Compare, in every group of worlds, the harm of strategy ``smaller`` with the harm of each strategy ``larger``.
 
-    They are paired by world. ``groups`` maps the name of a group to the harm [n] of each strategy.
+    The comparisons are paired by world. ``groups`` maps the name of a group to the harm [n] of each strategy.
     """
     return [
         Less.of_harms(group if len(larger) == 1 else f"{group}, {other}", harm, smaller, other)
@@ -79,9 +82,9 @@ def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
 
 
 def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
-    """Return a table of mean harm with its interval: one row per strategy, one column per group of worlds.
+    """Return a table of the mean harm with its interval: one row per strategy, one column per group of worlds.
 
-    ``groups`` maps the name of a group to the harm [n] of each strategy; ``note`` is added below the table.
+    ``groups`` maps the name of a group to the harm [n] of each strategy. ``note`` is added to the text below the table.
     """
     strategies = next(iter(groups.values()))
     rows = [(name, *(mean(harm[name]) for harm in groups.values())) for name in strategies]
@@ -96,14 +99,14 @@ def over_distance(
     parameters: Sequence[Parameter],
     episodes: int,
 ) -> Made:
-    """Return an item that shows the harm of strategies against the sum of both gaps.
+    """Return the result for a figure of the paper that shows harm against the sum of both gaps.
 
     Args:
-        stem: name of its files without ending.
-        curves: result of ``by_distance`` for each assumption on when Vehicle 2 may act, by the name of the assumption.
+        stem: name of the result's files without ending.
+        curves: result of ``by_distance``, by the name of the assumption on when Vehicle 2 may act.
         verdicts: verdicts on the paper's statements.
         lines: names of the strategies to draw.
-        parameters: parameters to list besides those of the scenario.
+        parameters: parameters to list besides the quantities of the scenario.
         episodes: number of worlds.
 
     """
@@ -142,10 +145,7 @@ def over_distance(
 
 
 def reproduce_distance(settings: Reproduction) -> Made:
-    """Reproduce the harm of the four strategies against the sum of both gaps; return figure, tables and verdicts.
-
-    The verdicts judge the paper's statements about it.
-    """
+    """Reproduce the figure of harm against the sum of both gaps; return figure, tables and verdicts."""
     episodes, braking = min(_DISTANCE_WORLDS, settings.episodes), NAMES[FULL_BRAKE]
     curves, verdicts = {}, []
     for reading in READINGS:
@@ -178,18 +178,18 @@ def reproduce_distance(settings: Reproduction) -> Made:
 
 _DELAYS, _DELAY_WORLDS = ("low", "middle", "high"), 2_000
 
-_STATE = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}  # world of the paper's figure, the same at each delay
+_STATE = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}  # world of the paper's figure
 
 _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 
 
 def reproduce_delays(settings: Reproduction) -> Made:
-    """Reproduce the harm of the four strategies at three delays; return figures, tables and verdicts.
+    """Reproduce the figure of harm at three delays; return figures, tables and verdicts.
 
-    There is one figure for the world of the paper's figure, and one for a list of worlds.
+    One figure shows the single world of the paper's figure. A second figure shows means over random worlds.
     """
     episodes = min(_DELAY_WORLDS, settings.episodes)
-    curves: dict[tuple[str, str], Groups] = {}  # by worlds and reading
+    curves: dict[tuple[str, str], Groups] = {}  # (description of the worlds, assumption) -> delay -> harm
     for reading in READINGS:
         for worlds, state, count in ((_ONE, _STATE, 1), (_LIST, {}, episodes)):
             scenarios = [reading.scenario(f"paper-delay-{delay}", **state) for delay in _DELAYS]
@@ -239,6 +239,6 @@ def reproduce_delays(settings: Reproduction) -> Made:
 
 
 def _delay_name(scenario: Scenario) -> str:
-    """Return the name of a scenario's delay with its latencies, for instance "low (0.1, 0.3 s)"."""
+    """Return the name of a scenario's delay with the latencies of Vehicles 2 and 3, such as "low (0.1, 0.3 s)"."""
     _, middle, rear = scenario.model_dump()["latency_s"]
     return f"{scenario.name.removeprefix('paper-delay-')} ({middle:g}, {rear:g} s)"

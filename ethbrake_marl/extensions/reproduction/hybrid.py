@@ -1,4 +1,7 @@
-"""The paper's hybrid (``Fig:hybrid illu``, ``Table:hybrid``) and its random test (``Table:Random``)."""
+"""Reproduce the paper's results on its hybrid, and its random test.
+
+The hybrid is in ``Fig:hybrid illu`` and ``Table:hybrid``, the random test in ``Table:Random``.
+"""
 
 from __future__ import annotations
 
@@ -46,13 +49,13 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of both on a list of worlds.
+    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of both.
 
-    The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the alert.
+    The *hybrid* is the paper's Algorithm 1: at the alert it chooses E-V2X-BM or the policy.
 
     Args:
         name: name of a shipped scenario.
-        settings: settings of the reproduction, with the number of worlds.
+        settings: settings of the reproduction, which limit the number of worlds.
         reading: assumption on when Vehicle 2 may act.
 
     """
@@ -61,10 +64,10 @@ def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evalua
 
 @lru_cache(maxsize=2 * len(READINGS))  # figure and table share the evaluations
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
-    """Evaluate the strategies of ``_drive_hybrid``, once for each set of arguments.
+    """Evaluate the strategies of ``_drive_hybrid``, or return the evaluation from the cache.
 
-    ``about`` describes the policy that has not converged. It is part of the cache key, so that a training that ends
-    meanwhile replaces a shipped policy.
+    ``about`` describes the policy that has not converged. It is part of the cache key, because a training that is
+    finished meanwhile replaces a shipped policy.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
@@ -77,12 +80,12 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 
 
 def reproduce_illustration(settings: Reproduction) -> Made:
-    """Reproduce harm against the sum of both gaps, for E-V2X-BM, a policy that has not converged, and the hybrid of
-    both.
+    """Reproduce the paper's illustration of its hybrid; return figure, tables and verdicts.
 
-    Returns figure, tables and verdicts. The *hybrid* is the paper's Algorithm 1: it chooses one of the two at the
-    alert. The paper's claim that it "consistently selects the strategy that results in lower harm" is judged in each
-    world and in each group.
+    The figure shows the harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against the
+    sum of both gaps. The *hybrid* is the paper's Algorithm 1: at the alert it chooses E-V2X-BM or the policy. The paper
+    says that it "consistently selects the strategy that results in lower harm". The verdicts check this statement in
+    each world, and in groups of worlds.
     """
     curves, verdicts = {}, []
     for reading in READINGS:
@@ -110,7 +113,7 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
     """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``); return tables and verdicts.
 
-    The paper allows two sets of initial speeds; both are used.
+    The paper does not say which of two sets of initial speeds it used. The results cover both sets.
     """
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),
@@ -144,9 +147,7 @@ def reproduce_hybrid_table(settings: Reproduction) -> Made:
 
 
 def reproduce_random_table(settings: Reproduction) -> Made:
-    """Reproduce collisions, harm and decrease of harm in the random test (``Table:Random``); return tables and
-    verdicts.
-    """
+    """Reproduce the paper's table of the random test (``Table:Random``); return tables and verdicts."""
     episodes, besides = min(_RANDOM_WORLDS, settings.episodes), []
     ours: dict[str, tuple[str, ...]] = {
         "Non-E": (NAMES[FULL_BRAKE],),

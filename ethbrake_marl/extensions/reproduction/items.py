@@ -1,4 +1,4 @@
-"""List of the items of a reproduction (the paper's figures and tables), in the order of the paper."""
+"""Items of a reproduction: the paper's figures and tables, in the order of the paper."""
 
 from __future__ import annotations
 
@@ -109,9 +109,9 @@ ITEMS = (  # in the order of the paper
 
 
 def read_results(folder: Path) -> list[Result]:
-    """Return the results of all items that exist in ``folder``, in the order of the paper.
+    """Return the results that are stored in ``folder``, in the order of the paper.
 
-    Raises ``InvalidInput`` for a damaged result, or a result of another item.
+    Raises ``InvalidInput`` if a result is damaged, or belongs to a different figure or table than its folder.
     """
     files = {item.name: folder / item.name / RESULT for item in ITEMS}
     return [checked_result(read_object(file), file, name) for name, file in files.items() if file.is_file()]

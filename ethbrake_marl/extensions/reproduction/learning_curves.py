@@ -1,4 +1,4 @@
-"""Learning curves: several seeds of several recipes on one scenario, in one folder, with one figure."""
+"""Learning curves: train several recipes with several seeds on one scenario, and draw them in one figure."""
 
 from __future__ import annotations
 
@@ -47,43 +47,47 @@ AXES: dict[Against, tuple[str, str, type]] = {  # column, label of the axis, typ
 
 
 class LearningCurves(NamedTuple):
-    """Trainings of several recipes with several seeds each on one scenario, stored in ``folder/RECIPE-seedK``."""
+    """Trainings of several recipes with several seeds on one scenario. Each is stored in ``folder/RECIPE-seedK``."""
 
     scenario: Scenario  # scenario of all trainings
-    plan: Sequence[tuple[TrainingRecipe, int]]  # recipes, each with its number of seeds: 0, 1, ...
+    plan: Sequence[tuple[TrainingRecipe, int]]  # each recipe with its number of seeds; the seeds are 0, 1, ...
     folder: Path  # folder of the trainings, the figure and the tables
-    against: Against = "steps"  # quantity on the x axis: ``steps`` or ``cpu``
+    against: Against = "steps"  # quantity on the x axis: ``steps`` (of training) or ``cpu`` (processor time)
 
     @staticmethod
     def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
-        """Return recipes with their numbers of seeds from a text such as ``ppo:5,sac:3`` (names or paths).
+        """Read a text such as ``ppo:5,sac:3``; return the recipes with their numbers of seeds.
 
-        Raises ``InvalidInput`` for another form or two recipes of the same name.
+        A recipe is the name of a shipped recipe, or the path of a recipe file. Raises ``InvalidInput`` if the text has
+        another form, or if two recipes have the same name.
         """
         curves = []
         for part in split_names(text, lambda part: os.path.isfile(part.rpartition(":")[0])):
             match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
             if match is None:
-                raise InvalidInput(f"recipes {text!r}: {part!r} must be RECIPE:SEEDS, for instance ppo:5,sac:3")
+                raise InvalidInput(
+                    f"recipes {text!r}: {part!r}: must be RECIPE:SEEDS, a recipe and its number of seeds, for instance"
+                    " ppo:5"
+                )
             curves.append((load_recipe(match[1]), int(match[2])))
         if len({recipe.name for recipe, _ in curves}) < len(curves):
-            raise InvalidInput(f"recipes {text!r}: two recipes have the same name")
+            raise InvalidInput(f"recipes {text!r}: two recipes have the same name; name each recipe once")
         return curves
 
     def train(
         self, *, steps: int | None = None, settings: Sequence[str] = (), jobs: int = 1, tell: OnProgress | None = None
     ) -> bool:
-        """Train every seed of every recipe. Finished trainings are kept, unfinished ones continue.
+        """Train every recipe with every seed. Finished trainings are not repeated; unfinished trainings continue.
 
-        Returns False if Ctrl-C stopped it. Raises ``InvalidInput`` before any training if the folder holds a different
-        training, and the exceptions of ``train_all``.
+        Returns False if Ctrl-C stopped the work. Raises ``InvalidInput`` before any training if the folder contains a
+        different training. Also raises the exceptions of ``train_all``.
 
         Args:
-            steps: training steps of each training; None: the recipe's.
-            settings: ``KEY=VALUE`` changes of scenario and recipe, only to be written to each training's
-                ``config.json``.
-            jobs: number of trainings at a time.
-            tell: called with the progress.
+            steps: number of steps of each training; None: as the recipe says.
+            settings: changes ``KEY=VALUE`` that scenario and recipe already contain; they are recorded in
+                ``config.json`` of each training.
+            jobs: number of trainings that run at the same time.
+            tell: function that receives the progress; None: the progress is not reported.
 
         """
         trainings = [
@@ -104,11 +108,11 @@ class LearningCurves(NamedTuple):
     def write(self) -> dict[str, Any]:
         """Draw the finished trainings, write figure, table and summary to the folder, and return the summary.
 
-        For each recipe the summary has the harm of the policies that the trainings kept, and of their last policies:
-        each is an interquartile mean over seeds, with a stratified bootstrap interval. It also has the hashes of the
-        recipe's fixed list and of the kept policies.
+        The summary contains, for each recipe, the harm of the best policy and of the last policy of the trainings. Each
+        is the interquartile mean over seeds with a stratified bootstrap interval. The summary also contains hashes of
+        the best policies, and of the worlds on which they were compared.
 
-        Raises ``InvalidInput`` if the trainings have no common evaluation step.
+        Raises ``InvalidInput`` if no step exists at which all seeds of a recipe were evaluated.
         """
         scenario, curves, lists = self.scenario, self.curves(), set()
         summary: dict[str, Any] = {
@@ -155,10 +159,10 @@ class LearningCurves(NamedTuple):
         return self.folder / f"{recipe.name}-seed{seed}"
 
     def curves(self) -> dict[str, dict[str, SeedCurve]]:
-        """Return the learning curves: metric -> name of the recipe -> curve over all its seeds.
+        """Return the learning curves: metric -> name of the recipe -> curve with all seeds of the recipe.
 
-        Metrics are the counts of harm that the recipes' rewards use, and the return; a metric without values is left
-        out. If ``against`` is ``cpu``, the x value of a step is the processor time that seeds took to it, on average.
+        The metrics are the return, and each count of harm that the reward of a recipe uses. A metric without values is
+        left out. If ``against`` is ``cpu``, the x values are processor times (s), averaged over the seeds.
         """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
         metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]
@@ -168,7 +172,7 @@ class LearningCurves(NamedTuple):
             spent = [run.cpu_s() for run in runs] if self.against == "cpu" else []
             for metric in curves:
                 values = [run.column(RunDirectory.RETURN if metric == _RETURNED else f"eval/{metric}") for run in runs]
-                if metric != _RETURNED or all(values):  # no episode may have ended in a very short training
+                if metric != _RETURNED or all(values):  # a very short training may end before its first episode does
                     curve = SeedCurve.of(values)
                     each = [np.interp(curve.steps, [*seconds], [*seconds.values()]) for seconds in spent]
                     curves[metric][recipe.name] = replace(curve, steps=np.mean(each, axis=0)) if each else curve

@@ -1,4 +1,4 @@
-"""Make the requested items in their folder."""
+"""Make figures and tables of a reproduction, and store them in its folder."""
 
 from __future__ import annotations
 
@@ -29,34 +29,38 @@ from ethbrake_marl.files.store import write_file, write_output
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items (figures and tables of the paper) with these names, in the order of the paper; if none is named,
-    all.
+    """Return the items (figures and tables of the paper) with these names, in the order of the paper.
 
-    Raises ``UnknownName`` with a suggestion, ``InvalidInput`` for a repeated name.
+    Without names, returns all items. Raises ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput``
+    for a repeated name.
     """
     known = {item.name: item for item in ITEMS}
     for k, name in enumerate(names):
         if name not in known:
             raise unknown_name("item", name, known)
         if name in names[:k]:
-            raise InvalidInput(f"item {name!r} is given twice")
+            raise InvalidInput(f"item {name!r} is given twice; name each item once")
     return [item for item in ITEMS if not names or item.name in names]
 
 
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
-    """Return the folder of a reproduction as a ``StudyFolder``, which continues an earlier one with the same settings.
+    """Return the folder of a reproduction. An earlier reproduction with the same settings in this folder continues.
 
-    ``asked`` are the settings. With ``force`` the results in the folder are deleted; its trainings stay. Raises
-    ``InvalidInput`` if the folder is a link.
+    Raises ``InvalidInput`` if the folder is a symbolic link.
+
+    Args:
+        asked: settings of the reproduction.
+        force: delete the results in the folder; trainings are not deleted.
+
     """
     path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
     if path.is_symlink():
-        raise InvalidInput(f"{path}: is no plain folder; give another (--output)")
+        raise InvalidInput(f"{path}: is a symbolic link; give a folder (--output)")
     if force and (path / SETTINGS).is_file() and read_object(path / SETTINGS).get("format") == FORMAT["format"]:
-        for item in ITEMS:  # figures and data are replaced when the item is made again
+        for item in ITEMS:  # figures and data are overwritten later
             (path / item.name / RESULT).unlink(missing_ok=True)
         write_file(path / SETTINGS, json_text({**FORMAT, **question}))
-    advice = "give another folder (--output), or replace it with force (--force)"
+    advice = "give another folder (--output), or replace its results (--force)"
     return StudyFolder(
         path, "reproduction", question, record=SETTINGS, more=FORMAT, advice=advice, beside=("trainings",),
         writes=("index.html",),
@@ -64,12 +68,16 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 
 
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
-    """Reproduce items (figures and tables of the paper). Return all results in the folder, and whether all trainings
-    ended.
+    """Reproduce items (figures and tables of the paper).
 
-    Items without trainings come first. An existing result from the same trainings is kept. After each item the page is
-    rewritten. Ctrl-C during a training ends all trainings, and items use the finished ones; a second Ctrl-C stops at
-    once. Raises the exceptions of ``open_folder`` and ``StudyFolder.work``.
+    Items without trainings come first. An item is not made again if its result exists and used the same trainings. The
+    page is rewritten after each item.
+
+    Ctrl-C during a training stops all trainings; the items then use the trainings that are finished. A second Ctrl-C
+    stops the work at once.
+
+    Returns all results in the folder, and whether all trainings are finished. Raises the exceptions of ``open_folder``
+    and ``StudyFolder.work``.
 
     Args:
         asked: settings of the reproduction.
@@ -94,9 +102,9 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
 
 
 def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
-    """Reproduce an item; write its figures and data, then its result file, which marks it as complete.
+    """Reproduce an item; write its figures and data, then its result file. The result file marks it as complete.
 
-    ``trained`` names the trainings that it uses, as ``group/recipe``.
+    ``trained`` names the finished trainings of the item, as ``group/recipe``.
     """
     place, started = asked.folder / item.name, time.process_time()
     product = item.make(asked)
@@ -123,7 +131,7 @@ def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
         notes=product.notes,
     )
     if place.is_symlink() or (place.exists() and not place.is_dir()):
-        raise InvalidInput(f"{place}: is no plain folder; move it away")
+        raise InvalidInput(f"{place}: is a symbolic link or a file, but must be a folder; move it away")
     place.mkdir(exist_ok=True)
     for drawn, figure in product.figures.items():
         for ending in (".svg", ".png"):

@@ -1,6 +1,7 @@
 """Sensitivity of the random test to quantities that the paper leaves open.
 
-For each quantity: what the paper says, our default, alternatives, and how far the headline numbers move.
+The result states for each quantity: what the paper says, our default, alternatives, and how much the main results
+change with each alternative.
 """
 
 from __future__ import annotations
@@ -47,24 +48,24 @@ class Alternative:
 
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
-    seed: int | None = None  # seed of the list of worlds; None: the usual one
-    # Harm that is counted: first impacts, all impacts (``total``), harm of the sampled aftermath, or the harm that
-    # E-V2X-BM predicts.
+    seed: int | None = None  # seed of the evaluation list; None: the usual seed
+    # Count of harm: ``first`` (first impacts), ``total`` (all impacts), ``sampled`` (the paper's sum over samples), or
+    # ``predicted`` (the harm that E-V2X-BM predicts).
     harm: Literal["first", "total", "sampled", "predicted"] = "first"
-    # None: PPO drives. Else the paper's hybrid of PPO and E-V2X-BM drives in its place, and this says how the hybrid
-    # finds H*, the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.
+    # None: PPO drives. ``coupled`` or ``pairwise``: the paper's hybrid of PPO and E-V2X-BM replaces PPO. The hybrid
+    # obtains H*, the harm of E-V2X-BM, from a simulation (``coupled``) or from a closed form (``pairwise``).
     bound: Literal["coupled", "pairwise"] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gap:
-    """A quantity that the paper leaves open, or that can be understood in two ways."""
+    """A quantity that the paper does not state, or states ambiguously."""
 
     name: str  # name of the quantity
-    paper: str  # statement of the paper, with the label in its source
+    paper: str  # what the paper says about the quantity, with the label of the place in the paper's source
     ours: str  # our default value
-    alternatives: tuple[Alternative, ...] = ()  # other values that are measured
-    otherwise: str = ""  # reason why no alternative is measured; empty if some are
+    alternatives: tuple[Alternative, ...] = ()  # other values with which the random test is repeated
+    otherwise: str = ""  # reason why there are no alternatives; empty if there are some
 
 
 def _of(key: str, *values: float, unit: str = "") -> tuple[Alternative, ...]:
@@ -122,16 +123,16 @@ _SHOWN = tuple(NAMES[spec] for spec in _SPECS)
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """Main results on a list of n worlds: harm and collisions of each strategy."""
+    """Main results in n worlds: harm and collisions of each strategy."""
 
-    gaps_m: Floats  # [n, P] gaps at the alert, m, to recognise lists of the same worlds
-    harm: Mapping[str, Floats]  # strategy -> harm, [n] m2/s2
-    collided: Mapping[str, Bools]  # strategy -> True for worlds with a collision, [n]
+    gaps_m: Floats  # [n, P] gaps at the alert (m), which show whether two results are for the same worlds
+    harm: Mapping[str, Floats]  # strategy -> [n] harm in each world (m2/s2)
+    collided: Mapping[str, Bools]  # strategy -> [n] whether each world has a collision
 
     def change(self, base: Headline, strategy: str) -> Estimate:
-        """Return the change of a strategy's mean harm against ``base``, m2/s2.
+        """Return a strategy's mean harm here minus its mean harm in ``base``, m2/s2.
 
-        The difference is paired by world if the worlds are the same, else unpaired.
+        The comparison is paired by world if both results are for the same worlds.
         """
         own, other = self.harm[strategy], base.harm[strategy]
         if np.array_equal(self.gaps_m, base.gaps_m):
@@ -140,9 +141,10 @@ class Headline:
 
 
 def reproduce_gaps(settings: Reproduction) -> Made:
-    """Measure how far the results on the random test move when one quantity that the paper leaves open changes.
+    """Measure how much the results of the random test change when one open quantity changes.
 
-    Returns a register of the open quantities, tables, a figure and verdicts.
+    Open quantities are those that the paper does not state, or states ambiguously (``GAPS``). Returns tables, one of
+    which lists all open quantities, a figure and verdicts.
     """
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
@@ -241,10 +243,15 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 
 
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
-    """Evaluate the strategies on the random test under one alternative; return harm and collisions in each world.
+    """Evaluate the strategies on the random test with one alternative; return harm and collisions in each world.
 
-    ``scenario`` is the random test, before the alternative's changes; ``episodes`` is the number of worlds. If the
-    alternative counts predicted harm, strategies without a prediction count with their first-impact harm.
+    If the alternative counts predicted harm, the first-impact harm is used for strategies that predict no harm.
+
+    Args:
+        scenario: scenario of the random test, to which the changes of the alternative are applied.
+        alternative: value of an open quantity.
+        episodes: number of worlds.
+
     """
     own = scenario.replace(**alternative.changes) if alternative.changes else scenario
     agents: dict[str, Agent] = lineup(own, *_SPECS)

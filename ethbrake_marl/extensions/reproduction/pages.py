@@ -1,4 +1,4 @@
-"""Page of a reproduction: one self-contained HTML file. The results as JSON, with figures beside it."""
+"""Output of a reproduction: one self-contained HTML page, and a JSON file with all results."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Return four texts on the results and the run that made them.
+    """Return texts on the results and how they were made.
 
-    These are the lead sentence; the command that makes the results; date, machines and processor time; and a list with
-    a remark if lists are shorter than the paper's, else empty.
+    Returns the first sentence of the page; the command that makes the results; date, machines and processor time; and
+    a list of remarks. The list has one remark if fewer worlds were used than in the paper; else it is empty.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -53,9 +53,9 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 
 
 def render_page(folder: Path, results: Sequence[Result]) -> str:
-    """Return the page with all results as HTML text; ``folder`` holds their figures.
+    """Return the page with all results as HTML text. ``folder`` contains the figures of the results.
 
-    Raises ``InvalidInput`` for a missing figure, or a figure with elements that our figures do not contain.
+    Raises ``InvalidInput`` if a figure is missing, or contains an element that our figures never contain.
     """
     lead, command, count, few = _account(results)
     _, *names = Page.anchors(["Overview", *(result.title for result in results)])
@@ -110,7 +110,7 @@ def _section(folder: Path, result: Result) -> Section:
 
 
 def _outcome(word: str) -> Markup:
-    """Return the outcome of a verdict, such as "agrees", as HTML with a sign and a colour."""
+    """Return the outcome of a verdict, such as "agrees", as HTML with a symbol and a colour."""
     return Markup('<span class="outcome {}">{}</span>').format(word.replace(" ", "-"), word)
 
 
@@ -118,9 +118,15 @@ FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the fi
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the results to ``file`` as JSON, and the figures into a folder ``figures`` beside it.
+    """Write the results to a JSON file, and copies of the figures into a folder ``figures`` beside it.
 
-    Existing files are replaced. ``folder`` holds the figures of the results.
+    Existing files are replaced.
+
+    Args:
+        file: JSON file to write.
+        folder: folder of the reproduction, which contains the figures.
+        results: results to write.
+
     """
     figures = file.parent / FIGURES
     figures.mkdir(exist_ok=True)

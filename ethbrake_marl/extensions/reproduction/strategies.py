@@ -1,4 +1,7 @@
-"""The paper's strategies on its worlds, with the stated latencies and with Vehicle 2 acting at 0.2 s."""
+"""The paper's strategies, and two assumptions on the time at which Vehicle 2 may act.
+
+The assumptions are the latencies that the paper states, and a latency of 0.2 s for Vehicle 2.
+"""
 
 from __future__ import annotations
 
@@ -42,15 +45,13 @@ NAMES = {  # names of the strategies in tables and figures
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """An assumption on the time at which Vehicle 2 may act; the paper allows two."""
+    """An assumption on the time at which Vehicle 2 may act. The paper can be understood in two ways."""
 
     name: str  # name of the assumption
-    acts_s: float | None = None  # time at which Vehicle 2 may act; None: the scenario's latency
+    acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Return the shipped scenario ``name`` under this assumption; ``changes`` replace further keys of the
-        scenario.
-        """
+        """Return the shipped scenario ``name`` with this assumption, and with ``changes`` of its keys."""
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
             return scenario
@@ -62,14 +63,12 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return the agents of ``specs`` (texts such as ``"full_brake"``), by their names in ``NAMES``, or else by spec."""
+    """Return agents by name. ``specs`` are texts such as ``"full_brake"``, which ``NAMES`` maps to longer names."""
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 
 def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
-    """Evaluate every agent on the first ``episodes`` worlds of the scenario's list. ``settings`` receives the
-    progress.
-    """
+    """Evaluate every agent in the first ``episodes`` worlds of a scenario; report the progress to ``settings``."""
     return evaluate(
         scenario.sample(episodes, LIST_SEED),
         agents,
@@ -81,10 +80,10 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 
 
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy, by its name, [n] m2/s2.
+    """Return the first-impact harm of each strategy: name of the strategy -> [n] harm in each world (m2/s2).
 
-    The mapping also has the harm that E-V2X-BM predicts (``PREDICTED``) and the proven lower bound (``PROVEN``), if
-    known.
+    If they are known, two further entries are the harm that E-V2X-BM predicts (``PREDICTED``), and the proven lower
+    bound of the harm (``PROVEN``).
     """
     each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
@@ -96,13 +95,14 @@ def harms(evaluation: Evaluation) -> dict[str, Floats]:
     return each_harm
 
 
-_STAND_IN = "ppo-obstacle"  # shipped policy that replaces an unconverged one without trainings
+_STAND_IN = "ppo-obstacle"  # shipped policy that is used if no policy stopped early was trained
 
 
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
-    """Return a policy in place of the paper's "PPO model obtained from training before convergence occurred".
+    """Return a policy that has not converged, and its description.
 
-    It is the policy that ``--full`` stopped early, or else a shipped policy. Also returns its description.
+    The paper uses a "PPO model obtained from training before convergence occurred". Here it is the policy that
+    ``--full`` stopped early. If this policy does not exist, a shipped policy replaces it.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
@@ -112,10 +112,10 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
 
 
 def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
-    """Return the paper's hybrid (Algorithm 1): at the alert it chooses ``policy`` or E-V2X-BM, whichever expects less
-    harm.
+    """Return the paper's hybrid (Algorithm 1): at the alert it chooses ``policy`` if its harm is at most H*.
 
-    ``bound`` is the harm expected of E-V2X-BM: ``coupled`` simulates it, ``pairwise`` predicts it by a closed form.
+    Otherwise it chooses E-V2X-BM. H* is the harm of E-V2X-BM: simulated (``bound="coupled"``), or predicted by a closed
+    form (``bound="pairwise"``).
     """
     return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
 

@@ -1,4 +1,4 @@
-"""Compare our rows with the paper's tables: what agrees, what differs, and what no strategy can reach."""
+"""Compare our results with the paper's tables: what agrees, what differs, and what no strategy can reach."""
 
 from __future__ import annotations
 
@@ -28,23 +28,25 @@ _UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "
 
 
 def collision_rate(collided: Bools) -> Estimate:
-    """Return the share of worlds with an impact, with its 95 % interval. ``collided`` [n] is True for such worlds."""
+    """Return the share of worlds with an impact, with its 95 % interval. ``collided`` [n] marks these worlds."""
     return rate(int(collided.sum()), len(collided))
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Our results under one assumption on when Vehicle 2 may act, for comparison with the paper's rows."""
+    """Our results with one assumption on when Vehicle 2 may act, for comparison with a table of the paper."""
 
     title: str  # description of the assumption
     evaluation: Evaluation  # outcomes of our strategies
-    ours: Mapping[str, Sequence[str]]  # row of the paper -> our strategies; the first one is compared
+    # strategy in the paper -> strategies of ours that it may mean; the paper's number is compared with the first
+    ours: Mapping[str, Sequence[str]]
 
     @cached_property
     def numbers(self) -> dict[str, dict[str, Estimate]]:
         """Our results: strategy -> quantity (such as "collision rate") -> estimate.
 
-        The key "least possible (proven)" (``NOBODY``), if present, holds the proven minimum over all strategies.
+        If proofs exist, the further key "least possible (proven)" (``NOBODY``) has the proven lower bounds for all
+        strategies.
         """
         numbers, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
@@ -63,9 +65,9 @@ class Beside:
         return numbers
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield all results of ours that a number in the paper may mean, each as (name, estimate).
+        """Yield our results that a number in the paper may mean, each as (name, estimate).
 
-        The first one is compared with the paper's number; the others are named if it differs.
+        The paper's number is compared with the first result. If they differ, the verdict names the nearest result.
 
         Args:
             row: name of the strategy in the paper.
@@ -83,9 +85,12 @@ class Beside:
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """Return a verdict on each printed number, once for each of ``besides`` (our results under one assumption).
+    """Return a verdict on each number in a table of the paper, for each of ``besides``.
 
-    ``printed`` are the rows of the paper's table.
+    Args:
+        printed: rows of the paper's table.
+        besides: our results, one entry for each assumption on when Vehicle 2 may act.
+
     """
     verdicts = []
     for beside in besides:
@@ -93,7 +98,7 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
         for row in printed:
             numbers = {_RATE: row.collision_rate, _MEAN_HARM: row.average_harm, _DECREASE: row.harm_decrease}
             for quantity, number in numbers.items():
-                if not number:  # 0 is the baseline's decrease; None is not printed
+                if not number:  # 0: decrease of the baseline itself; None: the paper prints no number
                     continue
                 (_, ours), *own = beside.candidates(row.agent, quantity)
                 others = [other.candidates(row.agent, quantity) for other in besides if other is not beside]
@@ -111,10 +116,16 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Return a verdict: can a choice between two strategies, world by world, avoid as many collisions as printed?
+    """Return a verdict: can a strategy that chooses one of two others per world avoid as many collisions as printed?
 
-    It avoids a collision only where one of the two strategies does, so at most as many as both together. ``one`` and
-    ``other`` are the paper's rows of the two strategies, ``chosen`` is its row of the choice.
+    It avoids a collision only in worlds in which one of the two others avoids it. It therefore avoids at most as many
+    collisions as the two others together.
+
+    Args:
+        one: row of the paper's table for the first strategy.
+        other: row for the second strategy.
+        chosen: row for the strategy that chooses one of the two.
+
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
     together = avoided[0] + avoided[1]
@@ -127,9 +138,14 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Return a verdict: does the decrease of harm printed in ``row`` follow from the harms printed in both rows?
+    """Return a verdict: does the printed decrease of harm follow from the printed harms?
 
-    ``baseline`` is the row to which the decrease refers. The two must agree within 0.01 percentage points.
+    The printed and the computed decrease must agree within 0.01 percentage points.
+
+    Args:
+        row: row of the paper's table with the decrease.
+        baseline: row to whose harm the decrease refers.
+
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
     printed = row.harm_decrease or 0.0
@@ -141,7 +157,7 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
 
 
 def rows_table(beside: Beside) -> Sheet:
-    """Return the table of our results under one assumption (``beside``), with the proven minimum."""
+    """Return a table of our results with one assumption (``beside``), with the proven lower bounds."""
     columns: dict[str, Column | str] = {
         _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
         _DECREASE: replace(PERCENT, heading="Harm decrease"),
@@ -161,15 +177,15 @@ def beside_printed(
     parameters: Sequence[Parameter],
     notes: Sequence[str] = (),
 ) -> Made:
-    """Return an item that compares a table of the paper with our results.
+    """Return the comparison of a table of the paper with our results: verdicts, tables and data.
 
     Args:
-        stem: name of its data file without ending.
+        stem: name of the data file without ending.
         printed: rows of the paper's table.
         besides: our results, one entry for each assumption on when Vehicle 2 may act.
-        arithmetic: verdicts on the printed numbers alone.
-        parameters: quantities that affect the item.
-        notes: sentences on what was run and what was not.
+        arithmetic: verdicts that use the printed numbers only.
+        parameters: quantities that affect the result.
+        notes: sentences that say what was run and what was not.
 
     """
     columns: dict[str, list[str]] = {

@@ -1,7 +1,6 @@
-"""The trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, and open reward weights.
+"""Trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, and open settings of training.
 
-Each group is a folder of learning curves (``learning_curves.LearningCurves``): finished trainings are kept, unfinished
-ones continue.
+A group of trainings is one folder of learning curves (``learning_curves.LearningCurves``).
 """
 
 from __future__ import annotations
@@ -26,15 +25,15 @@ _STATED_STATE = (  # the paper's state: positions and speeds of all vehicles, an
 
 @dataclass(frozen=True, slots=True)
 class TrainedRecipe:
-    """A training recipe with a number of decisions, and how often it is evaluated."""
+    """A training recipe, the length of the training, and how often the policy is evaluated."""
 
     recipe: str  # name of a shipped recipe
     decisions: int  # length of the training, in decisions
     every_updates: int  # number of updates between two evaluations
-    per_s: int  # decisions per second of one core (Intel Xeon), to estimate the cost
+    per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Return the recipe, renamed to ``name``, with these settings and with ``changes`` of further keys."""
+        """Return the recipe with the name ``name``, with these settings, and with ``changes`` of further keys."""
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}
         if "log_every_updates" in type(recipe).model_fields:  # otherwise the table has a row for every update
@@ -44,22 +43,22 @@ class TrainedRecipe:
 
 PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 5_000)
 
-EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the recipe's decisions
+EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the decisions of recipe ``ppo``
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Trainings on one scenario in one folder, in the order in which they run."""
+    """Trainings of several recipes on one scenario, stored in one folder."""
 
-    name: str  # name of the group and of its folder
+    name: str  # name of the group; also the name of its folder
     scenario: str  # name of a shipped scenario
-    # name of the recipe in the group -> its settings, and the recipe itself
+    # name of the recipe in the group -> settings of the training, and the recipe
     trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]
-    seeds: int  # number of seeds of each recipe, from 0 on
+    seeds: int  # number of seeds of each recipe; the seeds are 0, 1, ...
 
 
 def groups() -> dict[str, Group]:
-    """Return every group of trainings by its name, the quickest first, so that first results exist early."""
+    """Return all groups of trainings by name, in the order in which they run: the quickest group first."""
     base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
     changed = {
         "risk-0": {"risk": 0.0},
@@ -77,7 +76,7 @@ def groups() -> dict[str, Group]:
         trained = {each.recipe: (each, each.load(each.recipe)) for each in recipes}
         return [Group(f"{delay}{suffix}", f"paper-delay-{delay}", trained, 3) for delay in CURVES]
 
-    found = [
+    every = [
         Group(STOPPED, "paper-random", {"ppo-stopped": (EARLY, EARLY.load("ppo-stopped"))}, 1),
         *curves("", TrainedRecipe("ppo", 400_000, 4, 16_000), TrainedRecipe("sac", 60_000, 30, 3_000)),
         *curves("-ppo-paper", PPO_PAPER),
@@ -86,4 +85,4 @@ def groups() -> dict[str, Group]:
         ),
         *curves("-sac-paper", TrainedRecipe("sac-paper", 20_000, 1_000, 170)),
     ]
-    return {group.name: group for group in found}
+    return {group.name: group for group in every}

@@ -1,4 +1,7 @@
-"""The paper's Scenarios 1 and 2: trajectories (``Fig:pic5sim``) and acceleration profiles (``Fig:pic5act``)."""
+"""Reproduce the paper's figures of its Scenarios 1 and 2.
+
+These are the trajectories (``Fig:pic5sim``) and the acceleration profiles (``Fig:pic5act``).
+"""
 
 from __future__ import annotations
 
@@ -47,14 +50,11 @@ _SCENARIOS = (1, 2)
 
 _CELLS = [(reading, number) for reading in READINGS for number in _SCENARIOS]
 
-Records = dict[tuple[Reading, int, str], EpisodeRecord]  # by reading, scenario and strategy
+Records = dict[tuple[Reading, int, str], EpisodeRecord]  # (assumption, number of the scenario, strategy) -> episode
 
 
 def reproduce_trajectories(settings: Reproduction) -> Made:
-    """Reproduce the vehicles' positions in the paper's Scenarios 1 and 2, on the road and over time.
-
-    Returns figures, a table and verdicts.
-    """
+    """Reproduce the trajectories in the paper's Scenarios 1 and 2; return figures, a table and verdicts."""
     records, figures, verdicts = _record_all(settings), {}, []
     for reading, stem in zip(READINGS, ("stated", "early"), strict=True):
         own = {f"{name}, Scenario {k}": records[reading, k, name] for name in _POLICIES for k in _SCENARIOS}
@@ -145,9 +145,9 @@ def _record_all(settings: Reproduction) -> Records:
 
 @cache
 def play() -> Part:
-    """Return the player of episodes for the page: Scenarios 1 and 2, with both assumptions on when Vehicle 2 may act.
+    """Return an interactive player of the episodes in Scenarios 1 and 2, as a part of the page.
 
-    It shows PPO and SAC side by side.
+    It first shows PPO and SAC side by side. The episodes use both assumptions on when Vehicle 2 may act.
     """
     records = []
     for reading, number in _CELLS:
@@ -174,16 +174,16 @@ def _parameters() -> list[Parameter]:
 
 
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
-    """Return one column of PPO's and of SAC's record at equal times until the later one ends.
+    """Return one recorded quantity under PPO and under SAC, at the same times.
 
-    The record that ends first keeps its last value.
+    The times end when the longer episode ends. The last value of the shorter episode is repeated until then.
 
     Args:
-        records: recorded episodes by assumption, scenario and strategy.
+        records: recorded episodes.
         reading: assumption on when Vehicle 2 may act.
         number: number of the scenario, 1 or 2.
-        what: array of the record, for instance ``gaps_m``.
-        column: index of its column.
+        what: name of an array of the record, for instance ``gaps_m``.
+        column: index of a column of this array.
 
     """
     pair = [records[reading, number, name] for name in _POLICIES]
@@ -193,22 +193,25 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 
 
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
-    """Return the root mean square difference between Vehicle 2 under PPO and under SAC, for Scenarios 1 and 2.
+    """Return the root mean square difference of a quantity of Vehicle 2 between PPO and SAC, for Scenarios 1 and 2.
 
-    ``what`` is the compared array of the records, for instance ``positions_m``; ``reading`` is the assumption on when
-    Vehicle 2 may act.
+    Args:
+        records: recorded episodes.
+        reading: assumption on when Vehicle 2 may act.
+        what: name of the quantity's array in the records, for instance ``positions_m``.
+
     """
     pairs = (_both(records, reading, number, what, 1) for number in _SCENARIOS)
     return [float(np.sqrt(np.mean((one - other) ** 2))) for one, other in pairs]
 
 
 def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Column) -> list[Verdict]:
-    """Return a verdict on each claim about one world, without intervals.
+    """Return a verdict on each claim about a single world. The numbers have no intervals.
 
     Args:
-        claims: claim -> text with the numbers, number that should be smaller, number that should be larger.
+        claims: claim -> text with both numbers, the number that the claim says is smaller, and the larger number.
         reading: assumption on when Vehicle 2 may act, for the text of the verdict.
-        show: format of the difference.
+        show: format of the difference of the two numbers.
 
     """
     return [
@@ -218,10 +221,10 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 
 
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return Vehicle 2's first command, the sum of the sizes of its changes of command (both m/s2), and its share of
-    braking.
+    """Return three numbers on the commands of Vehicle 2.
 
-    The share of braking is over the time until its standstill, from 0 to 1.
+    They are its first command (m/s2), the sum of the absolute changes of its command (m/s2), and the share (0 to 1) of
+    the time in which it brakes while it moves.
     """
     acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
     command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0

@@ -1,9 +1,14 @@
 """Verdicts on the paper's numbers and statements, computed from our results.
 
-A printed number *agrees* with ours if they differ by no more than chance between two lists of worlds, or by no more
-than ``TOLERANCE`` of the printed number. It is *undecided* if chance alone is more than ``WIDE`` of it. It *cannot
-agree* if a bound for all strategies lies beyond it by more than chance. A statement agrees if all its comparisons come
-out as it says; it is undecided if one does not, but its interval contains 0.
+*Chance* is the difference that two random lists of worlds may have by chance. A number that the paper prints
+
+- *agrees* with ours if the two differ by no more than chance, or by no more than ``TOLERANCE`` of the printed number;
+- is *undecided* if they differ by no more than chance, but chance is more than ``WIDE`` of the number;
+- *cannot agree* if a proven bound for all strategies excludes it by more than chance;
+- *differs* in all other cases.
+
+A statement of the paper *agrees* if the interval of every comparison supports it. It is *undecided* if the intervals of
+all other comparisons contain 0.
 """
 
 from __future__ import annotations
@@ -20,11 +25,11 @@ from ethbrake_marl.evaluation.statistics import mean, paired_difference, unpaire
 from ethbrake_marl.files.sheet import Column, Estimate
 from ethbrake_marl.physics.state import Floats
 
-Judgement = Literal["cannot agree", "differs", "undecided", "not run", "agrees"]  # the worst first
+Judgement = Literal["cannot agree", "differs", "undecided", "not run", "agrees"]  # in this order, the worst first
 
 TOLERANCE = 0.02  # allowed difference, as a share of the printed number
 
-WIDE = 0.15  # largest chance, as a share of the printed number, with which a comparison is decided
+WIDE = 0.15  # limit of chance, as a share of the number; above it, a small difference is undecided
 
 HOW_JUDGED = (
     "Every verdict is computed: a number agrees where it is within the chance between two lists of worlds or"
@@ -38,14 +43,13 @@ WRITTEN = ConfigDict(strict=True, extra="forbid")  # for types that are read fro
 
 @model(frozen=True, config=WRITTEN)
 class Verdict:
-    """Outcome of one comparison with the paper, and the numbers behind it."""
+    """Outcome of one comparison with the paper, and the numbers that explain the outcome."""
 
     what: str  # what was compared
     outcome: Judgement  # ``agrees``, ``differs``, ``undecided``, ``cannot agree`` or ``not run``
-    because: str  # the numbers behind the outcome, as text
+    because: str  # text with the numbers that explain the outcome
 
 
-# Formats of quantities.
 HARM = Column("Harm")
 
 PERCENT = Column("Collision rate", digits=1, scale=100.0, unit=" %")
@@ -65,10 +69,11 @@ def compare_number(
     Args:
         what: name of the number.
         printed: the paper's number.
-        ours: the same quantity in our results, with its interval over worlds.
+        ours: the same quantity in our results, with its 95 % interval.
         show: format of both numbers.
-        least: description and value of a proven lower bound over our list for all strategies; None: no bound.
-        others: the same quantity under other assumptions, by description; if ours differs, the nearest one is named.
+        least: description and value of a proven lower bound for all strategies in our worlds; None: no bound.
+        others: description -> the same quantity with another assumption. If our number differs from the printed number,
+            the verdict names the nearest of these quantities.
 
     """
     text = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
@@ -92,10 +97,10 @@ def compare_number(
 
 
 def _off(printed: float, ours: Estimate) -> str:
-    """Return a text on how far ``ours`` is from the printed number, such as "+3.1 %"; empty if the two agree.
+    """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; empty if the two agree.
 
-    They agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance (see
-    ``_chance``). Chance does not count if it is above 15 % of the larger number (``WIDE``).
+    The two numbers agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance
+    (``_chance``). Chance is ignored if it is more than 15 % of the larger number (``WIDE``).
     """
     chance = _chance(ours)
     off = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
@@ -105,9 +110,9 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return by how much this estimate and that of another list of as many worlds may differ by chance.
+    """Return by how much this estimate may differ by chance from an estimate for other worlds (as many).
 
-    It is sqrt(2) times the half-width of the interval.
+    The result is sqrt(2) times half the width of the 95 % interval.
     """
     low, high = estimate.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
@@ -115,31 +120,36 @@ def _chance(estimate: Estimate) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """Difference of two quantities, as evidence for or against a statement that the first is smaller than the second.
+    """Comparison of two quantities, as evidence on a statement that the first is smaller than the second.
 
-    A statement can need several of them, for example one for each group of worlds.
+    A statement can need several comparisons, for example one for each group of worlds.
     """
 
-    where: str  # worlds or strategies that are compared, in words
-    difference: Estimate  # smaller quantity minus larger one; below 0 if the statement is right
-    neither: bool = False  # True if both are 0 in every world, so that nothing is left to compare
-    # proven lower bound minus the larger quantity; above 0, no strategy can make the statement right. None: no bound
+    where: str  # text that says which worlds or strategies are compared
+    difference: Estimate  # quantity that should be smaller, minus the other one; below 0 if the statement is right
+    neither: bool = False  # True if both quantities are 0 in every world
+    # proven lower bound of all strategies, minus the quantity that should be larger. If it is above 0, the statement
+    # cannot be right for any strategy. None: no bound
     least: Estimate | None = None
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Compare two samples from different worlds: is ``smaller`` [n] below ``larger`` [m] on average?
+        """Compare the means of two independent samples: is the mean of ``smaller`` [n] below that of ``larger`` [m]?
 
-        ``where`` says in words what is compared.
+        ``where`` is a text that says what is compared.
         """
         return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
 
     @classmethod
     def of_harms(cls, where: str, harm: Mapping[str, Floats], smaller: str, larger: str) -> Less:
-        """Compare the harm of two strategies in the same worlds, with the proven lower bound.
+        """Compare the harm of two strategies in the same worlds, and with the proven lower bound if it is known.
 
-        ``harm`` maps strategies to their harm [n]; ``smaller`` and ``larger`` are names of strategies; ``where``
-        describes the comparison.
+        Args:
+            where: text that says what is compared.
+            harm: name of the strategy -> [n] harm in each world.
+            smaller: name of the strategy whose harm should be smaller.
+            larger: name of the strategy whose harm should be larger.
+
         """
         low, high = harm[smaller], harm[larger]
         least = paired_difference(harm[PROVEN], high) if PROVEN in harm else None
@@ -147,12 +157,12 @@ class Less:
 
 
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
-    """Return a verdict on a statement of the paper: it agrees if the interval of every comparison lies below 0.
+    """Return a verdict on a statement of the paper. It agrees if the interval of every comparison is below 0.
 
     Args:
         what: the statement.
-        parts: its comparisons.
-        or_equal: True: a difference of 0 also agrees.
+        parts: comparisons that the statement needs.
+        or_equal: True: intervals that end at 0 agree, too.
         show: format of the differences.
 
     """
@@ -186,7 +196,10 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
 
 
 def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
-    """Return one verdict on an item from all its verdicts: the number of each outcome, and the first of the worst."""
+    """Combine all verdicts on a figure or table into one: the worst outcome, and the number of each outcome.
+
+    The text also quotes the first verdict with the worst outcome.
+    """
     if not verdicts:
         return Verdict("all", "not run", "nothing was compared")
     counted = {outcome: sum(each.outcome == outcome for each in verdicts) for outcome in get_args(Judgement)}

@@ -35,47 +35,47 @@ PERIODIC = load_scenario("cooperation-2-paper").replace(v2x={"preset": "blocked"
 WORLD = one_line([10.0, 8.0], [20.0, 18.0, 39.9], [8, 6, 5], [0, 0.4, 0.7], driving=2.0, mass=[1, 2, 4])
 
 UNCERTAINTIES: dict[str, Callable[[], object]] = {
-    "uncertainty: '': entry 1 is empty; it must be quantity=half-width": lambda: parse_uncertainty(""),
+    "uncertainty: '': entry 1 is empty; must be quantity=half-width": lambda: parse_uncertainty(""),
     "uncertainty: 'latency_s': must be quantity=half-width, for instance braking_capacity_mps2=5%": lambda: (
         parse_uncertainty("latency_s")
     ),
     "uncertainty: 'latency_s=-0.1': must be quantity=half-width": lambda: parse_uncertainty("latency_s=-0.1"),
     "uncertainty: 'latency_s=nan': must be quantity=half-width": lambda: parse_uncertainty("latency_s=nan"),
-    "uncertainty: latency_s: half-width inf: must be a number, at least 0": lambda: parse_uncertainty(
-        "latency_s=1e999"
-    ),
-    "uncertainty: latency_s: half-width 1.0: must be a share from 0": lambda: parse_uncertainty("latency_s=100%"),
+    "uncertainty: latency_s: half-width = inf: must be a finite number": lambda: parse_uncertainty("latency_s=1e999"),
+    "uncertainty: latency_s: half-width = 1.0: must be a share from 0": lambda: parse_uncertainty("latency_s=100%"),
     "uncertainty: 'latency_s.vehicle_0=0.1': must be quantity=half-width": lambda: parse_uncertainty(
         "latency_s.vehicle_0=0.1"
     ),
-    "uncertainty: 'latency_s.pair_1=0.1': gaps_m is limited by .pair_1, any other quantity by .vehicle_1": lambda: (
-        parse_uncertainty("latency_s.pair_1=0.1")
+    "uncertainty: 'latency_s.pair_1=0.1': only gaps_m takes a pair, as in gaps_m.pair_1": lambda: parse_uncertainty(
+        "latency_s.pair_1=0.1"
     ),
-    "uncertainty: latency_s=0.1 and latency_s=0.2 speak of the same quantity; give each once": lambda: (
-        parse_uncertainty("latency_s=0.1,latency_s=0.2")
+    "uncertainty: latency_s=0.1 and latency_s=0.2 are intervals of the same quantity": lambda: parse_uncertainty(
+        "latency_s=0.1,latency_s=0.2"
     ),
-    "uncertainty: latency_s=0.1 and latency_s.vehicle_2=0.2 speak of the same quantity; give each once": lambda: (
+    "uncertainty: latency_s=0.1 and latency_s.vehicle_2=0.2 are intervals of the same quantity": lambda: (
         parse_uncertainty("latency_s=0.1,latency_s.vehicle_2=0.2")
     ),
-    "uncertainty: mass_t.vehicle_4=0.1: the line has only 3 of these": lambda: parse_uncertainty(
+    "uncertainty: mass_t.vehicle_4=0.1: the line has only 3 vehicles": lambda: parse_uncertainty(
         "mass_t.vehicle_4=0.1"
     ).members(WORLD),
-    "uncertainty: mass_t=1: the value 1 of vehicle_1 in world 0 may be as low as 0; it must stay above 0": lambda: (
+    "uncertainty: mass_t=1: the value 1 of vehicle_1 in world 0 may be as low as 0; must be above 0": lambda: (
         parse_uncertainty("mass_t=1").members(WORLD)
     ),
     "=1e+308: the value 10 of vehicle_1 to vehicle_2 in world 0 may be as high as 1e+308; must be finite": lambda: (
         parse_uncertainty("gaps_m=1e308").members(WORLD)
     ),
-    "11 uncertain numbers in each world make 2048 corners; at most 1024 can be certified: name vehicles": lambda: (
+    "11 uncertain numbers in each world make 2048 corners; must be at most 1024 corners: limit": lambda: (
         parse_uncertainty("latency_s=0.1,mass_t=0.1,speeds_mps=1,gaps_m=1").members(WORLD)
     ),
-    "uncertainty: no interval; one": lambda: Uncertainty(()),
-    "must be a tuple of Interval; parse_uncertainty reads it": lambda: Uncertainty("gaps_m=0.5"),
-    "uncertainty: latency_s: half-width -1.0: must be a number, at least 0": lambda: Interval("latency_s", -1.0),
-    "uncertainty: gaps_m: half-width True: must be a number, at least 0": lambda: Interval("gaps_m", True),
-    "uncertainty: gaps_m: place 0.5: must be an index from 0": lambda: Interval("gaps_m", 0.5, place=0.5),
-    "uncertainty: gaps_m: place -1: must be an index from 0": lambda: Interval("gaps_m", 0.5, place=-1),
-    "uncertainty = 0.1: must be an Uncertainty or text": lambda: checked_uncertainty(0.1),
+    "uncertainty: no interval; must have at least one": lambda: Uncertainty(()),
+    "must be a tuple of Interval objects": lambda: Uncertainty("gaps_m=0.5"),
+    "uncertainty: latency_s: half-width = -1.0: must be a finite number": lambda: Interval("latency_s", -1.0),
+    "uncertainty: gaps_m: half-width = True: must be a finite number": lambda: Interval("gaps_m", True),
+    "uncertainty: gaps_m: place = 0.5: must be an index of a vehicle or pair": lambda: Interval(
+        "gaps_m", 0.5, place=0.5
+    ),
+    "uncertainty: gaps_m: place = -1: must be an index of a vehicle or pair": lambda: Interval("gaps_m", 0.5, place=-1),
+    "uncertainty = 0.1: must be an Uncertainty or a text": lambda: checked_uncertainty(0.1),
 }
 
 
@@ -89,50 +89,50 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: make_agent(
         "full_brake+robust", scenario=PAIR
     ),
-    "agent 'coast+step:estimated+robust': +search comes first and once, then one shield of +episode": lambda: (
+    "agent 'coast+step:estimated+robust': must have at most one +search, then at most one shield (+episode": lambda: (
         make_agent("coast+step:estimated+robust", scenario=PERIODIC)
     ),
-    "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated decides on what was received itself": lambda: (
-        make_agent("e_v2x_bm:estimated+episode:estimated", scenario=PERIODIC)
+    "agent 'e_v2x_bm:estimated+episode:estimated': e_v2x_bm:estimated already decides on received": lambda: make_agent(
+        "e_v2x_bm:estimated+episode:estimated", scenario=PERIODIC
     ),
-    "shield: robust interior: total harm: it certifies first-impact harm of at most 3 vehicles without": lambda: (
-        make_agent("coast+robust:interior:estimated", scenario=PERIODIC, harm_count="total")
+    "shield: robust interior: total harm: cannot be certified; use robust corners": lambda: make_agent(
+        "coast+robust:interior:estimated", scenario=PERIODIC, harm_count="total"
     ),
-    "shield: robust interior: an obstacle ahead: it certifies first-impact harm": lambda: make_agent(
+    "shield: robust interior: an obstacle ahead: cannot be certified": lambda: make_agent(
         "coast+robust:interior:estimated", scenario=PERIODIC.replace(obstacle_gap_m=60.0)
     ),
-    "shield: robust interior: 5 vehicles: it certifies first-impact harm of at most 3 vehicles": lambda: RobustShield(
-        line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior"
+    "shield: robust interior: 5 vehicles: cannot be certified; use robust corners, or first-impact harm of": lambda: (
+        RobustShield(line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
     ),
-    "shield: mode step takes no uncertainty; robust does": lambda: ShieldOptions(mode="step", uncertainty="gaps_m=1"),
-    "shield: robust = 'interior': mode step takes none; robust does": lambda: ShieldOptions(
+    "shield: mode step takes no uncertainty; must be mode robust": lambda: ShieldOptions(
+        mode="step", uncertainty="gaps_m=1"
+    ),
+    "shield: robust = 'interior': not a setting of mode step; use mode robust": lambda: ShieldOptions(
         mode="step", robust="interior"
     ),
-    "shield: allowance = 5.0: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: allowance = 5.0: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", allowance=5.0
     ),
-    "shield: logging = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: logging = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", logging=True
     ),
-    "shield: shares = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: shares = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", shares=True
     ),
-    "shield: estimated = True: mode episode takes none; step and robust do": lambda: ShieldOptions(
+    "shield: estimated = True: not a setting of mode episode; use mode step or robust": lambda: ShieldOptions(
         mode="episode", estimated=True
     ),
-    "not together with estimated = True, which certifies against": lambda: ShieldOptions(estimated=True, allowance=1.0),
-    "shield: cap = 'baseline': not together with estimated = True": lambda: ShieldOptions(
-        estimated=True, cap="baseline"
-    ),
-    "shield: uncertainty = 'gaps_m=0.5': not together with estimated = True": lambda: ShieldOptions(
+    "shield: allowance = 1.0: must be 0.0 if estimated = True": lambda: ShieldOptions(estimated=True, allowance=1.0),
+    "shield: cap = 'baseline': must be None if estimated = True": lambda: ShieldOptions(estimated=True, cap="baseline"),
+    "shield: uncertainty = 'gaps_m=0.5': must be None if estimated = True": lambda: ShieldOptions(
         estimated=True, mode="robust", uncertainty="gaps_m=0.5"
     ),
     "shield: estimated = 'yes': must be True or False": lambda: ShieldOptions(estimated="yes"),
     "ShieldedEnv: mode robust needs an uncertainty, for instance braking_capacity_mps2=5%": lambda: ShieldedEnv(
         EthBrakeEnv(), mode="robust"
     ),
-    "HybridShield: estimated = True: shields one learner, not several; pass learners=['vehicle_2']": lambda: (
-        HybridShield(parallel_env(PAIR), mode="step", estimated=True)
+    "HybridShield: estimated = True: shields only one learner; pass one": lambda: HybridShield(
+        parallel_env(PAIR), mode="step", estimated=True
     ),
 }
 
@@ -170,18 +170,14 @@ def test_name__is_unknown(message: str) -> None:
 
 def test_mixture__estimated_agents_need_one_of_its_scenarios() -> None:
     members = [{"scenario": load_scenario(name).declared()} for name in ("paper-random", "paper-random-brake-only")]
-    with refused(
-        "is a mixture, and a vehicle that is not known could be of any of paper-random, paper-random-brake-only"
-    ):
+    with refused("is a mixture: an unknown vehicle could belong to any of paper-random, paper-random-brake-only"):
         ShieldedEnv(EthBrakeEnv(Scenario(name="mixed", mixture=members)), estimated=True)
 
 
 def test_estimated_worlds__that_leave_too_much_open_are_refused() -> None:
     wide = {"braking_capacity_mps2": {"uniform": [3, 9]}, "mass_t": {"uniform": [2, 9]}, "driving_capacity_mps2": 3.0}
     wide = PAPER.replace(vehicles=4, latency_s=0.1, v2x="nominal", roles={"vehicle_2": "learner"}, **wide)
-    with refused(
-        "leaves 14 numbers of the other vehicles open, which make 16384 corners; at most 1024 can be certified"
-    ):
+    with refused("has 14 uncertain numbers of other vehicles, which make 16384 corners; must be at most 1024 corners"):
         make_agent("coast+robust:estimated", scenario=wide)
 
 
@@ -204,21 +200,23 @@ def test_interior__takes_no_brakes_that_began_to_build_up_before() -> None:
 def test_interior__takes_no_script_that_it_cannot_enclose() -> None:
     roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "e_v2x_bm:pairwise"}
     gentle = PAPER.replace(early_impacts="keep", roles=roles)
-    with refused(
-        "vehicle_3 is controlled by 'e_v2x_bm:pairwise', which it cannot enclose; full_brake, coast and constant:A"
-    ):
+    with refused("vehicle_3 follows 'e_v2x_bm:pairwise'; must be full_brake, coast or constant:A"):
         RobustShield(gentle, 1, uncertainty=parse_uncertainty("gaps_m.pair_1=0.1"), robust="interior")
 
 
 def test_interior__takes_no_command_beyond_the_least_capacity() -> None:
     weak = line(3).replace(braking_capacity_mps2=[6.0, 6.0, 5.2])  # vehicle_3 holds 5 m/s2, which 4.68 cannot
     shield = RobustShield(weak, 1, uncertainty=parse_uncertainty("braking_capacity_mps2=10%"), robust="interior")
-    with refused("uncertainty: braking_capacity_mps2=10%: agent 'constant:5': above the braking capacity 4.68 m/s2"):
+    with refused(
+        "uncertainty: braking_capacity_mps2=10%: agent 'constant:5': brakes harder than the braking capacity of 4.68"
+    ):
         shield.begin(weak.sample(1, 0).worlds, np.arange(1))
 
 
 def test_uncertainty__is_for_an_agent_that_certifies_against_it() -> None:
-    with refused("uncertainty gaps_m=1: nobody uses it; an agent with +robust does: ppo@PATH+robust"):
+    with refused(
+        "uncertainty gaps_m=1: none of the agents uses an uncertainty; agents with +robust do: ppo@PATH+robust"
+    ):
         make_lineup(["coast"], PAPER, uncertainty="gaps_m=1")
 
 
@@ -226,19 +224,19 @@ SLOW = PAPER.replace(brake_rate_mps3=9)
 PIECES = PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"})
 AGENTS: dict[str, Callable[[], object]] = {
     "agent 'ppo+robust': mode robust needs an uncertainty": lambda: make_agent("ppo+robust", scenario=PAPER),
-    "agent 'e_v2x_bm:estimated': needs a scenario: make_agent('e_v2x_bm:estimated'": lambda: make_agent(
+    "agent 'e_v2x_bm:estimated': needs a scenario, for instance make_agent('e_v2x_bm:estimated'": lambda: make_agent(
         "e_v2x_bm:estimated"
     ),
-    "scenario 'mixture-delays': is a mixture, and a vehicle that is not known could be of any": lambda: make_agent(
+    "scenario 'mixture-delays' is a mixture: an unknown vehicle could belong to any": lambda: make_agent(
         "e_v2x_bm:estimated", scenario=eb.load_scenario("mixture-delays")
     ),
-    ":estimated: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and nothing exact": lambda: evaluated(
+    ":estimated: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and the result": lambda: evaluated(
         make_agent("full_brake+step:estimated", scenario=SLOW), SLOW
     ),
-    ":estimated: a vehicle of world 0 brakes in pieces (profile), and nothing exact is known for these": lambda: (
-        evaluated(make_agent("full_brake+step:estimated", scenario=PIECES), PIECES)
+    ":estimated: a vehicle of world 0 brakes in pieces (profile), and the result would not be exact": lambda: evaluated(
+        make_agent("full_brake+step:estimated", scenario=PIECES), PIECES
     ),
-    "shield: robust interior: vehicle_1 is controlled by 'profile:0=3,1=5', which it cannot enclose": lambda: evaluated(
+    "shield: robust interior: vehicle_1 follows 'profile:0=3,1=5'; must be full_brake": lambda: evaluated(
         make_agent("full_brake+robust:interior", scenario=PIECES, uncertainty="latency_s=0.1"), PIECES
     ),
 }
@@ -258,7 +256,7 @@ def test_team__goes_behind_no_robust_shield(monkeypatch) -> None:
     team = Team.of(make_agent("coast"), [1, 2])
     entry = Entry("team", "team@RUN", "", (), lambda argument, settings: team)
     monkeypatch.setitem(registry.AGENTS.loaded, "team", entry)
-    with refused("'team@run+robust': is a team, and +robust is for one controlled vehicle"):
+    with refused("'team@run+robust': +robust works for one controlled vehicle only, not for a team"):
         make_lineup(["team@run+robust"], PAIR)
 
 

@@ -82,7 +82,7 @@ def test_step__in_the_middle_promises_nothing_where_a_piece_is_missing() -> None
 def test_field__a_controller_refuses_to_do_without_what_it_reads() -> None:
     for without in ("place", "speed", "acceleration"):
         lacking = telling([piece for piece in USUAL_PIECES if piece != without])
-        with pytest.raises(InvalidInput, match=f"agent 'acc': vehicle_1 does not tell its {without}"):
+        with pytest.raises(InvalidInput, match=f"agent 'acc': messages of vehicle_1 do not contain its {without}"):
             drive(lacking.sample(2, 7).worlds, make_agent("acc", scenario=lacking), lacking, 1)
     sees = {"link_latency_s": 0.3, "senses": "front", "sensing_s": [0.0, 0.0]}
     harms = [

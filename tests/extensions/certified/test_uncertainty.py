@@ -220,7 +220,7 @@ FRICTION: dict[str, Callable[[], object]] = {
     "uncertainty: friction=0.1: friction is not known in every world; declare it in the scenario": lambda: (
         parse_uncertainty("friction=0.1").members(FIXED.sample(1, 7).worlds)
     ),
-    "uncertainty: friction=1: the value 0.6 in world 0 may be as low as -0.4; it must stay above 0": lambda: (
+    "uncertainty: friction=1: the value 0.6 in world 0 may be as low as -0.4; must be above 0": lambda: (
         parse_uncertainty("friction=1").members(FIXED.replace(friction=0.6).sample(1, 7).worlds)
     ),
 }

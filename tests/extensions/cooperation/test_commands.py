@@ -15,18 +15,18 @@ REFUSED = [
         "study ablate --output new --levels cooperation-3-pair,cooperation-3-pair",
         "levels: 'cooperation-3-pair' is given twice",
     ),
-    ("study ablate --output new --levels cooperation-3-pair", "levels: 1 given; at least two are needed to compare"),
+    ("study ablate --output new --levels cooperation-3-pair", "levels: only 1 level; give at least two levels"),
     (
         "study ablate --output new --levels cooperation-0-sensors,paper-distance",
-        "level 'paper-distance': its speeds_mps differs from that of 'cooperation-0-sensors' (20, 18, 20",
+        "level 'paper-distance': speeds_mps is 20, 18, 20, but",
     ),
     (
         "study ablate --output new --levels cooperation-3-pair,cooperation-3-five",
-        "level 'cooperation-3-five': its vehicles differs from that of 'cooperation-3-pair' (5; there 3)",
+        "level 'cooperation-3-five': vehicles is 5, but 3 at level 'cooperation-3-pair'",
     ),
     (
         "study ablate --output new --episodes 10 --search-episodes 11",
-        "search-episodes 11: must be at most the 10 worlds of --episodes",
+        "search-episodes = 11: must be at most the number of worlds, episodes = 10",
     ),
     (
         "study ablate --output new --set scheme=shard",
@@ -34,9 +34,9 @@ REFUSED = [
     ),
     (
         "study ablate --output new --shield robust",
-        "shield 'robust': must be step; episode and robust shield one vehicle",
+        "shield 'robust': must be step, because the other shields can control one vehicle only",
     ),
-    ("study ablate --output new --recipes ppo,ppo", "recipes ppo, ppo: give at least one, each with a name of its own"),
+    ("study ablate --output new --recipes ppo,ppo", "recipes ppo, ppo: two recipes have the same name"),
 ]
 
 

@@ -195,13 +195,13 @@ def test_price__is_the_ratio_of_the_means_over_worlds_where_something_converged(
 @pytest.mark.parametrize(
     ("level", "options", "message"),
     [
-        ("cooperation-0-sensors", {}, "scenario 'cooperation-0-sensors': nobody learns; give at least one vehicle"),
-        ("cooperation-3-pair", {"tolerance": float("nan")}, "tolerance nan: must be a number of m2/s2, at least 0"),
+        ("cooperation-0-sensors", {}, "scenario 'cooperation-0-sensors': has no learner; give at least one vehicle"),
+        ("cooperation-3-pair", {"tolerance": float("nan")}, "tolerance = nan: the tolerance must be a finite"),
         ("cooperation-3-pair", {"rounds": 0}, "rounds = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"budget": 0}, "budget = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"seed": -1}, "seed = -1: must be a whole number, at least 0"),
-        ("cooperation-3-pair", {"objective": ["own"]}, "objective: 1 entries; 3 vehicles need 3"),
-        ("cooperation-3-pair", {"objective": "injury:lr4s"}, "is no weighted sum of the vehicles' harm; known: "),
+        ("cooperation-3-pair", {"objective": ["own"]}, "objective: has 1 entries; must have 3"),
+        ("cooperation-3-pair", {"objective": "injury:lr4s"}, "is not a weighted sum of the vehicles' harm; use"),
         ("cooperation-3-pair", {"harm_count": "last"}, "last"),
     ],
 )

@@ -43,7 +43,7 @@ RANGE = "must go up from LOW to HIGH in at most 99 whole steps, for instance 0..
 REFUSED = {
     "friction": MUST,
     "=1,2": MUST,
-    "objective=own,total": f"{MUST} or v2x.lost=0,0.1,0.3; compare other values as --levels",
+    "objective=own,total": f"{MUST} or v2x.lost=0,0.1,0.3; for other values, give scenarios with --levels",
     "gaps_m='{uniform: [5, 10]}'": MUST,
     "friction=0.5,nan": MUST,
     "friction=0.5,,0.6": MUST,
@@ -52,20 +52,20 @@ REFUSED = {
     "friction=0.5..1:0": RANGE,
     "friction=0.5..1:-0.1": RANGE,
     "friction=0..100:1": RANGE,
-    "friction=0.5": "--sweep friction: 1 given; must be 2 to 100 numbers",
-    "friction=0..60:1,100..160:1": "122 given; must be 2 to 100 numbers",
+    "friction=0.5": "--sweep friction: has 1 number; give 2 to 100 numbers",
+    "friction=0..60:1,100..160:1": "has 122 numbers; give 2 to 100 numbers",
     "friction=0.5,0.50": "--sweep friction: 0.5 is given twice",
     "objective=social:0..120:30": "objective 'social:120': social needs an angle from 0 to 90 degrees",
     "mass_t.2=-1,2": "mass_t[2] (vehicle_3) = -1: must be finite and in (0, 1000] t",
     "frictoin=0.5,0.6": "unknown setting 'frictoin'; did you mean 'friction'?",
-    "averaging=0.9,0.99": "--sweep averaging: is a recipe's; a sweep varies a scenario (recipes: ethbrake study sweep)",
-    "vehicles=2,3": "--sweep vehicles: levels with different vehicles cannot be compared, vehicle by vehicle",
-    "horizon_s=4,8": "give each a folder of its own (--set horizon_s=..., --output)",
-    "friction=0.5,0.6 --sweep v2x.lost=0,0.1": "--sweep is given twice; sweep one key, because a figure has one axis",
-    "friction=0.5,0.6 --set friction=1": "--sweep friction: --set friction has no place beside it",
-    "friction=0.5,0.6 --levels cooperation-3-pair,cooperation-4-all": "levels: 2 given; a sweep makes its levels",
-    "friction=0.5,0.6 --levels cooperation-0-sensors": "levels: nobody learns in any of them",
-    "objective=social:0,90 --set reward.objective=own": "recipe 'cooperation' has an objective of its own",
+    "averaging=0.9,0.99": "--sweep averaging: is a key of a recipe, but must be a key of a scenario",
+    "vehicles=2,3": "--sweep vehicles: levels with different vehicles cannot be compared; run one ablation",
+    "horizon_s=4,8": "run one ablation for each value of horizon_s (--set horizon_s=..., --output)",
+    "friction=0.5,0.6 --sweep v2x.lost=0,0.1": "--sweep is given twice; give it once, because",
+    "friction=0.5,0.6 --set friction=1": "--sweep friction: --set changes the same key",
+    "friction=0.5,0.6 --levels cooperation-3-pair,cooperation-4-all": "levels: 2 levels; a sweep needs exactly one",
+    "friction=0.5,0.6 --levels cooperation-0-sensors": "levels: no level has a learner",
+    "objective=social:0,90 --set reward.objective=own": "recipe 'cooperation' has its own objective",
 }
 
 
@@ -196,7 +196,7 @@ def test_sweep__costs_runs_and_goes_on(
     told = json.loads(cost.out)
     assert (told["trainings"], told["training_folders"], told["search_folders"], told["decisions"]) == (2, 2, 1, 512)
     parts = [told[name] for name in ("training_s", "search_s", "driving_s")]
-    assert min(parts) > 0.0 and told["total_s"] == pytest.approx(sum(parts)) and "CPU time" in told["measured"]
+    assert min(parts) > 0.0 and told["total_s"] == pytest.approx(sum(parts)) and "processor time" in told["measured"]
 
     assert ethbrake(*line.split()).status == 0
     out = Path("out")
@@ -214,7 +214,7 @@ def test_sweep__costs_runs_and_goes_on(
     assert again.status == 0 and "to do: 0 trainings, 0 decisions" in again.err
     assert json.loads(again.out)["levels"] == found["levels"]
     other = ethbrake(*line.replace("0,90", "0,45,90").split())
-    assert other.status == 2 and "holds an ablation with other settings (levels)" in other.err
+    assert other.status == 2 and "contains an ablation with other settings (levels)" in other.err
     (out / "settings.json").unlink()
     more = ethbrake(*line.replace("0,90", "0,45,90").split(), "--cost")
     told = json.loads(more.out)

@@ -43,7 +43,7 @@ def test_ablate__trains_and_compares_levels_that_differ_in_tells(levels: list[st
 def test_ablate__behind_a_shield_refuses_a_level_whose_messages_lack_a_piece_before_it_trains(
     levels: list[str],
 ) -> None:
-    where = r"level 'no-mass' behind the shield: vehicle_1 does not tell its mass"
+    where = r"level 'no-mass' behind the shield: messages of vehicle_1 do not contain its mass"
     with pytest.raises(InvalidInput, match=where):
         plan_ablation(",".join(levels), "ppo", None, quick=True, shield="step", folder=Path("out"))
     assert not Path("out").exists()

@@ -121,15 +121,15 @@ def test_old_news__are_moved_on_until_their_sender_stands() -> None:
 
 
 def test_agent__that_is_made_for_another_time_step_is_refused() -> None:
-    with refused("agent 'cacc' was made for decisions every 0.1 s; scenario 'two' has one every 0.4 s"):
+    with refused("agent 'cacc' was made for decisions every 0.1 s; scenario 'two' has a decision every 0.4 s"):
         eb.evaluate(agents={"cacc": eb.make_agent("cacc")}, scenario=TWO.replace(time_step_s=0.4), episodes=2)
 
 
 REFUSED: dict[str, Callable[[], object]] = {
     "agent 'idm:a=0': a must be a number above 0, for instance a=1.4": lambda: make_agent("idm:a=0"),
-    "agent 'idm:T=1:T=2': T is given twice": lambda: make_agent("idm:T=1:T=2"),
+    "agent 'idm:T=1:T=2': parameter T is given twice": lambda: make_agent("idm:T=1:T=2"),
     "agent 'acc:T': T must be a number 0 or more, for instance T=1.1": lambda: make_agent("acc:T"),
-    "agent 'r157_fsm:b_min=7': b_min 7 must not be above b_max 6": lambda: make_agent("r157_fsm:b_min=7"),
+    "agent 'r157_fsm:b_min=7': b_min = 7: must be at most b_max, which is 6": lambda: make_agent("r157_fsm:b_min=7"),
     "unknown agent 'idm:t=1': parameter 't'": lambda: make_agent("idm:t=1"),
     "vehicle_3 is controlled by 'idm', whose command is not fixed at the alert": lambda: make_agent("e_v2x_bm").begin(
         eb.load_scenario("paper-random").sample(12, 7).worlds, 1, {2: make_agent("idm")}

@@ -253,23 +253,23 @@ def first_nan(values):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (Loses, "world 0 loses a step: its clock went from 1.9 s to 1.9 s, and 2 s is right to 0.05 s; each call of"),
-        (broken(does=moves(-0.3)), "world 0 goes back: its clock went from 2 s to 1.8 s, and 2.1 s is right"),
-        (broken(does=moves(0.1)), "world 0 skips: its clock went from 2 s to 2.2 s, and 2.1 s is right to 0.05 s"),
+        (Loses, "world 0 loses a step: its clock went from 1.9 s to 1.9 s, but should be at 2 s (tolerance 0.05 s)"),
+        (broken(does=moves(-0.3)), "world 0 goes back: its clock went from 2 s to 1.8 s, but should be at 2.1 s"),
+        (broken(does=moves(0.1)), "world 0 skips: its clock went from 2 s to 2.2 s, but should be at 2.1 s"),
         (broken(does=off), "apply raised OSError: the bench is off (test_hosts.py, line "),
         (broken(tells=off), "state raised OSError: the bench is off (test_hosts.py, line "),
         (broken(tells=lambda t: t._replace(speeds_mps=first_nan(t.speeds_mps))), "speeds_mps[3, 1] is nan; every"),
         (broken(tells=lambda t: t._replace(time_s=math.inf)), "time_s[0] is inf; every number must be finite"),
         (
             broken(tells=lambda t: t._replace(gaps_m=t.gaps_m[1:])),
-            "gaps_m is of shape (19, 2); (20, 2) is needed: worlds, then vehicles or pairs",
+            "gaps_m has shape (19, 2); must have shape (20, 2): (worlds, vehicles or pairs)",
         ),
         (broken(tells=lambda t: t._replace(speeds_mps=[[1.0], [1.0, 2.0]])), "state raised ValueError: "),
         (broken(tells=lambda t: t[:2]), "state raised TypeError: "),
-        (broken(tells=lambda t: t._replace(impacts="two")), "impacts are str; what eb.advance gives is needed, or"),
-        (broken(tells=lambda t: t._replace(impacts=3)), "impacts are int; "),
-        (broken(tells=lambda t: t._replace(impacts=nothing(20, obstacle=21))), "impacts.obstacle_first_harm must be"),
-        (broken(tells=lambda t: t._replace(impacts=nothing(20, math.inf))), "impacts.first_impact_harm must be"),
+        (broken(tells=lambda t: t._replace(impacts="two")), "impacts is of type str; must be None, or as"),
+        (broken(tells=lambda t: t._replace(impacts=3)), "impacts is of type int; "),
+        (broken(tells=lambda t: t._replace(impacts=nothing(20, obstacle=21))), "impacts.obstacle_first_harm must have"),
+        (broken(tells=lambda t: t._replace(impacts=nothing(20, math.inf))), "impacts.first_impact_harm must have"),
         (broken(tells=lambda t: t._replace(speeds_mps=np.ma.masked_less(t.speeds_mps, 99))), "speeds_mps[0, 0] is nan"),
     ],
 )
@@ -369,9 +369,9 @@ class Drifts(Bench):
         return super().state()._replace(gaps_m=self.gaps + self.time_s)
 
 
-STEP = r" goes from \S+ to \S+ m/s within \S+ s; \S+ to \S+ m/s is possible under \S+ m/s2: begin a step with"
-GAP = r"the gap between vehicle_\d and vehicle_\d of world \d+ is \S+ m at \S+ s; their speeds lead to \S+ to \S+ m"
-SPEED = r"of world \d+ drives at \S+ m/s at \S+ s; its commands lead to \S+ to \S+ m/s: follow command.acceleration"
+STEP = r" goes from \S+ to \S+ m/s within \S+ s, but its command of \S+ m/s2 allows \S+ to \S+ m/s; begin each step"
+GAP = r"the gap between vehicle_\d and vehicle_\d of world \d+ is \S+ m at \S+ s, but must be \S+ to \S+ m by the"
+SPEED = r"of world \d+ drives at \S+ m/s at \S+ s, but should drive at \S+ to \S+ m/s; the host must"
 
 
 @pytest.mark.parametrize("dt", [0.1, 0.01])
@@ -388,7 +388,7 @@ SPEED = r"of world \d+ drives at \S+ m/s at \S+ s; its commands lead to \S+ to \
         (OneCoasts, "constant:-1.5", rf"vehicle_2 {SPEED}"),
         (Frozen, "full_brake", GAP),
         (Stops, "full_brake", rf"vehicle_1 .*{STEP}"),
-        (Flies, "full_brake", rf"vehicle_1 of world 0 goes from \S+ to 1e\+09 m/s within {'{dt}'} s; "),
+        (Flies, "full_brake", rf"vehicle_1 of world 0 goes from \S+ to 1e\+09 m/s within {'{dt}'} s, but"),
         (FliesOnceHit, "full_brake", r"vehicle_\d of world \d+ goes from \S+ to 1e\+09 m/s"),
         (Leaps, "full_brake", GAP),
         (Drifts, "full_brake", GAP),
@@ -489,12 +489,15 @@ def test_host__that_is_a_little_off_is_driven_to_the_end(make, dt):
 @pytest.mark.parametrize(
     ("host", "message"),
     [
-        (object(), "host object: has no dt and no state and no apply; docs/extensions/hosts.md shows one"),
-        (Bench(PAPER.sample(20, 7).worlds, 0.03), "host: dt = 0.03 s: decisions every 0.1 s must be whole steps"),
-        (Bench(PAPER.sample(20, 7).worlds, 0.2), "host: dt = 0.2 s: decisions every 0.1 s must be whole steps"),
-        (Bench(PAPER.sample(20, 7).worlds, math.nan), "host: dt = nan: must be a number of seconds above 0"),
-        (Bench(PAPER.sample(20, 7).worlds, "0.1"), "host: dt = '0.1': must be a number of seconds above 0"),
-        (Bench(PAPER.sample(20, 8).worlds), "in the worlds that were given; set the host up with these, to 0.01"),
+        (
+            object(),
+            "host object: has no dt and no state and no apply; docs/extensions/hosts.md shows what a host needs",
+        ),
+        (Bench(PAPER.sample(20, 7).worlds, 0.03), "host: dt = 0.03 s: the time between decisions, 0.1 s, must be"),
+        (Bench(PAPER.sample(20, 7).worlds, 0.2), "host: dt = 0.2 s: the time between decisions, 0.1 s, must be"),
+        (Bench(PAPER.sample(20, 7).worlds, math.nan), "host: dt = nan: the step length must be a number"),
+        (Bench(PAPER.sample(20, 7).worlds, "0.1"), "host: dt = '0.1': the step length must be a number"),
+        (Bench(PAPER.sample(20, 8).worlds), "in worlds; the host must start with the gaps and speeds of worlds"),
     ],
 )
 def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message):
@@ -506,11 +509,11 @@ def test_host__that_does_not_fit_is_refused_before_anything_moves(host, message)
 @pytest.mark.parametrize(
     ("scenario", "agent", "message"),
     [
-        ("paper-random", "full_brake", "host: 'str' is no agent: it has no name and no act; make_agent(name) makes"),
+        ("paper-random", "full_brake", "host: 'str' is not an agent, because it has no name and no act; to make"),
         ("paper-random-obstacle", None, "host: scenario 'paper-random-obstacle': has an obstacle ahead (obstacle_gap"),
         ("paper-random-buildup", None, "host: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and"),
-        (PAPER.with_learners([]), None, "host: scenario 'paper-random' has no learner to drive; scenario.with_learn"),
-        (PAPER, PAPER, "is no agent"),
+        (PAPER.with_learners([]), None, "host: scenario 'paper-random' has no learner; give one with a learner"),
+        (PAPER, PAPER, "is not an agent"),
     ],
 )
 def test_host__of_what_it_cannot_know_is_refused(scenario, agent, message):
@@ -519,7 +522,7 @@ def test_host__of_what_it_cannot_know_is_refused(scenario, agent, message):
     with pytest.raises(eb.EthBrakeError) as refused:
         drive_host(Bench(worlds), agent or eb.make_agent("full_brake"), scenario, worlds)
     assert message in str(refused.value)
-    with pytest.raises(eb.EthBrakeError, match=r"host: worlds = .* must be worlds, as"):
+    with pytest.raises(eb.EthBrakeError, match=r"host: worlds = .* must be a Worlds object"):
         drive_host(Bench(worlds), eb.make_agent("full_brake"), scenario, scenario.sample(5, 7))
 
 
@@ -546,7 +549,7 @@ def test_running__worlds_that_cannot_be_are_refused():
     alert, engine = PAPER.sample(3, 7).worlds, eb.make_engine(PAPER, 2)
     with pytest.raises(eb.EthBrakeError, match=r"gaps_m\[0, 1\] = -1: must be finite and in \[0, inf\]"):
         alert.running(1.0, [1.0, -1.0], 3.0)
-    with pytest.raises(eb.EthBrakeError, match="place: 3 worlds of 3 vehicles; 2 of 3 needed"):
+    with pytest.raises(eb.EthBrakeError, match="place: got 3 worlds of 3 vehicles; 2 worlds of 3"):
         engine.place(alert)
 
 

@@ -25,7 +25,7 @@ def test_sumo__that_is_not_installed_is_told_in_one_line(monkeypatch):
     ("spec", "message"),
     [
         ("carla", "unknown host 'carla'; known: sumo"),
-        ("sumo:x", "host 'sumo:x': 'x' is no step in s; for instance sumo:0.01"),
+        ("sumo:x", "host 'sumo:x': 'x' is not a step length; give a number of seconds"),
     ],
 )
 def test_find_host__refuses_what_is_none(spec, message):
@@ -53,9 +53,9 @@ def test_sumo__begins_where_it_is_told_and_is_one_at_a_time():
     with find_host("sumo:0.1").open(worlds) as host:
         told = host.state()
         assert np.abs(told.gaps_m - worlds.gaps_m).max() < 1e-12 and np.array_equal(told.speeds_mps, worlds.speeds_mps)
-        with pytest.raises(eb.EthBrakeError, match="a simulation is open in this process"):
+        with pytest.raises(eb.EthBrakeError, match="another SUMO simulation is open in this process"):
             SumoHost(worlds)
-    with pytest.raises(eb.EthBrakeError, match=r"dt = 0.0005: must be whole milliseconds"):
+    with pytest.raises(eb.EthBrakeError, match=r"dt = 0.0005: the step length must be a whole number of milliseconds"):
         SumoHost(worlds, 0.0005)
 
 

@@ -92,9 +92,9 @@ def test_training__starts_from_nothing_where_no_policy_ships_and_says_so(tmp_pat
     notes: list[str] = []
     tell = lambda progress: notes.append(progress.note)  # noqa: E731
     result = train(SHIPPED.replace(**SMALL, **STILL), name, tmp_path / "run", on_progress=tell)
-    told = f"random weights, as no ppo ships for scenario {name!r}"
+    told = f"random weights, because no ppo is shipped for scenario {name!r}"
     assert json.loads((tmp_path / "run" / "run.json").read_text())["start"] == result.training.begins == told
-    assert notes[0] == f"begins with {told}"
+    assert notes[0] == f"initial weights: {told}"
     assert result.policy.tensors["policy.output.bias"] == pytest.approx(-0.9, abs=1e-3)
     seen = np.random.default_rng(0).uniform(0, 1, (50, result.policy.observation.size)).astype(np.float32)
     np.testing.assert_allclose(result.policy(seen), -0.9, atol=0.1)
@@ -294,7 +294,9 @@ def test_imitation__draws_from_the_stream_of_its_own_seed() -> None:
 
 
 def test_training__says_that_no_template_does_better(tmp_path: Path) -> None:
-    with pytest.raises(NoBetterTemplate, match="network 2: in none of 64 worlds does one of 20 templates do better"):
+    with pytest.raises(
+        NoBetterTemplate, match="expert 2: in none of the 64 worlds does one of the 20 templates exceed"
+    ):
         train(TINY_EXPERTS.replace(experts={**EXPERTS, "gain": 1e6}), SCENARIO, tmp_path / "run", measure=None)
     assert eb.load_policy(tmp_path / "run" / "policy-last").manifest.network.networks == 2
 

@@ -30,9 +30,7 @@ def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> No
     with refused("observation: lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
         widened(eb.load_shipped("ppo"), Training.of(turned, PAPER))
     smaller = load_recipe("vine").replace(network={"policy": [64, 64]})
-    with refused(
-        "network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; they must be the same"
-    ):
+    with refused("network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; change the recipe"):
         widened(eb.load_shipped("ppo"), Training.of(smaller, PAPER))
 
 
@@ -40,7 +38,7 @@ def test_policy_to_start_from__has_one_network(empty_folder: Path) -> None:
     several = {"networks": 3, "gate_hidden": (6,), "value_hidden": ()}
     several = make_policy(eb.ObservationSpec(), {"name": "paper-random"}, "vine", **several)
     several.save(Path("first"))
-    with refused("recipe 'vine': start: this policy is a mixture of 3 networks"):
+    with refused("recipe 'vine': start: the policy is a mixture of 3 networks"):
         train(TINY_EXPERTS.replace(start="vine@first"), PAPER, Path("run"))
 
 
@@ -61,10 +59,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "near = [{smallest: 0.1, largest: 1}, {smallest: 0.1, largest: 1}...": lambda: TINY_ROLLOUTS.replace(
         near=[{"smallest": 0.1, "largest": 1.0}] * 9
     ),
-    "recipe 'vine': reward.shaping = 0.1: must be 0: tried actions are played to the end": lambda: TINY_VINE.replace(
-        reward={"harm": 1.0, "shaping": 0.1}
+    "recipe 'vine': reward.shaping = 0.1: must be 0: this algorithm plays tried actions to the end": lambda: (
+        TINY_VINE.replace(reward={"harm": 1.0, "shaping": 0.1})
     ),
-    "recipe 'vine': offset.largest = 0.1: must be at least smallest = 0.3": lambda: TINY_VINE.replace(
+    "recipe 'vine': offset.largest = 0.1: must be at least smallest, which is 0.3": lambda: TINY_VINE.replace(
         offset={"smallest": 0.3, "largest": 0.1}
     ),
     "recipe 'vine': gradient_limit = often: must be auto or a finite number above 0": lambda: TINY_VINE.replace(
@@ -74,17 +72,19 @@ REFUSED: dict[str, Callable[[], object]] = {
         start="sac@x"
     ),
     "'ppo@shipped' is now written ppo": lambda: TINY_VINE.replace(start="ppo@shipped"),
-    "n_envs x n_steps = 16777216 decisions per update; at most": lambda: TINY_VINE.replace(n_envs=2**22),
+    "n_envs x n_steps = 16777216 decisions per update are too many (at most 4194304)": lambda: TINY_VINE.replace(
+        n_envs=2**22
+    ),
     "must be single, shared, independent or centralised": lambda: TINY_VINE.replace(scheme="centralized"),
-    "memory = 15: must be at least tried = 16": lambda: TINY_ROLLOUTS.replace(memory=15),
-    "must hold a range if there are neither fixed": lambda: TINY_ROLLOUTS.replace(near=[], fixed=[], drawn=0),
+    "memory = 15: must be at least tried, which is 16": lambda: TINY_ROLLOUTS.replace(memory=15),
+    "must contain a range, because the recipe has no fixed": lambda: TINY_ROLLOUTS.replace(near=[], fixed=[], drawn=0),
     "recipe 'vine': experts.networks = 1: must be greater than or equal to 2": lambda: experts(networks=1),
-    "the sum of the shares is 1.5; must be 1": lambda: experts(
+    "the sum of the four shares is 1.5; it must be 1": lambda: experts(
         shares={"pretraining_first": 0.5, "pretraining_others": 0.5, "gating": 0.5, "joint": 0.0}
     ),
     "recipe 'vine': experts.gatin: unknown key; did you mean gating?": lambda: experts(gatin=[8]),
-    "runs/mine: is not a folder; give a policy bundle (manifest.json, weights.safetensors) or a run": lambda: train(
-        load_recipe("vine").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1
+    "runs/mine: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)": lambda: (
+        train(load_recipe("vine").replace(start="ppo@runs/mine"), "cooperation-2-five", "run", steps=1)
     ),
     "drawn = 2: must be at most the number of policies, 1": lambda: train(
         load_recipe("rollout-classification").replace(policies=["ppo"]), "paper-random", "new"
@@ -92,7 +92,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     "'policy@shipped/ppo' is now written ppo": lambda: train(
         load_recipe("rollout-classification").replace(policies=["policy@shipped/ppo"], drawn=1), "paper-random", "new"
     ),
-    "recipe 'vine': experts: a mixture is for one learner, not for 2": lambda: train(TINY_EXPERTS, PAIR, Path("run")),
+    "recipe 'vine': experts: a mixture of experts can drive one learner only": lambda: train(
+        TINY_EXPERTS, PAIR, Path("run")
+    ),
 }
 
 

@@ -40,7 +40,7 @@ def test_folder__is_searched_below_and_what_is_no_recording_is_skipped(tmp_path:
     assert recordings == ["Casale/part1.csv: 1-2-3", "JRC/low speed/part1.csv: 1-2-3"]
     assert made.found[1:] == [
         "rows of 2 different trios of vehicles in 2 recordings",
-        "skipped, no recordings or there already: Casale/Veh_specifications.csv, empty.csv, trip.csv",
+        "skipped, because they are no recordings or copies: Casale/Veh_specifications.csv, empty.csv, trip.csv",
     ]
     assert "; rows of 2 different trios of vehicles in 2 recordings; skipped" in made.text
     assert rows_of(scenario_from_data("mine", tmp_path / "Casale" / "part1.csv", "openacc")) == rows_of(made)[:1]
@@ -55,9 +55,7 @@ def test_refused_files__are_all_listed_and_add_no_row(
     openacc(good(folder / "late"), COLUMNS, *late)
     made = scenario_from_data("mine", folder, "openacc")
     assert len(rows_of(made)) == 1 and made.found[-1] == "refused: 3 files"
-    wrong = (
-        "data/late/a.csv, line 11: vehicle 2 overlaps vehicle 1 ahead by 15.00 m; 9 of 54 are like that, at most 1% may"
-    )
+    wrong = "data/late/a.csv, line 11: vehicle 2 overlaps vehicle 1 ahead by 15.00 m; 9 of 54 vehicles have"
     starts = [f"data/{name}.csv, line 3, column Speed1: 'fast' is not a number" for name in "bc"] + [wrong]
     assert [text.startswith(start) for text, start in zip(made.refused, starts, strict=True)] == [True] * 3
     command = ["scenario", "from-data", "data", "--format", "openacc", "--output", "mine.yaml"]
@@ -76,10 +74,11 @@ def test_refused_files__are_all_listed_and_add_no_row(
 def test_folder_without_recordings__says_what_each_file_lacks(tmp_path: Path) -> None:
     (tmp_path / "Veh.csv").write_text("Vehicle,Length\n")
     with pytest.raises(
-        InvalidInput, match=r"holds no recording of OpenACC: .*Veh.csv: has no column Time, Speed<number>, IVS<number>"
+        InvalidInput,
+        match=r"contains no recording of OpenACC: .*Veh.csv: lacks columns .*: Time, Speed<number>, IVS<number>",
     ):
         scenario_from_data("mine", tmp_path, "openacc")
-    with pytest.raises(InvalidInput, match=r"must be a folder with \*_tracks.csv, the files of exiD"):
+    with pytest.raises(InvalidInput, match=r"must be a folder with files of exiD, whose names match \*_tracks.csv"):
         scenario_from_data("mine", tmp_path, "exid")
     with pytest.raises(InvalidInput, match="must be a folder with"):
         scenario_from_data("mine", tmp_path / "nowhere", "exid")
@@ -105,10 +104,10 @@ def test_hostile_folder__yields_the_good_files_and_one_line_for_each_other(tmp_p
     said = dict.fromkeys(made.refused)
     rights = (
         "binary.csv: cannot be read ('utf-8'",
-        "cut.csv, line 3: 3 values, but the header has 6 columns; is the file whole?",
-        "huge.csv, line 2: longer than 65,536",
-        "nowhere.csv: no such file",
-        "pipe.csv: is not a plain file",
+        "cut.csv, line 3: the line has 3 values, but the header has 6 columns; is the file complete?",
+        "huge.csv, line 2: the line must have fewer than 65,536",
+        "nowhere.csv: the file does not exist",
+        "pipe.csv: is a device, a pipe or a socket",
         "round.csv: cannot be read (Too many levels",
     )
     assert [right in text for right, text in zip(rights, said, strict=True)] == [True] * 6

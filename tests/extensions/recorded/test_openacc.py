@@ -56,22 +56,22 @@ def test_pair__is_no_chain_of_three_and_the_message_names_a_scenario_for_pairs(
     if found:
         assert len(rows_of(scenario_from_data("mine", folder, "openacc", based_on="realistic-pair"))) == 1
     else:
-        right = r"no 3 vehicles follow .*; the longest queue has 2: --based-on takes .*, as realistic-pair of 2"
+        right = r"no queue of 3 vehicles .*; the longest queue has 2 vehicles: .*, for instance realistic-pair with 2"
         with pytest.raises(InvalidInput, match=right):
             scenario_from_data("mine", folder, "openacc")
 
 
 def test_car_without_speed__has_no_link(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"no 3 vehicles follow each other in a lane at any moment looked at$"):
+    with pytest.raises(InvalidInput, match=r"contains no queue of 3 vehicles at the times that were read$"):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,Speed3,IVS1,IVS2", "20,,20,15,16"), "openacc")
 
 
 def test_no_link__is_said_with_the_columns(tmp_path: Path) -> None:
     with pytest.raises(
-        InvalidInput, match=r"no car follows another in the columns Speed1, Speed3, IVS1; .*Speed k\+1 and IVS k"
+        InvalidInput, match=r"no car follows another in the columns Speed1, Speed3, IVS1; .*Speed1, Speed2 and IVS1"
     ):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed3,IVS1", "20,20,15"), "openacc")
-    with pytest.raises(InvalidInput, match="has no column IVS<number>, as files of OpenACC have"):
+    with pytest.raises(InvalidInput, match="lacks columns that files of OpenACC have: IVS<number>"):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,Lat1", "20,20,15"), "openacc")
 
 
@@ -83,7 +83,7 @@ def test_heading__has_up_to_ten_lines(lines: int, tmp_path: Path) -> None:
     else:
         with pytest.raises(
             InvalidInput,
-            match=r"holds no recording of OpenACC: .*a.csv: has no column Time, Speed<number>, IVS<number>",
+            match=r"contains no recording of OpenACC: .*a.csv: lacks columns .*: Time, Speed<number>, IVS<number>",
         ):
             scenario_from_data("mine", folder, "openacc")
 
@@ -96,14 +96,16 @@ def test_gap_of_0_or_less__of_a_standing_car_is_left_out_of_moving_ones_one_in_a
     assert "left out: 2 links of standing cars whose gap was recorded as 0 or less" in made.found
     few, many = ["20,20,20,20,-1,16,17"] * 1, ["20,0.5,20,20,-1,16,17"] * 2
     made = scenario_from_data("mine", openacc(tmp_path, columns, *[good] * 24, *few), "openacc")  # 1 of 100 vehicles
-    assert "left out: 1 vehicles that overlap, are there twice, or follow one that is not there" in made.found
-    with pytest.raises(InvalidInput, match=r"line 25: vehicle 2 overlaps vehicle 1 ahead by 1\.00 m; 2 of 100 are"):
+    assert "left out: 1 vehicles that overlap, are recorded twice, or follow one that is not recorded" in made.found
+    with pytest.raises(
+        InvalidInput, match=r"line 25: vehicle 2 overlaps vehicle 1 ahead by 1\.00 m; 2 of 100 vehicles have"
+    ):
         scenario_from_data("mine", openacc(tmp_path, columns, *[good] * 23, *many), "openacc")
 
 
 def test_column_twice__is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        InvalidInput, match=r"a.csv: Time, Speed1, Speed2, speed2, IVS1: each column must be there once"
+        InvalidInput, match=r"a.csv: columns Time, Speed1, Speed2, speed2, IVS1: each name must occur only once"
     ):
         scenario_from_data("mine", openacc(tmp_path, "Speed1,Speed2,speed2,IVS1", "20,20,20,15"), "openacc")
 
@@ -124,7 +126,7 @@ def test_units__are_checked_between_moments_a_second_apart_however_far_rows_are_
             made = scenario_from_data("mine", folder, "openacc", based_on="realistic-pair", every_s=every_s)
             assert len(rows_of(made)) == 300 / every_s
         else:
-            with pytest.raises(InvalidInput, match=r"gaps change 3\.\d\d times as much as speeds say"):
+            with pytest.raises(InvalidInput, match=r"gaps change 3\.\d\d times as much as they should by the speeds"):
                 scenario_from_data("mine", folder, "openacc", based_on="realistic-pair", every_s=every_s)
 
 
@@ -145,4 +147,4 @@ def test_file_with_semicolons__is_refused_with_a_hint(tmp_path: Path) -> None:
     openacc(tmp_path, "Speed1,Speed2,IVS1", "20,20,15")
     (tmp_path / "b.csv").write_text("Time;Speed1;Speed2;IVS1\n0;20;20;15\n")
     (text,) = scenario_from_data("mine", tmp_path, "openacc", based_on="realistic-pair").refused
-    assert "columns are separated by commas" in text
+    assert "commas must separate the columns" in text

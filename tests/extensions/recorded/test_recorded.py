@@ -63,7 +63,7 @@ def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) 
     folder = write_openacc(tmp_path / "openacc", 40)
     made = scenario_from_data("mine", folder, "openacc")
     assert made.found == [
-        "30 chains of 3 vehicles, every 1 s, each vehicle in one of them at most",
+        "30 chains of 3 vehicles, every 1 s; at one time, a vehicle is in at most one chain",
         "rows of 1 different trio of vehicles in 1 recording",
         "left out: 100 vehicles that were too few, or left over, at the end of a queue",
     ]
@@ -72,7 +72,9 @@ def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) 
     assert "CC BY 4.0" in made.text and len(rows_of(scenario_from_data("mine", folder, "openacc", every_s=0.1))) == 300
     (folder / "later.csv").write_text("Date,later\n" + (folder / "platoon.csv").read_text())
     assert scenario_from_data("mine", folder, "openacc").found[0].startswith("60 chains")
-    with pytest.raises(InvalidInput, match=r"gaps change 0\.31 times as much as speeds say .*OpenACC has m and m/s"):
+    with pytest.raises(
+        InvalidInput, match=r"gaps change 0\.31 times as much as they should by the speeds .*must be in m and m/s"
+    ):
         scenario_from_data("mine", write_openacc(tmp_path / "feet", 100, unit=0.3048), "openacc")
 
 
@@ -85,25 +87,25 @@ def scaled(text: str, lengths: float, speeds: float) -> str:
 
 
 REFUSED = {
-    "a column is missing": (lambda t: t.replace("precedingId", "-"), "no column precedingId, as files of highD have"),
-    "semicolons": (lambda t: t.replace(",", ";"), "columns are separated by commas"),
-    "a column twice": (lambda t: t.replace("ttc", "width"), "csv: frame, id, .*: each column must be there once"),
+    "a column is missing": (lambda t: t.replace("precedingId", "-"), "lacks columns .* highD have: precedingId"),
+    "semicolons": (lambda t: t.replace(",", ";"), "commas must separate the columns"),
+    "a column twice": (lambda t: t.replace("ttc", "width"), "columns frame, id, .*: each name must occur only"),
     "text": (lambda t: t.replace("4.50", "long", 1), "line 2, column width: 'long' is not a number"),
     "nan": (lambda t: t.replace("4.50", "nan", 1), "line 2, column width: nan must be a finite number"),
-    "no length": (lambda t: t.replace("4.50", "0.00", 1), r"line 2, column width: 0 m of length: must be in \(0, 40\]"),
+    "no length": (lambda t: t.replace("4.50", "0.00", 1), r"line 2, column width: 0 m: the length must be above 0"),
     "a huge id": (lambda t: t.replace("\n1,1,", "\n1,1e300,", 1), r"column id: 1e\+300 must have the drivingDirection"),
     "half an id": (lambda t: t.replace("\n1,1,", "\n1,1.5,", 1), r"column id: 1.5 must be a whole number, 0 or above"),
-    "half written": (lambda t: t[:-20], "values, but the header has 25 columns; is the file whole?"),
-    "no rows": (lambda t: t.splitlines()[0] + "\n", "has no rows"),
-    "empty": (lambda t: "", "has no column frame, id"),
+    "half written": (lambda t: t[:-20], "values, but the header has 25 columns; is the file complete?"),
+    "no rows": (lambda t: t.splitlines()[0] + "\n", "contains no rows of data"),
+    "empty": (lambda t: "", "lacks columns that files of highD have: frame, id"),
     "no UTF-8": (lambda t: "\udcff" + t, "cannot be read .*utf-8"),
     "half a frame": (lambda t: t.replace("\n2,1,", "\n2.5,1,", 1), "column frame: 2.5 must be a multiple of 0.04 s"),
-    "twice": (lambda t: t + t.splitlines()[1] + "\n", "line 3122: vehicle 1 is there at that time in line 2, too"),
+    "twice": (lambda t: t + t.splitlines()[1] + "\n", "line 3122: vehicle 1 is recorded twice .* .see line 2"),
     "nobody ahead": (lambda t: re.sub(r",1,0,0,0,0,0,0,0,3\n", ",77,0,0,0,0,0,0,0,3\n", t), "vehicle 77, which is not"),
-    "feet": (lambda t: scaled(t, 2.8, 1.5), "long, fewer than a third; its lengths and speeds must be"),
-    "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m of length: must be in \(0, 40\]; highD has m and m/s"),
-    "half as fast": (lambda t: scaled(t, 1.0, 0.4), r"gaps change 2\.\d\d times as much as speeds say"),
-    "too fast": (lambda t: t.replace("-27.879", "-127.879"), "127.879 m/s; must be at most 75; highD has m and m/s"),
+    "feet": (lambda t: scaled(t, 2.8, 1.5), "long, which is less than a third; lengths and speeds must be"),
+    "long lorries": (lambda t: scaled(t, 3.281, 3.281), r"m: the length must be .* at most 40 m; highD is in m"),
+    "half as fast": (lambda t: scaled(t, 1.0, 0.4), r"gaps change 2\.\d\d times as much as they should by the speeds"),
+    "too fast": (lambda t: t.replace("-27.879", "-127.879"), "127.879 m/s: the speed must be at most 75 m/s; highD is"),
 }  # fmt: skip
 
 
@@ -127,7 +129,7 @@ def test_overlaps__are_refused_but_few_of_noisy_data_are_left_out(tmp_path: Path
     made = scenario_from_data("mine", file.parent, "ngsim")
     assert len(rows_of(made)) == 39 and "left out: 2 vehicles that overlap" in made.found[2]
     file.write_text(re.sub(r"(?m)^((?:2|5|8|11|14|17),\d+,11,\d+,20),[^,]+", r"\1,99", text))
-    with pytest.raises(InvalidInput, match=r"line \d+: vehicle 2 overlaps .*; 12 of 120 are like that"):
+    with pytest.raises(InvalidInput, match=r"line \d+: vehicle 2 overlaps .*; 12 of 120 vehicles have such faults"):
         scenario_from_data("mine", file.parent, "ngsim")
 
 
@@ -141,7 +143,7 @@ def test_memory__does_not_grow_with_the_file(tmp_path: Path, monkeypatch: pytest
         told = scenario_from_data("mine", folder, "highd").found
         most.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert told[2] == "left out: 1,108 chains: a table holds 500 numbers, so one in 13 is kept"
+    assert told[2] == "left out: 1,108 chains: a table has at most 500 numbers, so one in 13 is used"
     assert most[2] < 1.3 * most[1]
 
 

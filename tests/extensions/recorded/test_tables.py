@@ -48,7 +48,7 @@ def test_leaders__are_the_next_in_the_lane_at_that_time(tmp_path: Path) -> None:
     assert rows_of(made) == ROWS and made.csv.endswith("a.csv: c-b-a\n")
     assert "left out: 4 vehicles that were too few, or left over, at the end of a queue" in made.found
     assert rows_of(made_of(table(tmp_path), every_s=0.5)) == [ROWS[0]] * 3
-    assert "licence is not known" in made.text
+    assert "licence is unknown" in made.text
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,9 @@ def test_times_of_30_hertz__may_be_rounded(tmp_path: Path) -> None:
         for k in range(61)
     ]
     assert rows_of(made_of(table(tmp_path, cars))) == [ROWS[0]] * 3
-    with pytest.raises(InvalidInput, match=r"every = 0.05 s: must be a multiple of 0.0333333 s, as the table has it"):
+    with pytest.raises(
+        InvalidInput, match=r"every = 0.05 s: must be a multiple of 0.0333333 s, the time step of the table"
+    ):
         made_of(table(tmp_path, cars), every_s=0.05)
 
 
@@ -97,7 +99,7 @@ def test_parquet__gives_the_same_rows_and_names_rows(tmp_path: Path, monkeypatch
     numbered = [(k % 5 + 1, *row[1:2], int(row[2][-1]), *row[3:]) for k, row in enumerate(CARS)]
     assert made_of(write(numbered)).csv.endswith("a.parquet: 3-4-1\n")
     for k, cell, right in (
-        (4, -1.0, r"a.parquet, row 3, column l: -1 m of length: must be in \(0, 40\]"),
+        (4, -1.0, r"a.parquet, row 3, column l: -1 m: the length must be above 0 and at most 40 m"),
         (5, None, "a.parquet, row 3, column v: is empty"),
         (0, None, "a.parquet, row 3, column who: is empty"),
     ):
@@ -106,7 +108,7 @@ def test_parquet__gives_the_same_rows_and_names_rows(tmp_path: Path, monkeypatch
     with pytest.raises(InvalidInput, match=r"a.parquet, row 1, column v: 'fast' is not a number"):
         made_of(write([(*car[:5], "fast") for car in CARS]))
     monkeypatch.setattr(reading, "PIECE", 6)  # rows are counted over pieces
-    with pytest.raises(InvalidInput, match=r"a.parquet, row 13, column l: 0 m of length"):
+    with pytest.raises(InvalidInput, match=r"a.parquet, row 13, column l: 0 m: the length"):
         made_of(write([*CARS[:12], (*CARS[12][:4], 0.0, 20.0), *CARS[13:]]))
     with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read as Parquet \(Unsupported cast from list"):
         made_of(write([(*car[:5], [car[5]]) for car in CARS]))
@@ -126,18 +128,18 @@ def one_more(*car: object) -> list[tuple[object, ...]]:
 WRONG = {
     "direction": (
         [(*car[:3], -car[3], *car[4:]) for car in CARS],
-        "lane E1_0, front changes -1.00 times as much as speed",
+        "lane E1_0, positions .front. change -1.00 times as much",
     ),
     "backwards": (
         [(*car[:3], -car[3], car[4], -car[5]) for car in CARS],
-        "in lane E1_0, front changes 1.00 times as much as a speed below 0 says; front must grow along travel",
+        "in lane E1_0, positions .front. change 1.00 times as much .*, which are below 0; front must increase",
     ),
     "feet": (
         [(*car[:3], car[3] / 0.3048, *car[4:]) for car in CARS],
-        r"front changes 3.28 times as much as speed says; .* both in m and m/s",
+        r"change 3.28 times as much as they should by the speeds; .* both must be in m and m/s",
     ),
-    "km/h": (scaled(1.0, 2.5), r"front changes 0.40 times as much as speed says"),
-    "twice": (one_more(*CARS[2]), "line 17: vehicle c is there at that time in line 4, too"),
+    "km/h": (scaled(1.0, 2.5), r"change 0.40 times as much as they should by the speeds"),
+    "twice": (one_more(*CARS[2]), "line 17: vehicle c is recorded twice for this time .see line 4"),
     "overlap": (one_more("d", 1.0, "E1_0", 119.0, 5.0, 20.0), "line 17: vehicle d overlaps vehicle c ahead by 3.00 m"),
     "no name": (one_more("", 1.0, "E1_0", 150.0, 5.0, 20.0), "line 17, column who: is empty"),
     "no number": (one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0), "line 17, column l: '5 m' is not a number"),
@@ -155,21 +157,24 @@ def test_wrong_table__is_refused_with_what_would_be_right(what: str, tmp_path: P
 @pytest.mark.parametrize(
     ("columns", "right"),
     [
-        ("", "must be time=...,vehicle=...,lane=...,front=...,length=...,speed=...,units=m|ft|km/h, each once"),
-        (COLUMNS.removesuffix(",units=m"), "units=m|ft|km/h, each once"),
-        (COLUMNS + ",time=t", "each once"),
-        (COLUMNS + ",colour=c", "each once"),
-        (COLUMNS.replace("x", ""), "each once"),
+        (
+            "",
+            "must be time=...,vehicle=...,lane=...,front=...,length=...,speed=...,units=m|ft|km/h, with each key once",
+        ),
+        (COLUMNS.removesuffix(",units=m"), "units=m|ft|km/h, with each key once"),
+        (COLUMNS + ",time=t", "with each key once"),
+        (COLUMNS + ",colour=c", "with each key once"),
+        (COLUMNS.replace("x", ""), "with each key once"),
         (COLUMNS.replace("=m", "=mph"), "columns: units = 'mph': must be one of m, ft, km/h"),
-        (COLUMNS.replace("=t,", "=t/0,"), "columns: time = .../0: must be the number of units of time in a second"),
-        (COLUMNS.replace("=who", "=id"), "a.csv: has no column id, as files of the table have"),
+        (COLUMNS.replace("=t,", "=t/0,"), "columns: time = .../0: the number after / must be"),
+        (COLUMNS.replace("=who", "=id"), "a.csv: lacks columns that files of the table have: id"),
     ],
 )
 def test_wrong_columns__are_refused(columns: str, right: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput) as told:
         made_of(table(tmp_path), columns)
     assert right in str(told.value)
-    with pytest.raises(InvalidInput, match="only --format table takes columns; those of highD are known"):
+    with pytest.raises(InvalidInput, match="the columns of highD are known; leave out --columns"):
         scenario_from_data("mine", tmp_path, "highd", columns=COLUMNS)
 
 
@@ -208,12 +213,12 @@ def test_ind_and_round__are_refused_by_name(name: str, tmp_path: Path) -> None:
     file = exid(tmp_path, 0.0) / "03_tracks.csv"
     lines = [",".join(line.split(",")[:17]) for line in file.read_text().splitlines()]
     file.write_text("\n".join([*lines, ""]))
-    with pytest.raises(InvalidInput, match=r"03_tracks.csv: this is inD or rounD, which has no lanes to follow"):
+    with pytest.raises(InvalidInput, match=r"03_tracks.csv: is a file of inD or rounD, which cannot be used"):
         scenario_from_data("mine", tmp_path, name)  # type: ignore[arg-type]
 
 
 def test_other_format__is_named(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInput, match=r"03_tracks.csv: is not highD; this is exiD"):
+    with pytest.raises(InvalidInput, match=r"03_tracks.csv: is not a file of highD, but of exiD"):
         scenario_from_data("mine", exid(tmp_path, 0.0), "highd")
 
 

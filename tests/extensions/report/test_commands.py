@@ -28,7 +28,7 @@ def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command,
     assert ethbrake(*line, folder, "--per-world", "csv", "--report").status == 0
     (folder / "mine.txt").write_text("mine")
     assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "report.html", "results.json", "worlds.csv"]
-    check_refused(ethbrake(*line, folder), "results.json: is there already")
+    check_refused(ethbrake(*line, folder), "results.json: already exists")
     assert ethbrake(*line, folder, "--force", "--per-world", "parquet").status == 0
     assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "results.json", "worlds.parquet"]
 
@@ -40,7 +40,7 @@ def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finishe
     assert told["intervals"] == "paired" and policies["trained policy"] == "same"
     assert all(each["total_harm_difference_interval"] == [0.0, 0.0] for each in told["agents"])
     tests = ethbrake("compare", results, finished_run / "other_tests.json")
-    check_refused(tests, "each test needs a file of its own")
+    check_refused(tests, "write the results of each test to its own file")
     page = (finished_run / "report.html").read_text()
     assert all(json.loads(results.read_text())[0][name] in page for name in ("worlds_sha256", "scenario_sha256"))
     for count in ("first", "total"):
@@ -49,7 +49,7 @@ def test_compare__a_run_its_report_and_shields_are_results_too(ethbrake, finishe
     told = told_json(ethbrake("compare", tmp_path / "first.json", tmp_path / "first.json", "--json"))
     found = {each["agent"]: each["harm_difference"] for each in told["agents"]}
     assert found == {f"full_brake ({mode})": 0.0 for mode in ("none", "episode", "step", "step-alert")}
-    check_refused(ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json"), "is about another harm than")
+    check_refused(ethbrake("compare", tmp_path / "first.json", tmp_path / "total.json"), "their counts of harm differ")
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -59,7 +59,7 @@ def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
     )
     assert answer.status == 0, answer.err
     text = Path("r/report.html").read_text()
-    assert "minus episode mode" in text and "First-impact harm, which the shield bounds" in text
+    assert "minus episode mode" in text and "First-impact harm in m²/s²; the shield bounds this harm" in text
 
 
 def test_target__that_cannot_be_replaced_is_refused_before_any_work(
@@ -82,7 +82,10 @@ def test_film__of_an_extra_that_is_missing_says_the_line_that_installs_it(ethbra
 
 
 REFUSED = [
-    ("watch --agents nobody --output x.txt", "a film that ends in '.txt': films are written as .gif, .mp4, .svg")
+    (
+        "watch --agents nobody --output x.txt",
+        "film with the file ending '.txt': the ending must be one of .gif, .mp4, .svg",
+    )
 ]
 
 
@@ -93,5 +96,5 @@ def test_film__is_refused(line: str, message: str, refuse: Refuse) -> None:
 
 def test_film__that_is_there_is_not_replaced_unasked(refuse: Refuse) -> None:
     Path("film.gif").write_text("precious")
-    told = "film.gif: is there already; give another name or use force (--force)"
+    told = "film.gif: already exists; give another name, or replace the file with force (--force)"
     refuse("watch --agents full_brake --output film.gif", told)

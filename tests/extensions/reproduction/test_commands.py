@@ -29,13 +29,13 @@ def test_items__of_the_paper_need_no_torch() -> None:
 REFUSED = [
     ("reproduce harm-delay", "unknown item 'harm-delay'; did you mean 'harm-delays'?"),
     ("reproduce gaps gaps", "item 'gaps' is given twice"),
-    ("reproduce --quick --full", "--quick and --full: give one of the two"),
+    ("reproduce --quick --full", "--quick and --full exclude each other; give one of them"),
     (
         "reproduce gaps --episodes 1",
         "Invalid value for '--episodes': must be greater than or equal to 2 (see: ethbrake reproduce --help)",
     ),
-    ("reproduce gaps --docs nowhere/all.json", "nowhere/all.json: there is no folder nowhere; make it first"),
-    ("reproduce gaps --docs page.md", "page.md: must end in .json"),
+    ("reproduce gaps --docs nowhere/all.json", "nowhere/all.json: the folder nowhere does not exist; create it first"),
+    ("reproduce gaps --docs page.md", "page.md: the name of the file must end in .json"),
 ]
 
 

@@ -35,5 +35,5 @@ def test_proofs__cover_an_obstacle_that_full_braking_never_meets() -> None:
 
 def test_proof__of_an_obstacle_that_full_braking_meets_is_refused() -> None:
     near = ALL.replace(obstacle_gap_m={"uniform": [10, 45]})
-    with refused("avoidability: obstacle_gap_m[0] = 33.6372: must be beyond full braking of vehicle_1"):
+    with refused("avoidability: obstacle_gap_m[0] = 33.6372: must be greater than the stopping distance of vehicle_1"):
         avoidability(near.sample(200, 7).worlds)
