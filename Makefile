@@ -1,9 +1,9 @@
-# Everything runs in the project's own environment, .venv, made from Python >= 3.11, this file and .ci/install.
-# TORCH_INDEX: index to take torch from, e.g. make run TORCH_INDEX=ADDRESS; without it uv picks the build (see below)
-# PYTHON:      the interpreter that makes the environment, when the first one found is not the one wanted.
-# ARGS:        passed on by `make run` (to `ethbrake run`), `make test` (to pytest) and the long programmes.
-# NAME:        of the programme that `make programme` runs.
-# WORKERS:     processes of `make test`. 0: one process, as a debugger needs.
+# Everything runs in the project's own environment, .venv. This file and .ci/install make it with Python >= 3.11.
+# TORCH_INDEX: package index for torch, e.g. make run TORCH_INDEX=ADDRESS. Default: uv chooses the build.
+# PYTHON:      Python that makes the environment. Default: the first suitable one.
+# ARGS:        arguments for `ethbrake run` (make run), pytest (make test) and the programmes.
+# NAME:        name of the programme that `make programme` runs.
+# WORKERS:     number of processes of `make test`; 0: one process, for a debugger.
 
 SHELL := /bin/sh
 VENV := .venv
@@ -17,27 +17,28 @@ ARGS ?=
 WORKERS ?= 2
 NAME ?=
 INSTALL := sh .ci/install $(VENV)
-# uv compiles nothing (all of it would take 48 CPU-s). Python compiles what it imports, once, unless this is passed on.
+# uv does not compile the installed files (this would take 48 CPU-s). Python compiles a file when it is first imported, and
+# stores the result, unless this variable is set.
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help venv run test core lint docs figures programme clean
 
 help:
-	@echo "make venv             the environment alone: $(VENV)"
-	@echo "make run [ARGS=...]   train, evaluate and report in runs/ (ethbrake run)"
-	@echo "make core [ARGS=...]   a copy without any extension passes the core's tests, trains, evaluates and shields"
-	@echo "make test [ARGS=...]  the test suite, without the tests marked slow or long (.ci/run runs the slow ones, too)"
-	@echo "make lint             ruff, ruff format --check, mypy --strict, deptry, import-linter"
-	@echo "make docs             the documentation site, its notebooks run: docs/_build/html; a warning is an error"
-	@echo "make figures          the printed blocks, tables and pictures of README and docs made again and compared (minutes)"
-	@echo "make programme NAME=NAME [ARGS=...]  a long programme (python -m tests.programmes); without a name they are listed"
-	@echo "make clean            remove $(VENV), .venvs, caches and builds (runs/ stays)"
-	@echo "TORCH_INDEX=URL       take torch from this index; else uv picks the build for this machine"
+	@echo "make venv             make only the environment $(VENV)"
+	@echo "make run [ARGS=...]   train, evaluate and write a report to runs/ (ethbrake run)"
+	@echo "make core [ARGS=...]   check a copy without extensions: tests of the core, training, evaluation, shield"
+	@echo "make test [ARGS=...]  run the tests, except those marked slow or long (.ci/run also runs the slow tests)"
+	@echo "make lint             check the code: ruff, ruff format --check, mypy --strict, deptry, import-linter"
+	@echo "make docs             build the site in docs/_build/html and run its notebooks; a warning is an error"
+	@echo "make figures          make blocks, tables and pictures of README and docs again, and compare them (minutes)"
+	@echo "make programme NAME=NAME [ARGS=...]  run a long check (python -m tests.programmes); without NAME list all"
+	@echo "make clean            delete $(VENV), .venvs, caches and builds, but not runs/"
+	@echo "TORCH_INDEX=URL       package index for torch; default: uv chooses the build for this machine"
 
 venv: $(STAMP)
 
-# The stamp holds the folder it was made in: an environment copied or moved along would run the code of the old folder.
+# The stamp contains the folder of its environment. A copied or moved environment would use the code of the old folder.
 MADE_IN := $(shell cat $(STAMP) 2>/dev/null)
 ifneq ($(MADE_IN),$(CURDIR))
 .PHONY: $(STAMP)
@@ -55,8 +56,8 @@ $(STAMP): pyproject.toml constraints.txt
 	  fi; \
 	done; \
 	if [ -z "$$found" ]; then \
-	  echo "error: needs Python 3.11 or newer; $(or $(PYTHON),python3) gives: $$("$(or $(PYTHON),python3)" --version 2>&1)" >&2; \
-	  echo "       Install one, or name it: make $(firstword $(MAKECMDGOALS)) PYTHON=/path/to/python3.11" >&2; \
+	  echo "error: Python 3.11 or newer is needed; $(or $(PYTHON),python3) gives: $$("$(or $(PYTHON),python3)" --version 2>&1)" >&2; \
+	  echo "       Install it, or give its path: make $(firstword $(MAKECMDGOALS)) PYTHON=/path/to/python3.11" >&2; \
 	  exit 1; \
 	fi; \
 	echo "== Using $$("$$found" --version) ($$(command -v "$$found"))"; \
@@ -66,16 +67,16 @@ $(STAMP): pyproject.toml constraints.txt
 	fi
 	@echo "== Installing ethbrake_marl"
 	@$(INSTALL) -e .
-	@echo "== Compiling the physics, beside the rest of the installation"
+	@echo "== Compiling the physics in the background"
 	@PYTHONPATH="$(CURDIR)" $(BIN)/python -c "from ethbrake_marl.cli import doctor; raise SystemExit(not doctor.compile_ahead(training=False, run_alone=True)[0])" & \
 	compiling=$$!; \
 	trap "kill $$compiling" INT TERM; \
-	echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv looks for the build for this machine)"; \
+	echo "== Installing torch$(if $(TORCH_INDEX), from $(TORCH_INDEX),: uv chooses the build for this machine)"; \
 	$(INSTALL) --torch "$(TORCH_INDEX)" || exit; \
-	echo "== Installing what it needs to train and to be tested, at the versions of constraints.txt"; \
+	echo "== Installing the packages for training and tests, at the versions of constraints.txt"; \
 	$(INSTALL) -e ".[train,dev]" || exit; \
 	wait $$compiling || \
-	  echo "== not all could be compiled (above): the rest is compiled when it is needed" >&2
+	  echo "== Some of the physics could not be compiled (see above); it is compiled when it is needed" >&2
 	@echo "== torch $$($(BIN)/python -c 'from importlib.metadata import version; print(version("torch"))')"
 	@$(BIN)/ethbrake evaluate --help >/dev/null
 	@echo "$(CURDIR)" > $@
@@ -100,13 +101,13 @@ lint: $(STAMP)
 	@$(BIN)/python -m ruff format --check .
 	@echo "== mypy --strict"
 	@$(BIN)/python -m mypy --strict ethbrake_marl tests/every_public_name.py
-	@echo "== deptry: every package that is imported is asked for, and the other way round"
+	@echo "== deptry: the imported packages are the required packages"
 	@$(BIN)/deptry ethbrake_marl
-	@echo "== import-linter: imports point down, without a circle"
+	@echo "== import-linter: imports only from lower folders, without circles"
 	@$(BIN)/lint-imports --no-cache
 
 $(DOCS_STAMP): $(STAMP)
-	@echo "== Installing what builds the site"
+	@echo "== Installing the packages for the site"
 	@$(INSTALL) -e ".[docs]"
 	@touch $@
 
@@ -116,7 +117,7 @@ docs: $(DOCS_STAMP)
 	@echo "== docs/_build/html/index.html"
 
 figures: $(STAMP)
-	@echo "== what the pages show, made again"
+	@echo "== make the blocks, tables and pictures of the pages again"
 	@$(PROGRAMME) figures $(ARGS)
 
 programme: $(STAMP)

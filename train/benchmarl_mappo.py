@@ -3,8 +3,8 @@
     python train/benchmarl_mappo.py --scenario cooperation-3-pair --steps 200000 --output runs/mappo
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@runs/mappo
 
-`ethbrake train --set scheme=centralised` trains the same kind of team (one actor for all, a critic on the state of the
-line) without the extra, with checkpoints and measuring on the way; this file is for those who use BenchMARL.
+`ethbrake train --set scheme=centralised` trains the same kind of team (one shared actor, a critic on the state of the
+line) without the extra, and with checkpoints and evaluations. This file is for users of BenchMARL.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ from ethbrake_marl.training.training import Training
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
-    """Train with the numbers of a recipe, into the new folder `output`."""
+    """Train MAPPO with the hyperparameters of a PPO recipe, and save the run in the new folder `output`.
+
+    Raises `InvalidInput` if the recipe is not for PPO, and `MissingExtra` without BenchMARL.
+    """
     line, plan = eb.load_scenario(scenario), load_recipe(recipe).replace(total_steps=steps, seed=seed)
     if not isinstance(plan, PpoRecipe):
         raise InvalidInput(f"recipe {plan.name!r}: is for {plan.algorithm.upper()}; MAPPO needs one for PPO")
@@ -39,11 +42,11 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
 
 
 def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path, algorithm: str = "mappo") -> Policy:
-    """Train BenchMARL's MAPPO with the numbers of `recipe`, and leave the shared actor in the new `directory`.
+    """Train BenchMARL's MAPPO with the hyperparameters of `recipe`, and save the shared actor in the new `directory`.
 
-    `algorithm` may also be "ippo", whose critic sees what the actor does. `load_team` and `ppo@DIRECTORY` take it. The
-    learning rate stays at its start, as BenchMARL has no schedule; there are no checkpoints and nothing is measured on
-    the way.
+    `algorithm` may also be "ippo", whose critic has the observation of the actor. `load_team` and `ppo@DIRECTORY` load
+    the result. The learning rate keeps its initial value, because BenchMARL has no schedule. There are no checkpoints
+    and no evaluations during the training.
     """
     from ethbrake_marl.training.random_state import own_random_state
 
@@ -63,7 +66,7 @@ def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path, algor
 
 
 def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str, algorithm: str = "mappo") -> Any:
-    """An experiment with the numbers of `recipe`; what BenchMARL writes of its own goes to the folder `scratch`."""
+    """Return a BenchMARL experiment with the hyperparameters of `recipe`. BenchMARL writes its files to `scratch`."""
     import torch
     from benchmarl.algorithms import algorithm_config_registry
     from benchmarl.experiment import Experiment, ExperimentConfig
@@ -96,7 +99,7 @@ def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str, algo
 
 
 def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Policy:
-    """The shared actor of an experiment as a policy; its mean is squashed by the hyperbolic tangent."""
+    """Return the shared actor of an experiment as a policy; the hyperbolic tangent limits its mean to [-1, 1]."""
     from torchrl.modules import MultiAgentMLP
 
     (actor,) = (m for m in experiment.group_policies["learners"].modules() if isinstance(m, MultiAgentMLP))
@@ -123,23 +126,23 @@ def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Poli
 
 
 def tensors_of(actor: Any, hidden: int) -> dict[str, NDArray[np.float32]]:
-    """The actor's layers under the names of our table; its last one gives the mean, then the noise."""
-    found: dict[str, NDArray[np.float32]] = {}
+    """Return the weights of the actor by the names of `NetworkSpec.tensors`. The last layer gives mean and noise."""
+    tensors: dict[str, NDArray[np.float32]] = {}
     for k in range(hidden + 1):
         for part in ("weight", "bias"):
             values = actor.params[str(2 * k), part].detach().cpu().numpy().astype(np.float32)
             if k < hidden:
-                found[f"policy.{k}.{part}"] = values
+                tensors[f"policy.{k}.{part}"] = values
             else:
-                found[f"policy.output.{part}"], found[f"policy.log_std.{part}"] = values[:1], values[1:]
-    return found
+                tensors[f"policy.output.{part}"], tensors[f"policy.log_std.{part}"] = values[:1], values[1:]
+    return tensors
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="cooperation-3-pair", help="a shipped scenario, or a YAML file")
     parser.add_argument("--recipe", default="cooperation-ppo", help="a shipped PPO recipe, or a YAML file")
-    parser.add_argument("--steps", type=int, default=200_000, help="decisions of learners")
+    parser.add_argument("--steps", type=int, default=200_000, help="decisions of all learners together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/mappo"), help="new folder")
     given = parser.parse_args()

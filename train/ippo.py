@@ -3,8 +3,9 @@
     python train/ippo.py --scenario cooperation-3-pair --output runs/ippo
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/ippo
 
-Each learner has an actor, a critic and an optimiser of its own, and sees the others as part of its environment. All
-learn at once, from the same episodes. In `train/mappo.py` one critic sees the whole line instead.
+Each learner has its own actor, critic and optimiser, and the other learners are part of its environment. All learners
+learn at the same time, from the same episodes. In `train/mappo.py` one critic observes the whole line instead. Letters:
+T time steps, C copies, F features.
 """
 
 from __future__ import annotations
@@ -24,36 +25,36 @@ from ethbrake_marl.errors import EthBrakeError, check_whole_number
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.training.own_team import save_team
 
-# 1. Settings. Each of them is an option of the command as well.
+# 1. Settings. Each is also an option of the command.
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to train, and the numbers of PPO."""
+    """What to train, and the hyperparameters of PPO."""
 
     scenario: str = "cooperation-3-pair"  # a shipped name, or the path of a YAML file
     steps: int = 1_500_000  # decisions of all learners together
     seed: int = 0
     output: Path = Path("runs/ippo")  # a new folder
     harm_count: str = "first"  # which impacts the reward counts: the "first" of each pair, or "total"
-    copies: int = 64  # episodes side by side
+    copies: int = 64  # parallel copies of the environment
     rollout: int = 64  # time steps of each copy between two updates
     epochs: int = 4
     minibatch: int = 512
     hidden: int = 64  # width of each of the two hidden layers
-    learning_rate: float = 2e-3  # at the start; falls linearly to 0
-    gamma: float = 1.0  # later harm counts in full
+    learning_rate: float = 2e-3  # at the start; decreases linearly to 0
+    gamma: float = 1.0  # no discount: later harm counts fully
     gae_lambda: float = 0.95
     clip: float = 0.2
-    mean: float = -0.7  # of the actions, at the start: where nothing is at stake, a vehicle goes on braking
-    log_std: float = -0.5  # likewise
+    mean: float = -0.7  # mean of the actions at the start: where actions do not matter, a vehicle keeps braking
+    log_std: float = -0.5  # logarithm of the actions' standard deviation at the start
 
 
-# 2. Networks. An actor gives the mean of a Gaussian. The environment takes actions in [-1, 1]: collect() clips them.
+# 2. Networks. An actor returns a Gaussian. The environment accepts actions in [-1, 1]; collect() clips them.
 
 
 def perceptron(inputs: int, hidden: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Two hidden layers and one output, with the initial weights that are usual for PPO."""
+    """Return a network with two hidden layers, one output and the usual initial weights of PPO."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, 1)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -72,27 +73,27 @@ class Learner(nn.Module):
         self.optimiser = torch.optim.Adam(self.parameters(), settings.learning_rate, eps=1e-5)
 
     def actions(self, seen: Tensor) -> Normal:
-        """The distribution of actions [..., 1] for observations [..., F]."""
+        """Return the distribution of actions [..., 1] for observations [..., F]."""
         return Normal(self.mean(seen), self.log_std.exp())
 
 
-# 3. Collect T time steps of C copies of the environment. A copy whose episode is over begins the next one at once.
-#    The horizon ends an episode like any other end: harm after it does not count.
+# 3. Collect T time steps of C copies of the environment. When an episode ends, its copy starts the next one at once.
+#    The horizon ends an episode, too: later harm does not count.
 
 
 class Rollout:
-    """What one learner saw, did and got."""
+    """Observations, actions and rewards of one learner."""
 
     def __init__(self, features: int, settings: Settings) -> None:
         steps, copies = settings.rollout, settings.copies
-        self.seen = torch.zeros(steps + 1, copies, features)  # the last row is seen after the last step
-        self.actions = torch.zeros(steps, copies, 1)  # before they are clipped
+        self.seen = torch.zeros(steps + 1, copies, features)  # the last row is the observation after the last step
+        self.actions = torch.zeros(steps, copies, 1)  # before clipping
         self.rewards = torch.zeros(steps, copies)
-        self.ended = torch.zeros(steps, copies)  # 1 where the episode ended with this step
+        self.ended = torch.zeros(steps, copies)  # 1 if this step ended the episode
 
 
 class Copies:
-    """Copies of the environment, each with worlds of its own. Their only agents are the learners."""
+    """Parallel copies of the environment, each with its own worlds. Their only agents are the learners."""
 
     def __init__(self, settings: Settings) -> None:
         reward = {"harm": 0.05, "harm_count": settings.harm_count, "terminal": 0.02}  # returns are of order 1
@@ -103,7 +104,7 @@ class Copies:
 
     @torch.no_grad()
     def collect(self, learners: dict[str, Learner], settings: Settings) -> tuple[dict[str, Rollout], list[float]]:
-        """A rollout of each learner, and the harm of each episode that ended."""
+        """Return a rollout per learner, and the harm of each episode that ended."""
         rollouts = {name: Rollout(self.seen[0][name].size, settings) for name in learners}
         harms: list[float] = []
         for t in range(settings.rollout):
@@ -122,7 +123,7 @@ class Copies:
         return rollouts, harms
 
     def observations(self, name: str) -> Tensor:
-        """What a learner sees in every copy, [C, F]."""
+        """Return the learner's observations in all copies, [C, F]."""
         return torch.from_numpy(np.stack([seen[name] for seen in self.seen]))
 
 
@@ -130,7 +131,7 @@ class Copies:
 
 
 def advantages(own: Rollout, values: Tensor, settings: Settings) -> Tensor:
-    """A_t = r_t - V_t + gamma (V_t+1 + lambda A_t+1), [T, C]; without the bracket where the episode ended."""
+    """A_t = r_t - V_t + gamma (V_t+1 + lambda A_t+1), [T, C]; at the end of an episode the bracket is 0."""
     result, after = torch.zeros_like(own.rewards), torch.zeros_like(own.rewards[0])
     for t in reversed(range(len(result))):
         ahead = settings.gamma * (values[t + 1] + settings.gae_lambda * after)
@@ -139,7 +140,7 @@ def advantages(own: Rollout, values: Tensor, settings: Settings) -> Tensor:
 
 
 def update(learner: Learner, own: Rollout, settings: Settings) -> None:
-    """Learn from one rollout."""
+    """Improve the networks of one learner with one rollout."""
     seen, actions = own.seen[:-1].flatten(0, 1), own.actions.flatten(0, 1)
     with torch.no_grad():
         values = learner.critic(own.seen)[..., 0]
@@ -163,7 +164,7 @@ def update(learner: Learner, own: Rollout, settings: Settings) -> None:
 
 
 def train(settings: Settings, folder: Path) -> None:
-    """Train for at least `steps` decisions, and write the team into `folder`."""
+    """Train for at least `settings.steps` decisions, and save the team in `folder`."""
     torch.set_num_threads(1)
     torch.manual_seed(settings.seed)
     copies = Copies(settings)

@@ -3,8 +3,9 @@
     python train/mappo.py --scenario cooperation-3-pair --output runs/mappo
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/mappo
 
-Each learner has an actor of its own, which sees what its vehicle knows. One critic, for training alone, sees the full
-state of the line, `state()`, and predicts the return of each learner. The rest is as in `train/ippo.py`.
+Each learner has its own actor, which observes what its vehicle knows. One critic observes the full state of the line,
+`state()`, and predicts the return of each learner; it is used only in training. Everything else is as in
+`train/ippo.py`. Letters: T time steps, C copies, L learners, F features, S size of the state.
 """
 
 from __future__ import annotations
@@ -24,36 +25,36 @@ from ethbrake_marl.errors import EthBrakeError, check_whole_number
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.training.own_team import save_team
 
-# 1. Settings. Each of them is an option of the command as well.
+# 1. Settings. Each is also an option of the command.
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to train, and the numbers of PPO."""
+    """What to train, and the hyperparameters of PPO."""
 
     scenario: str = "cooperation-3-pair"  # a shipped name, or the path of a YAML file
     steps: int = 1_000_000  # decisions of all learners together
     seed: int = 0
     output: Path = Path("runs/mappo")  # a new folder
     harm_count: str = "first"  # which impacts the reward counts: the "first" of each pair, or "total"
-    copies: int = 64  # episodes side by side
+    copies: int = 64  # parallel copies of the environment
     rollout: int = 64  # time steps of each copy between two updates
     epochs: int = 4
     minibatch: int = 512
     hidden: int = 64  # width of each of the two hidden layers
-    learning_rate: float = 2e-3  # at the start; falls linearly to 0
-    gamma: float = 1.0  # later harm counts in full
+    learning_rate: float = 2e-3  # at the start; decreases linearly to 0
+    gamma: float = 1.0  # no discount: later harm counts fully
     gae_lambda: float = 0.95
     clip: float = 0.2
-    mean: float = -0.7  # of the actions, at the start: where nothing is at stake, a vehicle goes on braking
-    log_std: float = -0.5  # likewise
+    mean: float = -0.7  # mean of the actions at the start: where actions do not matter, a vehicle keeps braking
+    log_std: float = -0.5  # logarithm of the actions' standard deviation at the start
 
 
-# 2. Networks. An actor gives the mean of a Gaussian. The environment takes actions in [-1, 1]: collect() clips them.
+# 2. Networks. An actor returns a Gaussian. The environment accepts actions in [-1, 1]; collect() clips them.
 
 
 def perceptron(inputs: int, hidden: int, outputs: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Two hidden layers, with the initial weights that are usual for PPO."""
+    """Return a network with two hidden layers and the usual initial weights of PPO."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, outputs)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -62,7 +63,7 @@ def perceptron(inputs: int, hidden: int, outputs: int, last_gain: float, last_bi
 
 
 class Actor(nn.Module):
-    """The distribution of actions [..., 1] for observations [..., F]."""
+    """Actor of one vehicle: returns the distribution of actions [..., 1] for observations [..., F]."""
 
     def __init__(self, features: int, settings: Settings) -> None:
         super().__init__()
@@ -73,22 +74,22 @@ class Actor(nn.Module):
         return Normal(self.mean(seen), self.log_std.exp())
 
 
-# 3. Collect T time steps of C copies of the environment. A copy whose episode is over begins the next one at once.
+# 3. Collect T time steps of C copies of the environment. When an episode ends, its copy starts the next one at once.
 
 
 @dataclass
 class Rollout:
-    """What the learners saw, did and got."""
+    """Observations, actions and rewards of all learners."""
 
-    seen: dict[str, Tensor]  # [T, C, F] of each learner
-    states: Tensor  # [T + 1, C, S] the last row is the state after the last step
-    actions: Tensor  # [T, C, L] before they are clipped
+    seen: dict[str, Tensor]  # learner -> observations [T, C, F]
+    states: Tensor  # [T + 1, C, S]; the last row is the state after the last step
+    actions: Tensor  # [T, C, L], before clipping
     rewards: Tensor  # [T, C, L]
-    ended: Tensor  # [T, C, 1] 1 where this step ended the episode; the horizon is an end like any other
+    ended: Tensor  # [T, C, 1]; 1 if this step ended the episode, also at the horizon
 
 
 class Copies:
-    """Copies of the environment, each with worlds of its own. Their only agents are the learners."""
+    """Parallel copies of the environment, each with its own worlds. Their only agents are the learners."""
 
     def __init__(self, settings: Settings) -> None:
         reward = {"harm": 0.05, "harm_count": settings.harm_count, "terminal": 0.02}  # returns are of order 1
@@ -99,7 +100,7 @@ class Copies:
 
     @torch.no_grad()
     def collect(self, actors: dict[str, Actor], steps: int) -> tuple[Rollout, list[float]]:
-        """A rollout, and the harm of each episode that ended."""
+        """Return a rollout, and the harm of each episode that ended."""
         seen: dict[str, list[Tensor]] = {name: [] for name in actors}
         states, actions, rewards, ended, harms = [self.states()], [], [], [], []
         for _ in range(steps):
@@ -124,7 +125,7 @@ class Copies:
 
 
 def advantages(rollout: Rollout, values: Tensor, settings: Settings) -> Tensor:
-    """A_t = r_t - V_t + gamma (V_t+1 + lambda A_t+1), [T, C, L]; without the bracket where the episode ended."""
+    """A_t = r_t - V_t + gamma (V_t+1 + lambda A_t+1), [T, C, L]; at the end of an episode the bracket is 0."""
     result, after = torch.zeros_like(rollout.rewards), torch.zeros_like(rollout.rewards[0])
     for t in reversed(range(len(result))):
         ahead = settings.gamma * (values[t + 1] + settings.gae_lambda * after)
@@ -146,7 +147,7 @@ class Team:
         return torch.cat([self.actors[name](seen[name][rows]).log_prob(action) for name, action in own], dim=-1)
 
     def update(self, rollout: Rollout, settings: Settings) -> None:
-        """Learn from one rollout."""
+        """Improve the actors and the critic with one rollout."""
         seen = {name: rows.flatten(0, 1) for name, rows in rollout.seen.items()}
         states, actions = rollout.states[:-1].flatten(0, 1), rollout.actions.flatten(0, 1)
         with torch.no_grad():
@@ -168,7 +169,7 @@ class Team:
 
 
 def train(settings: Settings, folder: Path) -> None:
-    """Train for at least `steps` decisions, and write the team into `folder`."""
+    """Train for at least `settings.steps` decisions, and save the team in `folder`."""
     torch.set_num_threads(1)
     torch.manual_seed(settings.seed)
     copies = Copies(settings)

@@ -1,14 +1,19 @@
-"""A policy with a memory (GRU), shared by all learners, for messages that come late or never. Read it top to bottom.
+"""A policy with a memory (GRU), shared by all learners, for late and lost messages. Read it from top to bottom.
 
     ethbrake scenario new lossy --based-on cooperation-3-pair     # then: v2x: {preset: blocked, persistence: periodic}
     python train/recurrent.py --scenario lossy.yaml --output runs/gru
     ethbrake evaluate --scenario lossy.yaml --agents full_brake,train/recurrent.py:make_agent:runs/gru
 
-What is known of others grows old between two messages, and one observation does not say how it came about; a memory
-may. Plain policy gradients through whole episodes, on arrays of all learners (docs/environments.md). ``--memoryless``
-trains the same without a memory, to compare: ages and estimates of what is known seem to say enough. First-impact harm
-on 2,000 worlds of seed 7 after ``--updates 500`` is 23.32 with it and 22.66 without, full braking's 44.83; after 200
-(seeds 0 and 1) 27.01 and 27.07 with it, 25.98 and 25.33 without (one thread, AMD EPYC, 2026-11-24).
+Information about other vehicles grows old between two messages. A memory can use earlier observations, too. The
+training is a plain policy gradient on whole episodes, on arrays of all learners (docs/environments.md).
+``--memoryless`` trains the same policy without a memory, for comparison. In these trainings the memory did not help, so
+the ages of the messages seem to be enough. First-impact harm on 2,000 worlds of
+seed 7 (one thread, AMD EPYC, 2026-11-24):
+
+    agent                                              with memory     without memory
+    after ``--updates 500``                            23.32           22.66
+    after ``--updates 200``, seeds 0 and 1             27.01, 27.07    25.98, 25.33
+    full braking                                                       44.83
 """
 
 from __future__ import annotations
@@ -26,33 +31,33 @@ from torch import Tensor, nn
 import ethbrake_marl as eb
 from ethbrake_marl.files.store import new_folder
 
-# 1. What is observed, unless the scenario says it: also how old news is, and which of the vehicles it is.
+# 1. Default observation, if the scenario has none: also the age of the news, and the vehicle's place in the line.
 
 OBSERVATION = ["own", "front_1", "rear_1", "front_1.age", "rear_1.age", "place"]
 HIDDEN, NOISE, RATE = 64, 0.3, 3e-3
 
 
-# 2. The network: what is seen and remembered [rows, F], [rows, H] -> the mean of the action [rows], the new memory.
+# 2. The network: observation [rows, F] and memory [rows, H] -> mean of the action [rows] and new memory [rows, H].
 
 
 class Recurrent(nn.Module):
-    """A GRU cell and a linear head; without a memory each step begins with an empty one."""
+    """A GRU cell and a linear head. With `remembers=False` the memory is 0 at the beginning of each step."""
 
     def __init__(self, features: int, remembers: bool) -> None:
         super().__init__()
         self.cell, self.head, self.remembers = nn.GRUCell(features, HIDDEN), nn.Linear(HIDDEN, 1), remembers
 
     def forward(self, seen: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """The mean of the action, and what is remembered."""
+        """Return the mean of the action [rows] and the new memory [rows, H]."""
         memory = self.cell(seen, memory if self.remembers else torch.zeros_like(memory))
         return self.head(memory)[:, 0], memory
 
 
-# 3. Training: every update plays the next n worlds of the stream to their ends, then learns from all decisions.
+# 3. Training: every update simulates the next n episodes, and then learns from all their decisions.
 
 
 def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespace) -> Recurrent:
-    """The trained network; what it does is told every ten updates."""
+    """Return the trained network. Print its harm every ten updates."""
     torch.manual_seed(args.seed)
     engine = eb.make_engine(scenario, args.worlds, observation=observation, seed=args.seed)
     learners, shape = list(engine.learners), (engine.n, len(engine.learners))
@@ -66,7 +71,7 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
             running = torch.from_numpy(~engine.ended)[:, None]
             seen = torch.from_numpy(engine.observe_all()).flatten(0, 1)
             mean, memory = network(seen, memory)
-            policy: Any = torch.distributions.Normal(mean.view(shape), NOISE)  # torch's are untyped
+            policy: Any = torch.distributions.Normal(mean.view(shape), NOISE)  # torch's distributions are untyped
             actions = policy.sample()
             step = engine.step(actions.clamp(-1, 1).numpy())
             chosen.append(policy.log_prob(actions) * running)
@@ -83,15 +88,15 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
     return network
 
 
-# 4. The agent, which the command line makes of this file and the folder: its memory is an array, a row for each world.
+# 4. The agent that the command line makes from this file and the folder. Its memory is an array with a row per world.
 
 
 def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
-    """What drives one vehicle by the network in a folder."""
+    """Return an agent that uses the network in `folder`."""
     with safe_open(Path(folder) / "network.safetensors", "numpy") as file:
-        told = json.loads(file.metadata()["told"])
+        content = json.loads(file.metadata()["content"])
         tensors = {name: torch.from_numpy(file.get_tensor(name)) for name in file.keys()}  # noqa: SIM118  # no mapping
-    network = Recurrent(tensors["cell.weight_ih"].shape[1], told["remembers"])
+    network = Recurrent(tensors["cell.weight_ih"].shape[1], content["remembers"])
     network.load_state_dict(tensors)
 
     def decide(seen: Any, memory: Any) -> tuple[Any, Any]:
@@ -102,14 +107,14 @@ def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
     return eb.policy_agent(
         decide,
         name="recurrent",
-        observation=told["observation"],
+        observation=content["observation"],
         initial_state=lambda n: torch.zeros(n, HIDDEN).numpy(),
         clip=True,
     )
 
 
 def main() -> None:
-    """Train, and write the network with what it observes."""
+    """Train, and save the network with the names of its features."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="cooperation-3-congested")
     parser.add_argument("--output", type=Path, required=True)
@@ -122,9 +127,9 @@ def main() -> None:
     observation = list(scenario.observation or OBSERVATION)
     with new_folder(args.output) as folder:
         network = train(scenario, observation, args)
-        told = {"observation": observation, "remembers": network.remembers}
+        content = {"observation": observation, "remembers": network.remembers}
         arrays = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-        save_file(arrays, folder / "network.safetensors", {"told": json.dumps(told)})
+        save_file(arrays, folder / "network.safetensors", {"content": json.dumps(content)})
 
 
 if __name__ == "__main__":

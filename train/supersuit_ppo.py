@@ -1,11 +1,11 @@
-"""PettingZoo -> SuperSuit -> Stable-Baselines3's PPO, several learners sharing one policy. Read it from top to bottom.
+"""Several learners share one policy: PettingZoo, SuperSuit and Stable-Baselines3's PPO. Read it from top to bottom.
 
     python train/supersuit_ppo.py --scenario cooperation-3-pair --steps 200000 --output runs/supersuit
     ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,ppo@runs/supersuit
 
-The native way, `ethbrake train --set scheme=shared`, does the same many times faster, and goes on after a crash; this
-file is for those who build on PettingZoo. SuperSuit 3.11 has four traps on this way. Each is closed where it says
-"trap".
+`ethbrake train --set scheme=shared` trains the same policy many times faster, and can resume after a crash. This file
+is for programs that use PettingZoo. SuperSuit 3.11 has four pitfalls; comments with the word "trap" say how each is
+avoided.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.networks import tensors_of
 from ethbrake_marl.training.training import Training
 
-# 1. What to train: the same settings as train/ppo.yaml, in smaller networks.
+# 1. What to train: as in train/ppo.yaml, with smaller networks.
 
 REWARD = {"harm": 0.05, "terminal": 0.02, "shaping": 0.05, "shaping_discount": 0.995}
 HIDDEN = [64, 64]
-COPIES, STEPS_PER_ROLLOUT = 32, 64  # worlds side by side; decisions of each learner between two updates
+COPIES, STEPS_PER_ROLLOUT = 32, 64  # parallel worlds; decisions of each learner between two updates
 
 
-# 2. The environment. A vehicle that follows a script is an agent too, but what it is told to do is ignored: learning
-#    from its rows would be learning from noise. So only the learners are shown to SuperSuit. They all end together, so
-#    no agent ever leaves early (trap: black_death_v3 would add a phantom step for those that do).
+# 2. The environment. Vehicles that follow scripts are agents, too, but their actions are ignored, so nothing can be
+#    learned from them. Therefore SuperSuit gets only the learners. All learners end at the same time, so no agent
+#    leaves early (trap: black_death_v3 would add an extra step for agents that leave early).
 
 
 class LearnersOnly(BaseParallelWrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """The learners of a line as the only agents."""
+    """Environment whose only agents are the learners of a line."""
 
     def __init__(self, env: Any, learners: list[str]) -> None:
         super().__init__(env)
@@ -51,15 +51,15 @@ class LearnersOnly(BaseParallelWrapper):  # type: ignore[misc]  # PettingZoo is 
 
     @property
     def agents(self) -> list[str]:
-        """The learners, while an episode runs."""
+        """The learners while an episode runs; an empty list after it."""
         return self.possible_agents if self.env.agents else []
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """As the environment does."""
+        """Return the environment's reset, restricted to the learners."""
         return tuple(self._of_learners(part) for part in self.env.reset(seed=seed, options=options))
 
     def step(self, actions: dict[str, Any]) -> Any:
-        """As the environment does."""
+        """Return the environment's step, restricted to the learners."""
         return tuple(self._of_learners(part) for part in self.env.step(actions))
 
     def _of_learners(self, part: dict[str, Any]) -> dict[str, Any]:
@@ -70,11 +70,11 @@ class LearnersOnly(BaseParallelWrapper):  # type: ignore[misc]  # PettingZoo is 
 
 
 class SeededAndTruncated(VecEnvWrapper):
-    """Seeds SuperSuit's copies, and tells PPO which episodes the horizon cut off.
+    """Seeds SuperSuit's copies, and reports to PPO which episodes the horizon truncated.
 
-    Trap: its vector environment has no `seed`, so `PPO(seed=...)` fails on it, and its copies are clones: without
-    a seed for each of them they all live through the same episodes. Here copy k starts the stream of seed + k.
-    Trap: it drops `truncated`, so PPO takes the horizon for a real end.
+    Trap: SuperSuit's vector environment has no `seed`, so `PPO(seed=...)` fails. Its copies are clones: without a seed
+    per copy all copies have the same episodes. Here copy k uses seed + k.
+    Trap: SuperSuit drops `truncated`, so PPO would treat the horizon as a real end.
     """
 
     def __init__(self, venv: Any) -> None:
@@ -82,7 +82,7 @@ class SeededAndTruncated(VecEnvWrapper):
         self._next_seed: int | None = None
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """The seed of the next reset."""
+        """Set the seed of the next reset."""
         self._next_seed = seed
         return [seed] * self.num_envs
 
@@ -93,11 +93,11 @@ class SeededAndTruncated(VecEnvWrapper):
         return observations
 
     def step_async(self, actions: Any) -> None:
-        """Keep the actions, row by row."""
+        """Send the actions, one row per learner and copy."""
         self.venv.step_async(actions)
 
     def step_wait(self) -> Any:
-        """One time step of every copy; those that end start their next episode."""
+        """Finish one time step of every copy. A copy whose episode ended starts the next episode."""
         observations, rewards, terminated, truncated, infos = self.venv.step_wait()
         terminated, truncated = np.asarray(terminated, bool), np.asarray(truncated, bool)
         for row in np.flatnonzero(truncated & ~terminated):
@@ -105,31 +105,32 @@ class SeededAndTruncated(VecEnvWrapper):
         return observations, rewards, terminated | truncated, infos
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Nothing inside is wrapped."""
+        """Return False for every row: the copies have no wrapper."""
         return [False] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """SuperSuit's attribute, once per row."""
+        """Return the attribute of SuperSuit's environment, once per row."""
         return [getattr(self.venv, attr_name)] * self.num_envs
 
 
 def make_worlds(scenario: eb.Scenario) -> SeededAndTruncated:
-    """`COPIES` worlds of a scenario as rows for Stable-Baselines3: row k * L + l is learner l of copy k."""
+    """Return `COPIES` worlds of a scenario as rows for Stable-Baselines3: row k * L + l is learner l of L in copy k."""
     names = [scenario.vehicle_names[i] for i in scenario.learners]
     learners = LearnersOnly(eb.parallel_env(scenario=scenario, reward=REWARD), names)
     rows = supersuit.pettingzoo_env_to_vec_env_v1(learners)
-    # num_cpus=0: all copies in this process (trap: with processes, SuperSuit gives seeds away twice).
+    # num_cpus=0: all copies in this process (trap: with more processes, SuperSuit uses seeds twice).
     copies = supersuit.concat_vec_envs_v1(rows, COPIES, num_cpus=0, base_class="stable_baselines3")
     return SeededAndTruncated(copies.venv)
 
 
-# 4. Training, and the policy as a bundle, which `ethbrake evaluate` takes as ppo@FOLDER.
+# 4. Training. The policy is saved as a bundle, which `ethbrake evaluate` loads as ppo@FOLDER.
 
 
 def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
-    """Train PPO for `steps` decisions of learners, and save its policy as `output`/policy.
+    """Train PPO for `steps` decisions of all learners together, and save its policy as `output`/policy.
 
-    Refuses at once what cannot be: steps, a seed, a scenario in which nobody learns, an `output` that is there.
+    Raises `InvalidInput` for wrong steps or seeds and for a scenario without a learner, `AlreadyExists` if `output`
+    exists.
     """
     Training.of("ppo", scenario, total_steps=steps, seed=seed)
     with new_folder(output) as folder:
@@ -137,7 +138,7 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
 
 
 def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
-    """The policy that PPO comes to."""
+    """Return the policy that PPO has learned after `steps` decisions."""
     torch.set_num_threads(1)
     worlds = VecMonitor(make_worlds(scenario))
     model = PPO(
@@ -179,7 +180,7 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="cooperation-3-pair", help="a shipped scenario, or a YAML file")
-    parser.add_argument("--steps", type=int, default=200_000, help="decisions of learners")
+    parser.add_argument("--steps", type=int, default=200_000, help="decisions of all learners together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("runs/supersuit"), help="new folder")
     given = parser.parse_args()

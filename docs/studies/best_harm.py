@@ -1,8 +1,8 @@
-"""The least harm of every world of a list: search it, let agents lower it, keep the table; or tell all shipped ones.
+"""Search the least harm of every world of a list, let agents improve on it, and save a table; or print shipped tables.
 
 ``python docs/studies/best_harm.py --scenario paper-random --episodes 1000 --output paper-random.npz`` searches a list.
-With ``--output``, finished parts are kept beside the file, and the same command goes on where it was interrupted.
-``--shipped`` tells proven and best known harm of every shipped table, and the gap.
+With ``--output``, finished chunks are saved beside the file, and the same command continues after an interruption.
+``--shipped`` prints proven and best known harm of every shipped table, and the gap between them.
 """
 
 from __future__ import annotations
@@ -40,22 +40,22 @@ from ethbrake_marl.training.settings import read_settings
 
 
 def main(words: list[str]) -> None:
-    """Search a list and print what was found, or print the shipped tables."""
+    """Search a list and print the mean harms, or print the shipped tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("--shipped", action="store_true", help="tell the shipped tables instead")
+    add("--shipped", action="store_true", help="print the shipped tables instead")
     add("--scenario", default="paper-random")
     add("--episodes", type=int, default=10_000, help="worlds of the list")
-    add("--seed", type=int, default=7, help="of the list")
-    add("--harm-count", choices=HARM_COUNTS, help="harm to minimise; both where it is not given")
-    add("--vehicles", metavar="A,B,...", help="who is controlled, together; else the learners")
+    add("--seed", type=int, default=7, help="seed of the list")
+    add("--harm-count", choices=HARM_COUNTS, help="harm to minimise; default: both")
+    add("--vehicles", metavar="A,B,...", help="vehicles to control together; default: the learners")
     add("--budget", type=int, default=100_000, help="candidate profiles per world and count")
     add("--search-seed", type=int, default=0)
-    add("--threads", type=int, help="worlds searched at once; changes no result")
-    add("--start", type=Path, metavar="FILE.npz", help="a table to start from; no world gets worse than there")
-    add("--agents", default="", metavar="A,B,...", help="who drives afterwards; where one does less harm, it counts")
+    add("--threads", type=int, help="worlds searched at the same time; changes no result")
+    add("--start", type=Path, metavar="FILE.npz", help="a table to start from; no world gets more harm")
+    add("--agents", default="", metavar="A,B,...", help="agents to try after the search; less harm counts")
     add("--output", type=Path, metavar="FILE.npz", help="the table to write")
-    add("--set", action="append", metavar="KEY=VALUE", help="another value of the scenario; repeatable")
+    add("--set", action="append", metavar="KEY=VALUE", help="a changed value of the scenario; repeatable")
     given = parser.parse_args(words)
     if given.shipped:
         print(shipped_bounds()[1].markdown())
@@ -70,24 +70,24 @@ def main(words: list[str]) -> None:
 
 
 def parts_beside(output: Path) -> Path:
-    """Where finished parts of a search are kept."""
+    """Return the folder of the finished chunks of a search."""
     return output.with_name(f".{output.name}.parts")
 
 
 def search(given: argparse.Namespace, command: str) -> tuple[BestHarmTable, dict[str, object]]:
-    """The table that is asked for, and what is told of it."""
+    """Return the table that the arguments ask for, and its mean harms and proven values by name."""
     if given.output is not None:
         check_target(given.output)
     chosen = load_runnable(given.scenario, read_settings(given.set).scenario)
     names = None if given.vehicles is None else [name.strip() for name in given.vehicles.split(",")]
     controlled = None if names is None else chosen.with_learners(names).learners
     if controlled is None and not chosen.learners:
-        raise InvalidInput(f"scenario {chosen.name!r} has no learner; say who is controlled: --vehicles vehicle_2")
+        raise InvalidInput(f"scenario {chosen.name!r} has no learner; give vehicles to control: --vehicles vehicle_2")
     sample = chosen.sample(given.episodes, given.seed)
     counts = HARM_COUNTS if given.harm_count is None else (given.harm_count,)
     specs = [spec.strip() for spec in split_specs(given.agents)] if given.agents else []
     if specs and (len(chosen.learners) != 1 or controlled not in (None, chosen.learners)):
-        raise InvalidInput("--agents: drive the scenario's only learner; leave out --vehicles")
+        raise InvalidInput("--agents need a scenario with exactly one learner, and no --vehicles")
     lineups = {each: make_agents(specs, chosen, harm_count=each) for each in counts}
     table = search_list(
         chosen, sample, chunks=None if given.output is None else parts_beside(given.output), counts=counts,
@@ -112,16 +112,17 @@ def search(given: argparse.Namespace, command: str) -> tuple[BestHarmTable, dict
 
 # The proven bounds of a list of worlds, beside the least harm known there.
 #
-# *Contact proven* is not *impact proven*: in the worlds between, every command leads to contact, and it is open whether
-# to an impact. Either vehicles get away with leaning on each other there, or the proof is loose. The harm of the best
-# known profiles in these very worlds tells which: next to none, or much.
+# *Contact proven* is not *impact proven*. In the worlds between the two, every command leads to contact, but perhaps
+# not to an impact. Either leaning without an impact is possible there, or the proof is loose. The harm of the best
+# known profiles in these worlds shows which: almost no harm, or much harm.
 
 
 def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, Any] | None:
-    """What is proven about the worlds of a list, beside the least harms of a table; None where nothing is.
+    """Return what is proven about the worlds of a list; None if nothing is proven.
 
-    The mean harm (m2/s2) that no command undercuts under either count, the shares with proven contact and proven
-    impact, and ``Between``; None for what is not decided. Worlds that cannot be advanced are left out.
+    The result has the mean proven harm (m2/s2, valid for both counts), the shares of worlds with proven contact and
+    with proven impact, and ``Between``, which uses the least harms of the table. Undecided values are None. Worlds that
+    cannot be advanced are left out.
     """
 
     def of(rows: Ints) -> dict[str, Any] | None:
@@ -142,10 +143,10 @@ def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[st
 
 
 def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[dict[str, Any]], Sheet]:
-    """The least harm known, the proven one, and the gap of every shipped table: plain data, and means as a sheet.
+    """Return best known harm, proven harm and gap of every shipped table, as plain data and as a sheet of means.
 
-    A header names a shipped scenario and a list of it, of which every world is compared; raises ``InvalidInput`` if
-    the table does not hold them. A gap is best known minus proven harm, as a share of the best known.
+    gap = (best known harm - proven harm) / best known harm. The header of a table names a shipped scenario and a list
+    of its worlds. Raises ``InvalidInput`` if the table does not contain these worlds.
     """
     harm, share = partial(Column, digits=3), partial(Column, digits=1, scale=100.0, unit=" %")
     columns = (
@@ -153,7 +154,7 @@ def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[
         share("gap"), share("contact proven"), share("impact proven"), share("between"),
         harm("best known there, first"), share("next to none there"),
     )  # fmt: skip
-    found, rows = [], []
+    plain, rows = [], []
     for table in shipped_tables() if tables is None else tables:
         header = table.header
         scenario = load_scenario(header["scenario"])
@@ -168,7 +169,7 @@ def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[
         for harm_count, best in known.items():
             if proven is not None and best is not None:
                 gaps[harm_count] = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
-        found.append({
+        plain.append({
             **result_identity("best-harm", scenario, sample),
             "scenario": scenario.name,
             "vehicles": names,
@@ -179,15 +180,15 @@ def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[
             "nothing_proven_because": why,
             **{f"gap_{harm_count}": gap for harm_count, gap in gaps.items()},
         })  # fmt: skip
-        told = proven or {}
-        inside = told.get("between") or {}
+        means = proven or {}
+        inside = means.get("between") or {}
         rows.append((
             f"{scenario.name} (seed {seed}){f': {why}' if why else ''}", f"{len(table.identity):,}",
-            told.get("proven_harm"), known["first"], gaps["first"], known["total"], gaps["total"],
-            told.get("contact_proven_rate"), told.get("impact_proven_rate"),
+            means.get("proven_harm"), known["first"], gaps["first"], known["total"], gaps["total"],
+            means.get("contact_proven_rate"), means.get("impact_proven_rate"),
             inside.get("rate"), inside.get("mean_first"), inside.get("harmless_rate"),
         ))  # fmt: skip
-    return found, Sheet("", columns, rows)
+    return plain, Sheet("", columns, rows)
 
 
 if __name__ == "__main__":

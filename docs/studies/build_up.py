@@ -1,6 +1,6 @@
-"""Harm where brakes build up, by rate and by whose brakes they are: what the table ``build-up`` of evaluation shows.
+"""Harm of agents if brakes build up, by rate and by vehicle: the table ``build-up`` of docs/results/evaluation.md.
 
-.venv/bin/python docs/studies/build_up.py        # first-impact / total harm, m2/s2; five minutes on one core
+.venv/bin/python docs/studies/build_up.py        # prints first-impact / total harm in m2/s2; five minutes on one core
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ CASES = {
 }
 
 
-def not_told(worlds: eb.Worlds) -> str:
-    """What E-V2X-BM does that takes all brakes as there at once: it holds one deceleration."""
+def without_rates(worlds: eb.Worlds) -> str:
+    """Return the harms of an E-V2X-BM that assumes brakes without build-up, as text."""
     agent, full = make_agent("e_v2x_bm", scenario=BASE), make_agent("full_brake")
     alert = BASE.sample(WORLDS, SEED).worlds
     chosen, _ = agent.act(alert, agent.begin(alert, 1, {0: full, 2: full}), 1)
@@ -41,23 +41,25 @@ def not_told(worlds: eb.Worlds) -> str:
 
 
 def harms(worlds: eb.Worlds, scenario: eb.Scenario, agents: dict[str, str]) -> dict[str, str]:
-    made = {name: make_agent(spec, scenario=scenario) for name, spec in agents.items()}
-    result = eb.evaluate(worlds, made, scenario=scenario)
-    found = {name: result.outcome(name) for name in agents}
-    return {n: f"{each.first_impact_harm.mean():.2f} / {each.total_harm.mean():.2f}" for n, each in found.items()}
+    drivers = {name: make_agent(spec, scenario=scenario) for name, spec in agents.items()}
+    result = eb.evaluate(worlds, drivers, scenario=scenario)
+    outcomes = {name: result.outcome(name) for name in agents}
+    return {n: f"{each.first_impact_harm.mean():.2f} / {each.total_harm.mean():.2f}" for n, each in outcomes.items()}
 
 
 if __name__ == "__main__":
-    warnings.simplefilter("ignore")  # policies drive brakes that they do not know; that is the question
+    warnings.simplefilter("ignore")  # the policies were not trained with these brakes, and warn
     for name, rates in CASES.items():
         scenario = BASE
         if min(rates) < AT_ONCE:
             scenario = BASE.replace(name="rates", brake_rate_mps3=list(rates), release_rate_mps3=list(rates))
         worlds = scenario.sample(WORLDS, SEED).worlds
-        told = harms(worlds, scenario, AGENTS)
-        told |= {"not told": not_told(worlds)}
-        time_step_s = BASE.time_step_s if scenario is BASE else None  # decisions are not used where brakes build up
+        row = harms(worlds, scenario, AGENTS)
+        row |= {"e_v2x_bm without rates": without_rates(worlds)}
+        # If brakes build up, the bound uses no decision times.
+        time_step_s = BASE.time_step_s if scenario is BASE else None
         bound = lower_bound(worlds, horizon_s=scenario.horizon_s, time_step_s=time_step_s).harm
-        told |= {"proven": f"{bound.mean():.2f}", "proven, of the searched": f"{bound[:SEARCHED].mean():.2f}"}
-        told |= harms(worlds.take(np.arange(SEARCHED)), scenario, {"search": "best_harm"})
-        print(name, told, flush=True)
+        row["proven"] = f"{bound.mean():.2f}"
+        row[f"proven, {SEARCHED} worlds"] = f"{bound[:SEARCHED].mean():.2f}"
+        row |= harms(worlds.take(np.arange(SEARCHED)), scenario, {f"best_harm, {SEARCHED} worlds": "best_harm"})
+        print(name, row, flush=True)

@@ -1,9 +1,9 @@
-"""What a cluster is asked for: processor seconds per million decisions and worlds, as in docs/results/scaling.json.
+"""Computing cost: processor seconds per million decisions and per million worlds, as in docs/results/scaling.json.
 
     python docs/studies/cost_model.py [--worlds 400]
 
-Processor time, not time by the clock: it is the same beside other programs. Compiling, loading and measuring on the way
-are left out; the first update, which warms up, does not count.
+Processor time is nearly independent of other programs on the machine. Compiling, loading, evaluations and the first
+update do not count.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.session import train
 
 SCENARIO = "paper-random"
-UPDATES = {"ppo": 5, "vine": 4, "quick": 4}  # of which the first does not count
+UPDATES = {"ppo": 5, "vine": 4, "quick": 4}  # updates of each training; the first does not count
 AGENTS = {"full_brake": 200, "e_v2x_bm": 50, "ppo": 50, "universal": 10, "ppo+step": 1}
-LARGER = 2  # a list of so many times the worlds is timed too: the difference is the cost of a world
+LARGER = 2  # a second list has so many times the worlds; the difference in time gives the cost of a world
 
 
 def per_decision(recipe_name: str, updates: int, folder: Path) -> float:
-    """Processor seconds of a decision, its share of the learning included."""
+    """Return the processor seconds per decision of a training, including the learning."""
     recipe = load_recipe(recipe_name)
     once = recipe.n_envs * recipe.rounds
-    told: dict[int, float] = {}
+    times: dict[int, float] = {}
 
     def note(progress: object) -> None:
-        told.setdefault(progress.done, time.process_time())  # type: ignore[attr-defined]
+        times.setdefault(progress.done, time.process_time())  # type: ignore[attr-defined]
 
     steps = updates * once
     train(recipe, SCENARIO, folder / recipe_name, steps=steps, measure=None, on_progress=note)
-    first = min(done for done in told if done > 0)
-    return (told[steps] - told[first]) / (steps - first)
+    first = min(done for done in times if done > 0)
+    return (times[steps] - times[first]) / (steps - first)
 
 
 def per_world(name: str, worlds: int) -> float:
-    """Processor seconds of a world that an agent drives."""
+    """Return the processor seconds per world with the agent ``name``."""
     scenario = load_scenario(SCENARIO)
     spent = []
     for n in (20, worlds, LARGER * worlds):
@@ -55,7 +55,7 @@ def per_world(name: str, worlds: int) -> float:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--worlds", type=int, default=400)
+    parser.add_argument("--worlds", type=int, default=400, help="worlds for the slowest agent")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="ethbrake-") as name:
         for recipe, updates in UPDATES.items():

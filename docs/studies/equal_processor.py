@@ -1,9 +1,9 @@
-"""Algorithms at equal processor time on the three tests: for docs/extensions/learners.md and docs/results.
+"""Algorithms at equal processor time on the three tests, for docs/extensions/learners.md and docs/results.
 
     .venv/bin/python docs/studies/equal_processor.py SECONDS FOLDER docs/figures/learning-curves-equal.png
 
-FOLDER keeps the trainings: the same command goes on. SECONDS of one core are spent on each; what measuring takes is
-not counted.
+Each training gets SECONDS of one core; the time of evaluations does not count. FOLDER contains the trainings, and the
+same command continues them after an interruption.
 """
 
 from __future__ import annotations
@@ -27,25 +27,25 @@ TESTS: dict[str, HarmCount] = {
     "paper-random-brake-only": "first",
     "paper-random-obstacle": "total",
 }
-STEPS = {  # in half a minute, by a short training of each
+STEPS = {  # recipe -> decisions in half a minute, measured in a short training
     "quick": 4_400_000,
     "ppo": 1_080_000,
     "sac": 225_000,
-    "options": 270_000,
+    "rollout-classification": 270_000,
 }
 POINTS, WORLDS, SEED, BUDGET = 12, 2000, 1007, 2000
 
 
 def plan(count: HarmCount, seconds: int) -> list[tuple[TrainingRecipe, int]]:
-    """The recipes with their steps, for a count."""
-    found = []
+    """Return the recipes, each with its number of seeds, for one count of harm."""
+    recipes = []
     for name in STEPS:
         recipe, steps = load_recipe(name), STEPS[name] * seconds // 30
         updates = steps // (recipe.n_envs * recipe.rounds)
         reward = recipe.reward.model_dump() | {"harm_count": count}
         measured = {"every_updates": max(updates // POINTS, 1), "worlds": WORLDS, "seed": SEED}
-        found.append((recipe.replace(total_steps=steps, reward=reward, evaluation=measured), 1))
-    return found
+        recipes.append((recipe.replace(total_steps=steps, reward=reward, evaluation=measured), 1))
+    return recipes
 
 
 if __name__ == "__main__":
@@ -63,10 +63,10 @@ if __name__ == "__main__":
         known[label] = float(np.mean(least))
         for name, curve in panels[label].items():
             harm = curve.values[0]
-            told = [f"{each:.3f}" for each in (harm[-1], harm.min(), harm.min() / known[label])]
-            print(f"| `{test}` | {count} | `{name}` | {curve.steps[-1]:.0f} s | {' | '.join(told)} |")
+            cells = [f"{each:.3f}" for each in (harm[-1], harm.min(), harm.min() / known[label])]
+            print(f"| `{test}` | {count} | `{name}` | {curve.steps[-1]:.0f} s | {' | '.join(cells)} |")
         print(f"best known: {known[label]:.3f}", flush=True)
-    caption = f"One seed each; harm on the fixed list of the trainings, {WORLDS:,} worlds of seed {SEED}."
+    caption = f"One training per recipe; harm on the fixed list of the trainings, {WORLDS:,} worlds of seed {SEED}."
     axis = AXES["cpu"][1]
     figure = seed_curves(panels, logarithmic=[*panels], caption=caption, x_label=axis, known=known)
     write_picture(picture, figure, force=True)

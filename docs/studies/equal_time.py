@@ -1,10 +1,9 @@
-"""Harm against processor time, on the same worlds and the same clock: table `equal-time` of docs/results/baselines.md.
+"""Harm and processor time of agents on the same worlds: the table `equal-time` of docs/results/baselines.md.
 
     .venv/bin/python docs/studies/equal_time.py [AGENT ...]
 
-The first agent is what the others are compared with. Each is measured with its whole episode: what it does at the
-alert, every decision, and the motion of the worlds. No shipped table holds the worlds of this list, so ``best_harm:K``
-has to search them.
+All agents are compared with the first one. The time is for whole episodes: the work at the alert, all decisions, and
+the motion of the worlds. No shipped table contains the worlds of this list, so ``best_harm:K`` has to search.
 """
 
 from __future__ import annotations
@@ -31,16 +30,16 @@ AGENTS = (
     *(f"planner:{candidates}" for candidates in (64, 256, 1024)),
 )  # fmt: skip
 WORLDS, SEED, REPEATS = 1000, 8, 2
-CHUNK = 500  # worlds driven together, for every agent alike
+CHUNK = 500  # worlds simulated together, equal for all agents
 HEAD = ("agent", "knows", "CPU, ms per world", "first-impact", "total", "difference")
 
 
 def drive(
     sample: Sample, agents: Mapping[str, Driver], scenario: Scenario, repeats: int
 ) -> dict[str, tuple[float, Outcome]]:
-    """Median processor time per world (ms) and outcome of every agent, which drive in turn."""
+    """Return the median processor time per world (ms) and the outcome of every agent. The agents drive in turn."""
     few = sample.take(np.arange(min(sample.worlds.n, 2)))
-    evaluate(few, agents, scenario=scenario, chunk=CHUNK)  # not counted: kernels are compiled, tables are read
+    evaluate(few, agents, scenario=scenario, chunk=CHUNK)  # compiles kernels and reads tables, before the measurement
     spent: dict[str, list[float]] = {name: [] for name in agents}
     outcomes: dict[str, Outcome] = {}
     for _ in range(repeats):
@@ -52,13 +51,16 @@ def drive(
 
 
 def rows_of(driven: Mapping[str, tuple[float, Outcome]], against: str) -> list[Sequence[str]]:
-    """The cells of the table, quickest first; the difference is paired by world, with its 95 % interval."""
+    """Return the rows of the table, fastest agent first.
+
+    The difference in first-impact harm from agent ``against`` is paired by world, with its 95 % interval.
+    """
     reference, rows = driven[against][1].first_impact_harm, []
     for name, (spent_ms, outcome) in sorted(driven.items(), key=lambda each: each[1][0]):
         harm = outcome.first_impact_harm
-        found = paired_difference(harm, reference)
-        low, high = found.interval or (found.value, found.value)
-        difference = "" if name == against else f"{found.value:+.3f} [{low:+.3f}, {high:+.3f}]"
+        change = paired_difference(harm, reference)
+        low, high = change.interval or (change.value, change.value)
+        difference = "" if name == against else f"{change.value:+.3f} [{low:+.3f}, {high:+.3f}]"
         means = [f"{each.mean():.3f}" for each in (harm, outcome.total_harm)]
         rows.append([f"`{name}`", outcome.knows.text, f"{spent_ms:.2f}", *means, difference])
     return rows

@@ -1,9 +1,9 @@
-"""Equilibria of the levels of cooperation, and teams trained for themselves and for all: docs/results/equilibria.json.
+"""Equilibria of the levels of cooperation, and teams with own or common objectives: docs/results/equilibria.json.
 
     .venv/bin/python docs/studies/equilibria.py runs/equilibria --jobs 2
 
-Trains what is missing in the folder, searches, and writes the tables. Everything drives the same worlds. A search
-minimises first-impact harm; processor seconds are those of its process, without compiling.
+Trains the teams that are missing in the folder, searches equilibria, and writes the tables, all on the same worlds.
+Searches minimise first-impact harm. Processor seconds of a search do not contain compiling.
 """
 
 from __future__ import annotations
@@ -52,16 +52,16 @@ RESULTS = DOCS / "results" / "equilibria.json"
 
 
 class Level(NamedTuple):
-    """What was found on one level."""
+    """Results of the searches on one level."""
 
     name: str
-    ends: Mapping[str, Mapping[str, Equilibrium]]  # objective -> start -> where best responses end
-    seconds: Mapping[str, float]  # objective -> processor seconds
-    optimum: Floats  # [n, N] first-impact harm that each vehicle bears in the joint optimum
+    ends: Mapping[str, Mapping[str, Equilibrium]]  # objective -> start -> where the best responses end
+    seconds: Mapping[str, float]  # objective -> processor seconds of the search
+    optimum: Floats  # [n, N] first-impact harm of each vehicle in the joint optimum, m2/s2
 
 
 def search(name: str, worlds: int) -> Level:
-    """Equilibria of a level under every objective, and its joint optimum."""
+    """Search the equilibria of a level for every objective, and its joint optimum."""
     scenario = eb.load_scenario(name)
     lines, ends, seconds = scenario.sample(worlds, SEED).worlds, {}, {}
     find_equilibria(scenario, lines.take(np.arange(1)), "own", budget=10, rounds=1)  # compiles
@@ -75,7 +75,7 @@ def search(name: str, worlds: int) -> Level:
 
 
 def train(folder: Path, name: str, objective: str, recipe: str, seed: int) -> None:
-    """Train a team in the folder, unless it is there."""
+    """Train a team in the folder, unless the folder exists."""
     import torch
 
     torch.set_num_threads(1)
@@ -85,11 +85,11 @@ def train(folder: Path, name: str, objective: str, recipe: str, seed: int) -> No
 
 
 def drive(folders: Sequence[Path], name: str, worlds: int) -> Floats:
-    """First-impact harm that each vehicle bears under every trained team, [seeds, n, N] m2/s2."""
+    """Return the first-impact harm of each vehicle with every trained team, [seeds, n, N] in m2/s2."""
     scenario = eb.load_scenario(name)
     teams = {folder.name: load_team(folder, scenario, folder.name) for folder in folders}
-    found = eb.evaluate(scenario.sample(worlds, SEED), teams, scenario=scenario, aftermath=False).complete()
-    return np.stack([found.outcome(each).vehicle_harm("first") for each in teams])
+    result = eb.evaluate(scenario.sample(worlds, SEED), teams, scenario=scenario, aftermath=False).complete()
+    return np.stack([result.outcome(each).vehicle_harm("first") for each in teams])
 
 
 def show(estimate: Estimate | None, digits: int = 2) -> str:
@@ -101,7 +101,7 @@ def percent(flags: Any) -> str:
 
 
 def price_rows(level: Level) -> list[list[str]]:
-    """How often starts converge and differ, and the prices of anarchy and stability."""
+    """Return rows with the rates of convergence and of different ends, and the prices of anarchy and stability."""
     rows = []
     for objective, ends in level.ends.items():
         spread, best = compare_starts(ends, "first"), level.optimum
@@ -124,7 +124,7 @@ def price_rows(level: Level) -> list[list[str]]:
 
 
 def bearing_rows(level: Level) -> list[list[str]]:
-    """Who bears what at the end of each start, and in the joint optimum."""
+    """Return rows with the harm of each vehicle where the best responses end, per start, and in the joint optimum."""
     rows = [[f"`{level.name}`", "total", "joint optimum", *(show(mean(each)) for each in level.optimum.T), "", ""]]
     rows[0][-2] = show(mean(level.optimum.sum(axis=1)))
     rows[0][-1] = "–"
@@ -138,7 +138,7 @@ def bearing_rows(level: Level) -> list[list[str]]:
 
 
 def learned_rows(place: Path, name: str, worlds: int) -> list[list[str]]:
-    """Who bears what under trained teams."""
+    """Return rows with the harm of each vehicle with trained teams."""
     rows = []
     for recipe, objective in product(SCHEMES, ("own", "total")):
         borne = drive([place / job(name, objective, recipe, seed) for seed in SEEDS[recipe]], name, worlds)
@@ -153,44 +153,45 @@ def job(name: str, objective: str, recipe: str, seed: int) -> str:
 
 
 def write(levels: Sequence[Level], learned: list[list[str]], worlds: int, file: Path) -> str:
-    """Write the tables as docs/results has them; return them as Markdown."""
+    """Write the tables in the format of docs/results, and return them as Markdown."""
     spec = importlib.util.spec_from_file_location("docs_results", DOCS / "extension" / "results.py")
     assert spec is not None and spec.loader is not None
     results = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = results  # where its classes look for the names in their annotations
+    sys.modules[spec.name] = results  # its data classes look up annotations here
     spec.loader.exec_module(results)
     about = f"{worlds} worlds of seed {SEED}; first-impact harm in m²/s², mean per world with 95 % intervals."
-    how = f"Best responses in turn from three starts, {BUDGET:,} candidates each, at most {ROUNDS} rounds."
+    how = f"Best responses in turn from three starts, with {BUDGET:,} candidates per response"
+    how += f" and at most {ROUNDS} rounds."
     vehicles = ["Vehicle 1", "Vehicle 2", "Vehicle 3"]
     tables = {
         "price-of-anarchy": (
-            "What it costs that each vehicle decides for itself",
+            "Cost of separate decisions",
             [
                 *("level", "objective", "ends converged", "worlds where ends differ", "joint optimum"),
                 *("best end", "worst end", "price of stability", "price of anarchy", "processor s"),
             ],
             [row for level in levels for row in price_rows(level)],
-            f"{about} {how} Ends differ if the harm of some vehicle does by more than 0.1. Best and worst are among the"
-            " ends that converged, world by world; a price is the ratio of the means.",
+            f"{about} {how} Ends differ if the harm of some vehicle differs by more than 0.1. Best and worst end are"
+            " chosen per world, among converged ends. A price is a ratio of means.",
             "a long search",
         ),
         "equilibria-borne": (
-            "Who bears what where best responses end",
+            "Harm of each vehicle where best responses end",
             ["level", "objective", "start", *vehicles, "line, first-impact", "line, total"],
             [row for level in levels for row in bearing_rows(level)],
-            f"{about} {how} All worlds, converged or not.",
+            f"{about} {how} All worlds, with and without convergence.",
             "a long search",
         ),
         "equilibria-learned": (
-            "Who bears what under teams trained for themselves and for all",
+            "Harm of each vehicle with trained teams, own and common objectives",
             ["level", "recipe, scheme", "objective", *vehicles, "line"],
             learned,
-            f"{about} Three seeds of `cooperation`, two of `cooperation-ppo`, a million decisions each; intervals for"
-            " other seeds and other worlds.",
+            f"{about} Three seeds of `cooperation`, two of `cooperation-ppo`, a million decisions each; intervals over"
+            " seeds and worlds.",
             "a training",
         ),
     }
-    found = [
+    made = [
         results.Table(
             id=name,
             title=title,
@@ -204,17 +205,17 @@ def write(levels: Sequence[Level], learned: list[list[str]], worlds: int, file: 
         )
         for name, (title, columns, rows, note, compared) in tables.items()
     ]
-    write_file(file, results.text_of(found).encode())
-    return "\n\n".join(f"{each.title}\n\n{each.markdown}" for each in found)
+    write_file(file, results.text_of(made).encode())
+    return "\n\n".join(f"{each.title}\n\n{each.markdown}" for each in made)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, search, write and print."""
+    """Train, search, write the tables and print them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="folder of the trainings; what is there is not trained again")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at a time, one thread each")
+    parser.add_argument("folder", type=Path, help="folder of the trainings; existing ones are not repeated")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel processes, with one thread each")
     parser.add_argument("--worlds", type=int, default=WORLDS, help="worlds of the list")
-    parser.add_argument("--output", type=Path, default=RESULTS, help="file of the tables")
+    parser.add_argument("--output", type=Path, default=RESULTS, help="JSON file for the tables")
     given = parser.parse_args(arguments)
     given.folder.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool:

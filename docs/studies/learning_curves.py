@@ -1,7 +1,7 @@
-"""Train several seeds of recipes on one scenario, and draw their learning curves into one figure.
+"""Train recipes with several seeds on one scenario, and draw their learning curves in one figure.
 
 ``python docs/studies/learning_curves.py --scenario paper-delay-low --recipes ppo:5,sac:3 --output runs/low-delay``.
-The same command goes on after an interruption: finished trainings are kept, begun ones go on.
+The same command continues after an interruption.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from ethbrake_marl.training.settings import read_settings
 
 
 def main(words: list[str]) -> int:
-    """Train, draw, and print the summary; 130 where Ctrl-C stopped it."""
+    """Train, draw, and print the summary. Return the exit status: 0, or 130 after Ctrl-C."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="paper-random")
     parser.add_argument("--recipes", default="ppo:5,sac:3", help="recipes, each with its number of seeds (0, 1, ...)")
     parser.add_argument("--output", type=Path, required=True, help="folder of the trainings, the figure and the table")
     parser.add_argument("--steps", type=int, help="training steps (decisions)")
-    parser.add_argument("--jobs", type=int, default=1, help="so many trainings at once")
-    parser.add_argument("--against", choices=[*AXES], default="steps", help="what stands below the curves")
-    parser.add_argument("--set", action="append", metavar="KEY=VALUE", help="another value; repeatable")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel trainings")
+    parser.add_argument("--against", choices=[*AXES], default="steps", help="quantity on the horizontal axis")
+    parser.add_argument("--set", action="append", metavar="KEY=VALUE", help="a changed value; repeatable")
     given = parser.parse_args(words)
     plan = LearningCurves.parse(given.recipes)
     settings = read_settings(given.set, [recipe for recipe, _ in plan])
@@ -34,7 +34,7 @@ def main(words: list[str]) -> int:
     changed = [(settings.change(recipe), seeds) for recipe, seeds in plan]
     curves = LearningCurves(scenario, changed, given.output, given.against)
     if not curves.train(steps=given.steps, jobs=given.jobs, settings=settings.texts, tell=_tell):
-        print("interrupted; the same command goes on with what is in the folder", file=sys.stderr)
+        print("interrupted; the same command continues the trainings in the folder", file=sys.stderr)
         return 130
     print(json.dumps(curves.write(), indent=2))
     print(f"figure: {given.output / 'learning_curves.png'}", file=sys.stderr)

@@ -1,14 +1,14 @@
-"""What is each piece of a message worth? A Markdown table of the harm where messages lack it.
+"""How much does each piece of a message reduce harm? Prints a Markdown table of the harm without each piece.
 
-    python docs/studies/message_contents.py runs/pieces --seeds 5     # trains what is missing there, prints the table
-    python docs/studies/message_contents.py runs/pieces --jobs 16     # likewise, in so many processes
-    python docs/studies/message_contents.py runs/pieces --quick       # in a minute, to see it run; it says nothing yet
+    python docs/studies/message_contents.py runs/pieces --seeds 5     # trains missing policies, prints the table
+    python docs/studies/message_contents.py runs/pieces --jobs 16     # the same, in 16 processes
+    python docs/studies/message_contents.py runs/pieces --quick       # a one-minute check; the results mean nothing
 
-Lines: ``paper-random``, a line of five in which four learn, and ``paper-random`` over a channel that loses half of
-its messages and a fifth of its links. Contents: the usual pieces, these without one, these with the intent, and the
-alert alone. For each of them policies are trained, and driven on the same worlds; five seeds take two to three hours
-of one core. All observe the same features; what needs a missing piece reads 0. Of a training the last policy is
-taken: nothing is chosen on the way.
+There are three lines of vehicles: ``paper-random``, a line of five of which four learn, and ``paper-random`` over a
+channel that loses half of its messages and a fifth of its links. Messages contain the usual pieces, the usual pieces
+without one, the usual pieces with the intent, or only the alert. For each combination policies are trained and
+evaluated on the same worlds. Five seeds take two to three hours on one core. All policies observe the same features; a
+feature that needs a missing piece reads 0. The last policy of a training is used, not the best.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from ethbrake_marl.files.sheet import Column
 from ethbrake_marl.physics.messages import USUAL_PIECES
 from ethbrake_marl.physics.state import Floats
 
-LINES = {  # scenario, channel
+LINES = {  # line of vehicles -> scenario, channel
     "`paper-random`": ("paper-random", {"preset": "paper"}),
     "line of five": ("cooperation-3-five", {"preset": "paper"}),
     "lossy channel": ("paper-random", {"preset": "blocked", "persistence": "periodic"}),
@@ -46,21 +46,21 @@ HEAD = ["messages contain", *(f"{line}, {what}" for line in LINES for what in ("
 
 
 class Effort(NamedTuple):
-    """How much is trained and driven."""
+    """Size of the study."""
 
-    seeds: int
+    seeds: int  # trainings per combination
     steps: int  # decisions of each learner in a training
-    worlds: int
+    worlds: int  # worlds of the evaluation
 
 
 def scenario_of(line: str, contents: str) -> eb.Scenario:
-    """The scenario of a line whose messages contain these pieces."""
+    """Return the scenario of a line of vehicles whose messages have these ``contents``."""
     name, channel = LINES[line]
     return eb.load_scenario(name).replace(v2x={**channel, "tells": list(CONTENTS[contents])})
 
 
 def learn(runs: Path, line: str, contents: str, steps: int, seed: int) -> Path:
-    """The folder of a training, which is made if it does not hold a policy."""
+    """Return the folder of a training. Train first if the folder has no policy."""
     scenario = scenario_of(line, contents)
     folder = runs / f"{line.strip('`')}-{contents}-{steps}-{seed}".replace(" ", "-")
     several = len(scenario.learners)
@@ -74,16 +74,16 @@ def learn(runs: Path, line: str, contents: str, steps: int, seed: int) -> Path:
 
 
 def harms(runs: Path, line: str, contents: str, effort: Effort) -> Floats:
-    """Total harm of every seed's policy, [seeds, worlds] m2/s2."""
+    """Return the total harm of the policy of every seed, [seeds, worlds] in m2/s2."""
     scenario = scenario_of(line, contents)
     folders = [learn(runs, line, contents, effort.steps, seed) for seed in range(effort.seeds)]
     agents = {folder.name: eb.LearnedAgent(eb.load_policy(folder / "policy-last")) for folder in folders}
-    found = eb.evaluate(scenario.sample(effort.worlds, SEED), agents, scenario=scenario, seed=SEED, aftermath=False)
-    return np.stack([found.outcome(name).ledger.world_harm("total") for name in agents])
+    result = eb.evaluate(scenario.sample(effort.worlds, SEED), agents, scenario=scenario, seed=SEED, aftermath=False)
+    return np.stack([result.outcome(name).ledger.world_harm("total") for name in agents])
 
 
 def table(runs: Path, effort: Effort) -> list[list[str]]:
-    """The rows: harm, and its change against the usual pieces, with 95 % intervals over seeds and worlds."""
+    """Return the rows: harm, and its change from the usual pieces, with 95 % intervals over seeds and worlds."""
     found = {(line, each): harms(runs, line, each, effort) for line in LINES for each in CONTENTS}
     rows = []
     for each in CONTENTS:
@@ -96,12 +96,12 @@ def table(runs: Path, effort: Effort) -> list[list[str]]:
 
 
 def main() -> None:
-    """Train what is missing, drive everything, print the table."""
+    """Train missing policies, evaluate all policies, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=300_000, help="decisions of each learner in a training")
-    parser.add_argument("--jobs", type=int, default=1, help="so many trainings at once")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel trainings")
     parser.add_argument("--quick", action="store_true", help="one seed of 4,096 decisions, 50 worlds")
     given = parser.parse_args()
     effort = Effort(1, 4_096, 50) if given.quick else Effort(given.seeds, given.steps, 4_000)

@@ -1,15 +1,15 @@
-"""The front that CAPQL of morl-baselines learns in a given processor time, as the library has it.
+"""The front that CAPQL of morl-baselines learns in a given processor time, with the library's own settings.
 
     pip install . mo-gymnasium morl-baselines
     python docs/studies/morl_front.py docs/studies/morl_front.json --seconds 300 --seeds 3
 
-One network takes the weights of the vehicles' harm beside the observation. It trains on `EthBrakeMO-v0`, with the
-library's own settings. Then it drives worlds that no training draws, once for each weight of a grid. Harm is the mean
-over these worlds in m2/s2. The hypervolume (m6/s6) is what the points dominate below a reference point: full braking,
-and `ROOF` for each vehicle. Full braking alone hides most of a front, because it spares Vehicle 1: only points with as
-little harm for Vehicle 1 count there.
+One network observes the weights of the vehicles' harm in addition to the usual observation. It is trained on
+`EthBrakeMO-v0`. Then it drives in worlds that no training uses, once for each weight vector of a grid. Harm is the mean
+over these worlds in m2/s2. The hypervolume (m6/s6) is the volume that the points dominate, up to a reference point.
+There are two reference points: full braking, and `ROOF` for each vehicle. Most points of a front do not count with the
+first, because full braking does little harm to Vehicle 1, and only points with even less count.
 
-Seconds are processor seconds of learning in one thread; imports, compiling and measuring do not count.
+Seconds are processor seconds of learning in one thread, without imports, compiling and evaluation.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ PACKAGES = ("morl-baselines", "mo-gymnasium", "gymnasium", "torch", "numpy", "et
 
 
 class TimeIsUpError(Exception):
-    """The processor time of a training is spent."""
+    """The processor time of a training is over."""
 
 
 class Limited(Wrapper):  # type: ignore[misc]
-    """Ends a training after ``seconds`` of processor time, whatever the algorithm; counts its steps."""
+    """Wrapper that ends any training after ``seconds`` of processor time, and counts its steps."""
 
     def __init__(self, env: Any, seconds: float) -> None:
         super().__init__(env)
         self.steps, self.ends = 0, time.process_time() + seconds
 
     def step(self, action: Any) -> Any:
-        """Make a step, or raise ``TimeIsUpError``."""
+        """Make a step. Raise ``TimeIsUpError`` if the time is over."""
         if time.process_time() > self.ends:
             raise TimeIsUpError
         self.steps += 1
@@ -68,10 +68,10 @@ def train(seconds: float, seed: int) -> tuple[CAPQL, float, int]:
     env = Limited(mo_gymnasium.make("EthBrakeMO-v0", scenario=SCENARIO), seconds)
     env.reset(seed=seed)
     env.action_space.seed(seed)
-    begun, agent = time.process_time(), CAPQL(env, seed=seed, log=False)
-    with suppress(TimeIsUpError):  # without a log, nothing depends on these
+    start, agent = time.process_time(), CAPQL(env, seed=seed, log=False)
+    with suppress(TimeIsUpError):  # these arguments have no effect without a log
         agent.train(10**9, eval_env=None, ref_point=np.zeros(3), num_eval_weights_for_front=3)
-    return agent, time.process_time() - begun, env.steps
+    return agent, time.process_time() - start, env.steps
 
 
 def measure(agent: CAPQL, scenario: eb.Scenario) -> dict[str, Any]:
@@ -82,21 +82,21 @@ def measure(agent: CAPQL, scenario: eb.Scenario) -> dict[str, Any]:
 
     agents = {"full": eb.make_agent("full_brake"), **{str(weight): driver(weight) for weight in WEIGHTS}}
     result = eb.evaluate(scenario.sample(WORLDS, SEED), agents, scenario=scenario)
-    found: dict[str, Any] = {}
+    numbers: dict[str, Any] = {}
     for count in HARM_COUNTS:
         full, *points = (result.outcome(name).vehicle_harm(count).mean(axis=0).round(4) for name in agents)
-        found[count] = {
+        numbers[count] = {
             "full_braking": full.tolist(),
             "hypervolume": float(hypervolume(-full, [-point for point in points])),
             "hypervolume_below_roof": float(hypervolume(np.full(3, -ROOF), [-point for point in points])),
             "non_dominated": len(filter_pareto_dominated([-point for point in points])),
             "harm": [point.tolist() for point in points],  # by weight
         }
-    return found
+    return numbers
 
 
 def main(words: list[str]) -> int:
-    """Train and measure every seed, and write the numbers into a file."""
+    """Train and evaluate with every seed, and write the numbers to a file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path, help="file for the numbers, JSON")
     parser.add_argument("--seconds", type=float, default=300.0, help="processor seconds of each training")

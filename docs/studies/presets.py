@@ -1,4 +1,4 @@
-"""When the news arrives over each preset: docs/cooperation.md, "The delay of a message".
+"""Delays of the news with each preset, for docs/cooperation.md, "The delay of a message".
 
 .venv/bin/python docs/studies/presets.py
 """

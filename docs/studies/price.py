@@ -2,8 +2,8 @@
 
     .venv/bin/python docs/studies/price.py docs/figures/price-of-not-knowing.png
 
-Agents that see through a channel stand beside the same ones on what was received. The price is the harm of the second
-minus that of the first, paired by world.
+Compares agents that decide only on received messages with the same agents that know the line exactly. The price is the
+difference of their harms, paired by world.
 """
 
 from __future__ import annotations
@@ -27,48 +27,51 @@ from ethbrake_marl.scenario.schema import Scenario
 SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
 POLICY = "ppo"
-ALONE = ("full_brake", POLICY)  # who says nothing of ``estimated``
-LIMITS = {  # who decides on what was received -> the same one that reads the line as it is
+ALONE = ("full_brake", POLICY)  # agents that have no variant ``estimated``
+LIMITS = {  # agent that decides on received messages -> the same agent that knows the line exactly
     "e_v2x_bm:estimated": "e_v2x_bm",
     "planner:128:estimated": "planner:128",
     f"{POLICY}+step:estimated": f"{POLICY}+step",
-    f"{POLICY}+robust:estimated": f"{POLICY}+step",  # no robust shield knows all
+    f"{POLICY}+robust:estimated": f"{POLICY}+step",  # no robust shield is exact
 }
 COUNTS = ("first", "total")
 CAPTION = (
-    f"{SCENARIO} over each channel: {WORLDS:,} worlds of the list of seed {SEED}. Harm on what was received, minus that"
-    " of the same agent which reads the line as it is; 95 % intervals, paired by world."
+    f"{SCENARIO} over each channel: {WORLDS:,} worlds of the list of seed {SEED}. Harm of the agent that decides on"
+    " received messages, minus harm of the same agent that knows the line exactly; 95 % intervals, paired by world."
 )
 
 
 def channels() -> dict[str, dict[str, str]]:
-    """The channels by name: each preset, and where it sends messages one by one also periodic."""
-    found = {}
+    """Return the channels by name: each preset, and each preset with messages also with periodic messages."""
+    named = {}
     for preset in PRESETS:
-        found[preset] = {"preset": preset}
+        named[preset] = {"preset": preset}
         if CHANNELS[preset].timing == "messages" and CHANNELS[preset].hears != "none":
-            found[f"{preset}, periodic"] = {"preset": preset, "persistence": "periodic"}
-    return found
+            named[f"{preset}, periodic"] = {"preset": preset, "persistence": "periodic"}
+    return named
 
 
 def drive(scenario: Scenario, n: int, lines: Mapping[str, dict[str, str]]) -> dict[str, Evaluation]:
-    """Every agent and its limit in the first ``n`` worlds of the list, over every channel."""
-    found = {}
+    """Evaluate all agents and their exact counterparts in the first ``n`` worlds of the list, over every channel.
+
+    ``lines``: name of a channel -> settings of ``v2x``.
+    """
+    results = {}
     for name, v2x in lines.items():
         over = scenario.replace(v2x=v2x)
         agents = {spec: make_agent(spec, scenario=over) for spec in (*ALONE, *LIMITS, *LIMITS.values())}
-        found[name] = evaluate(over.sample(n, SEED), agents, scenario=over, seed=SEED, aftermath=False).complete()
-    return found
+        results[name] = evaluate(over.sample(n, SEED), agents, scenario=over, seed=SEED, aftermath=False).complete()
+    return results
 
 
 def price(over: Evaluation, agent: str, count: str) -> Estimate:
-    """The harm of the agent minus its limit's, over one channel."""
+    """Return the harm of the agent minus the harm of its exact counterpart, over one channel."""
     own, limit = (over.outcome(spec).ledger.world_harm(count) for spec in (agent, LIMITS[agent]))
     return paired_difference(own, limit)
 
 
 def above(over: Evaluation, agent: str) -> Estimate | None:
-    """The share of worlds above what the agent's shield expected first; None: it has none."""
+    """Return the share of worlds with more harm than the first bound of the agent's shield; None without a shield."""
     own = over.outcome(agent)
     if "+" not in agent or own.predicted_harm is None:
         return None
@@ -76,7 +79,7 @@ def above(over: Evaluation, agent: str) -> Estimate | None:
 
 
 def tables(found: Mapping[str, Evaluation]) -> str:
-    """A Markdown table of those that are not compared, and one for every agent that is: a line per channel."""
+    """Return Markdown tables: one of the agents without counterpart, and one per compared agent; a row per channel."""
     head = ["channel", *(f"`{agent}`, {count}" for agent in ALONE for count in COUNTS)]
     lines = [
         [name, *(mean(over.outcome(agent).ledger.world_harm(count)).in_words() for agent in ALONE for count in COUNTS)]
@@ -86,7 +89,7 @@ def tables(found: Mapping[str, Evaluation]) -> str:
 
 
 def compared(found: Mapping[str, Evaluation], agent: str) -> str:
-    """The table of one agent beside its limit."""
+    """Return the table of one agent and its exact counterpart."""
     words = (f"`{LIMITS[agent]}`", f"`{agent}`", "price")
     head = ["channel", *(f"{word}, {count}" for count in COUNTS for word in words)]
     lines = []
@@ -101,13 +104,13 @@ def compared(found: Mapping[str, Evaluation], agent: str) -> str:
 
 
 def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Rows of cells, all but the first to the right."""
+    """Return a Markdown table. All columns except the first are right-aligned."""
     rule = "| --- |" + " ---: |" * (len(head) - 1)
     return "\n".join(["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(cells) + " |" for cells in lines)])
 
 
 def draw(found: Mapping[str, Evaluation]) -> Figure:
-    """The price of every agent that is compared: a group of bars for every channel, a panel for each harm."""
+    """Draw the prices: a group of bars per channel, a bar per agent, a panel per count of harm."""
     units = ("price, first-impact harm (m²/s²)", "price, total harm (m²/s²)")
     figure, at, width = new_figure(8.4, 7.2), np.arange(len(found)), 0.8 / len(LIMITS)
     for axes, count, unit in zip(figure.subplots(2, sharex=True), COUNTS, units, strict=True):
@@ -130,6 +133,6 @@ def draw(found: Mapping[str, Evaluation]) -> Figure:
 
 
 if __name__ == "__main__":
-    driven = drive(load_scenario(SCENARIO), WORLDS, channels())
-    write_picture(sys.argv[1], draw(driven), force=True)
-    print(tables(driven))
+    results = drive(load_scenario(SCENARIO), WORLDS, channels())
+    write_picture(sys.argv[1], draw(results), force=True)
+    print(tables(results))

@@ -1,9 +1,9 @@
-"""What the training blocks of docs/train.md and README reach over five seeds: the table `training-blocks`.
+"""Results of the training programs in docs/train.md and README with five seeds: the table `training-blocks`.
 
     python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
 
-Each argument is a block. ``-bootstrap`` trains it with ``horizon_is_end=False``, ``-speed`` with the reward term of
-docs/train.md that makes a vehicle stop. A training takes a minute or two of one core.
+Each argument names a program. ``-bootstrap`` trains with ``horizon_is_end=False``, ``-speed`` with the reward term of
+docs/train.md that makes a vehicle stop. A training takes one or two minutes on one core.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.physics.state import Floats
 
 SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}
-BLOCKS = {  # scenario, worlds at once, reward
+BLOCKS = {  # program -> scenario, parallel worlds, reward
     "one": ("paper-random", 64, SHAPED),
     "pair": ("cooperation-3-pair", 32, SHAPED),
     "readme": ("paper-random", 64, {"harm": 1.0}),
 }
 SEEDS, STEPS, WORLDS = range(5), 200_000, 500
-MEASURES = {  # heading -> measure, times what, and digits
+MEASURES = {  # heading -> measure, factor, digits
     "first-impact harm": ("first_impact_harm", 1.0, 2),
     "total harm": ("total_harm", 1.0, 2),
     "sampled harm": ("sampled_harm", 1.0, 1),
@@ -35,12 +35,12 @@ MEASURES = {  # heading -> measure, times what, and digits
 
 
 def speed(step: StepOutcome) -> Floats:
-    """Minus the own speed."""
+    """Return minus the speed of each vehicle in m/s."""
     return -step.speeds_mps
 
 
 def train(block: str, seed: int) -> PPO:
-    """The model of a block, trained as the page does with another seed."""
+    """Return the model of a program, trained as on its page, with this seed."""
     name, _, variant = block.partition("-")
     scenario, worlds, reward = BLOCKS[name]
     reward = {**reward, "speed": 5e-4} if variant == "speed" else reward
@@ -50,20 +50,20 @@ def train(block: str, seed: int) -> PPO:
 
 
 def measure(block: str, model: PPO) -> dict[str, float]:
-    """The measures of the policy on worlds that no training has seen."""
+    """Return the measures of the policy on worlds that no training uses."""
     agents = {block: eb.policy_agent(model, clip=True)}
     (row,) = eb.summarise(eb.evaluate(agents=agents, scenario=BLOCKS[block.partition("-")[0]][0], episodes=WORLDS))
-    told = {name: estimate.value for name, estimate in row.estimates.items() if estimate is not None}
-    return told | {"moving": row.exploits.moving}
+    values = {name: estimate.value for name, estimate in row.estimates.items() if estimate is not None}
+    return values | {"moving": row.exploits.moving}
 
 
 def line(block: str, seeds: list[dict[str, float]]) -> str:
-    """The row of a block: median and range of each measure over its seeds."""
+    """Return the row of a program: median and range of each measure over its seeds."""
     cells = [f"`{block}`"]
     for name, scale, digits in MEASURES.values():
         values = sorted(scale * each[name] for each in seeds if name in each)
-        told = [f"{value:.{digits}f}" for value in (median(values), values[0], values[-1])] if values else []
-        cells.append(f"{told[0]} ({told[1]} to {told[2]})" if told else "–")
+        texts = [f"{value:.{digits}f}" for value in (median(values), values[0], values[-1])] if values else []
+        cells.append(f"{texts[0]} ({texts[1]} to {texts[2]})" if texts else "–")
     return f"| {' | '.join(cells)} |"
 
 

@@ -1,4 +1,4 @@
-"""One pair of vehicles in each regime of the closed form: the figure of docs/internals/proofs/constant-deceleration.md.
+"""One pair of vehicles in each regime of the closed form: figure of docs/internals/proofs/constant-deceleration.md.
 
 .venv/bin/python docs/studies/regimes.py docs/figures/regimes.png
 """
@@ -10,7 +10,7 @@ import sys
 import matplotlib.pyplot as plt
 import numpy as np
 
-CASES = {  # gap (m), leader's speed and deceleration, follower's, latency tau (s): one world for each regime
+CASES = {  # regime -> gap, leader's speed and deceleration, follower's speed and deceleration, latency tau (SI units)
     "A: follower coasts": (2.0, 20.0, 6.0, 20.0, 6.0, 1.2),
     "A': coasts, leader stands": (2.0, 4.0, 6.0, 4.0, 6.0, 1.2),
     "B: both brake": (3.5, 20.0, 6.0, 20.0, 6.0, 0.8),
@@ -19,7 +19,7 @@ CASES = {  # gap (m), leader's speed and deceleration, follower's, latency tau (
 
 
 def way(speed, braking, onset, time):
-    """Distance covered by coasting to the onset, then braking to rest."""
+    """Return the distance covered at ``time``: coasting until ``onset``, then braking to rest."""
     after = np.clip(time - onset, 0.0, speed / braking)
     return speed * np.minimum(time, onset) + speed * after - braking * after**2 / 2
 

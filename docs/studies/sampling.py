@@ -1,9 +1,9 @@
-"""The convergence of the paper's fixed-step map to the exact harm as its step shrinks: docs/extensions/reproduction.md.
+"""How the paper's fixed-step map converges to the exact harm with smaller steps: docs/extensions/reproduction.md.
 
     .venv/bin/python docs/studies/sampling.py docs/figures/sampled-convergence.png
 
-Both integrators take the same worlds, under the same constant commands, to the scenario's horizon; Vehicle 2 is driven
-by one agent, all others brake fully. An error is the sampled harm minus the exact one.
+The map and the exact physics simulate the same worlds with the same constant commands, up to the scenario's horizon.
+One agent drives Vehicle 2, and all other vehicles brake fully. Error: sampled harm minus exact harm.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 
 SCENARIO, WORLDS, SEED, VEHICLE = "paper-random", 2000, 7, 1
 STEPS_S = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
-FITTED_UP_TO_S = 0.1  # at 0.2 s Vehicle 3's latency falls between two samples, which is an error of another kind
+FITTED_UP_TO_S = 0.1  # at 0.2 s there is another error: the latency of Vehicle 3 falls between two samples
 CONTROLS = ("full_brake", "constant:5")
-COLUMNS = {  # of the table -> in the figure
+COLUMNS = {  # column of the table -> label in the figure
     "first-impact, mean": "first-impact harm, error of the mean",
     "total, mean": "total harm, error of the mean",
     "first-impact, median abs.": "first-impact, median over worlds",
@@ -46,19 +46,19 @@ CAPTION = (
 
 @dataclass(frozen=True)
 class Convergence:
-    """One control of Vehicle 2: the exact harms, and the errors at every step."""
+    """Results for one agent of Vehicle 2: the exact harms, and the errors for every step length."""
 
     agent: str
     first_mean: float  # exact mean first-impact harm
-    total_mean: float
+    total_mean: float  # exact mean total harm
     chained: float  # share of worlds with a chain impact
     steps_s: Sequence[float]
-    errors: Floats  # [step, column], m2/s2
+    errors: Floats  # [step length, column], m2/s2
 
     def order(self, column: int) -> float | None:
-        """Slope of log |error| over log step, by least squares for steps up to ``FITTED_UP_TO_S``.
+        """Return the slope of log |error| over log step, by least squares for steps up to ``FITTED_UP_TO_S``.
 
-        None where the error changes its sign or is zero, so that it has no order.
+        Return None if the error changes its sign or is zero, because it then has no order.
         """
         steps = np.array(self.steps_s)
         fitted = steps <= FITTED_UP_TO_S
@@ -69,7 +69,10 @@ class Convergence:
 
 
 def chain_impacts(worlds: Worlds, rows: ImpactRows) -> Bools:
-    """Worlds in which an impact moved a third vehicle, [n]: the momentum of the two that met did not stay theirs."""
+    """Return which worlds have an impact that moved a third vehicle, [n].
+
+    In such an impact the momentum of the two colliding vehicles changes.
+    """
     mass = worlds.vehicles.mass_t
     front = mass[rows.world, rows.pair] * rows.front_speed_change_mps
     rear = mass[rows.world, rows.pair + 1] * rows.rear_speed_change_mps
@@ -79,7 +82,7 @@ def chain_impacts(worlds: Worlds, rows: ImpactRows) -> Bools:
 
 
 def convergence(worlds: Worlds, agent: str, until_s: float = 8.0, steps_s: Sequence[float] = STEPS_S) -> Convergence:
-    """Exact and sampled harm of ``worlds`` (at the alert) up to ``until_s``, for every step."""
+    """Compute exact and sampled harm of ``worlds`` (at the alert) up to ``until_s``, for every step length."""
     command = -worlds.vehicles.braking_capacity_mps2
     driver = make_agent(agent)
     command[:, VEHICLE], _ = ask_script(driver, worlds, begin_script(driver, worlds, VEHICLE, {}), VEHICLE)
@@ -94,7 +97,7 @@ def convergence(worlds: Worlds, agent: str, until_s: float = 8.0, steps_s: Seque
 
 
 def errors_of(worlds: Worlds, sampled: Impacts, exact: Impacts, chained: Bools) -> list[float]:
-    """What the columns tell at one step."""
+    """Return the values of all columns for one step length."""
     ledger, reference = empty_ledger(worlds).add(sampled), empty_ledger(worlds).add(exact)
     first = ledger.world_harm("first") - reference.world_harm("first")
     total = ledger.world_harm("total") - reference.world_harm("total")
@@ -104,7 +107,7 @@ def errors_of(worlds: Worlds, sampled: Impacts, exact: Impacts, chained: Bools) 
 
 
 def table(study: Convergence) -> str:
-    """One control as a Markdown table: a line per step, and the fitted order below."""
+    """Return the results of one agent as a Markdown table: one row per step length, and a row with the orders."""
     lines = [
         f"`{study.agent}`: exact mean harm {study.first_mean:.3f} (first-impact) and {study.total_mean:.3f} (total);"
         f" chain impacts in {study.chained:.1%} of the worlds.",
@@ -122,7 +125,7 @@ def table(study: Convergence) -> str:
 
 
 def draw(studies: Sequence[Convergence]) -> Figure:
-    """Absolute errors over the step, both on logarithmic axes, one panel per control, with a line of order 1."""
+    """Draw absolute errors over step lengths on logarithmic axes: a panel per agent, with a line of order 1."""
     figure = new_figure(7.4, 3.9)
     places = figure.subplots(1, len(studies), sharey=True, squeeze=False)[0]
     for axes, study in zip(places, studies, strict=True):
@@ -146,9 +149,9 @@ def draw(studies: Sequence[Convergence]) -> Figure:
 if __name__ == "__main__":
     scenario = load_scenario(SCENARIO)
     sample = scenario.sample(WORLDS, SEED)
-    found = [convergence(sample.worlds, agent, scenario.horizon_s) for agent in CONTROLS]
-    write_picture(sys.argv[1], draw(found), force=True)
+    studies = [convergence(sample.worlds, agent, scenario.horizon_s) for agent in CONTROLS]
+    write_picture(sys.argv[1], draw(studies), force=True)
     versions = ", ".join(f"{name} {number}" for name, number in result_versions().items())
     identity = f"Worlds: SHA-256 {worlds_sha256(sample.worlds, sample.index)}; "
     identity += f"scenario: SHA-256 {scenario_sha256(scenario)}; {versions}."
-    print("\n\n".join([*map(table, found), identity]))
+    print("\n\n".join([*map(table, studies), identity]))

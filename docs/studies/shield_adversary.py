@@ -1,7 +1,7 @@
-"""The trained adversary of the shield: PPO under the shield, paid for the harm of each step; weights in tests/shield.
+"""Train adversaries of the shield: PPO behind the shield, rewarded for harm. Writes their weights to tests/shield.
 
-``PYTHONPATH=. .venv/bin/python docs/studies/shield_adversary.py``: a minute for each number of vehicles. The weights
-are plain arrays, and stay those of the repository unless this is run.
+``PYTHONPATH=. .venv/bin/python docs/studies/shield_adversary.py`` takes a minute for each number of vehicles. The
+weights in the repository are plain arrays, and change only if this program is run.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "tests" / "shield"
 
 
 def train(N: int, steps: int) -> str:
-    """Train against the shield on ``line(N)`` and keep the actor's weights."""
+    """Train against the shield on a line of ``N`` vehicles, save the actor's weights, and return a summary."""
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecEnvWrapper
@@ -43,10 +43,10 @@ def train(N: int, steps: int) -> str:
     )  # fmt: skip
     model.learn(steps)
     state = model.policy.state_dict()
-    kept = {}
+    weights = {}
     for k, name in enumerate([*(f"mlp_extractor.policy_net.{2 * k}" for k in range(len(HIDDEN))), "action_net"]):
-        kept |= {f"weight{k}": state[f"{name}.weight"].numpy(), f"bias{k}": state[f"{name}.bias"].numpy()}
-    np.savez(FOLDER / f"adversary-{N}.npz", **kept)
+        weights |= {f"weight{k}": state[f"{name}.weight"].numpy(), f"bias{k}": state[f"{name}.bias"].numpy()}
+    np.savez(FOLDER / f"adversary-{N}.npz", **weights)
     paid = np.mean([episode["r"] for episode in model.ep_info_buffer])
     return f"N = {N}: {steps:,} steps, mean harm of the last episodes {-paid / 0.02:.2f} m2/s2"
 

@@ -1,7 +1,7 @@
-"""How fast the step shield is: ``.venv/bin/python docs/studies/shield_speed.py [DECISIONS]``.
+"""Speed of the step shield: ``.venv/bin/python docs/studies/shield_speed.py [DECISIONS]``.
 
-Decisions per second of a batch, the latency of one decision, and both with a learned policy behind the shield. The
-figures of single decisions mean something on idle cores only.
+Prints the decisions per second of a batch, the time of one decision, and the time of one decision with a learned policy
+behind the shield. Measure single decisions on idle cores.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ SCENARIO = load_scenario("paper-random")
 
 
 def batch_rate(intervals: str | None, n: int) -> tuple[float, int]:
-    """Decisions per second of a batch under random proposals, and the members of each world."""
+    """Return decisions per second of a batch of ``n`` worlds with random proposals, and the members per world."""
     shield = RobustShield(SCENARIO, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
     shield.begin(SCENARIO.sample(n, 3).worlds, np.arange(n))
     rng = np.random.default_rng(0)
     shield.decide(rng.uniform(-1.0, 1.0, n))
-    done, begun = 0, time.process_time()
+    done, start = 0, time.process_time()
     while not shield.memory.running.finished.all():
         done += int((~shield.memory.running.finished).sum())
         shield.decide(rng.uniform(-1.0, 1.0, n))
-    return done / (time.process_time() - begun), shield.memory.running.members
+    return done / (time.process_time() - start), shield.memory.running.members
 
 
 def single_times(decisions: int) -> list[float]:
-    """Seconds of one decision after another, by the clock."""
+    """Return the wall-clock seconds of each decision."""
     rng, took = np.random.default_rng(0), []
     while len(took) < decisions:
         shield = StepShield(SCENARIO, 1)
@@ -52,7 +52,10 @@ def single_times(decisions: int) -> list[float]:
 
 
 def policy_times(decisions: int, later: bool) -> list[float]:
-    """Processor seconds per decision of a learned policy behind the shield, one world at a time."""
+    """Return the processor seconds of each decision of a learned policy behind the shield, one world at a time.
+
+    ``later``: the setting ``later_rollouts`` of the shield.
+    """
     (policy,) = make_agents(["ppo"], SCENARIO).values()
     took: list[float] = []
     world = 0
@@ -69,17 +72,17 @@ def policy_times(decisions: int, later: bool) -> list[float]:
 
 
 def main(decisions: int = 5_000) -> None:
-    """Print one line for each."""
+    """Print one line per measurement."""
     for intervals, n in ((None, 4096), ("gaps_m=0.5", 1000), ("braking_capacity_mps2=10%,gaps_m=0.5", 1000)):
         rate, members = batch_rate(intervals, n)
-        print(f"{members} members a world ({intervals or 'step mode'}): {rate:,.0f} decisions/s batched", flush=True)
-    for told, took in (
+        print(f"{members} members per world ({intervals or 'step mode'}): {rate:,.0f} decisions/s batched", flush=True)
+    for label, took in (
         ("one decision", single_times(decisions)),
-        ("ppo behind it, inference included, with later rollouts", policy_times(decisions, True)),
-        ("ppo behind it, inference included, without", policy_times(decisions, False)),
+        ("one decision with ppo, inference included, with later rollouts", policy_times(decisions, True)),
+        ("one decision with ppo, inference included, without later rollouts", policy_times(decisions, False)),
     ):
         middle, slow = np.quantile(took, [0.5, 0.99]) * 1e6
-        print(f"{told}: p50 {middle:.0f} us, p99 {slow:.0f} us", flush=True)
+        print(f"{label}: p50 {middle:.0f} us, p99 {slow:.0f} us", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""The speed of a machine per second of processor time: ``python docs/studies/speed.py [--quick] [--json]``.
+"""Speed of the package per second of processor time: ``python docs/studies/speed.py [--quick] [--json]``.
 
-Every rate is the median over repetitions of work done per second of this process's own processor time, on one core and
-after a first round that does not count (it compiles and fills caches). Programs that run beside it therefore weigh
-little, though not nothing: caches and memory are shared. ``relative`` sets a rate of world-steps against the
-calibration, a loop so simple that hardly anything but the machine can make it slower, measured in the same run.
+Every rate is a median over repetitions: work per second of this process's processor time, on one core, after a first
+round that does not count (it compiles and fills caches). Other programs on the machine have little effect, because
+only caches and memory are shared. ``relative`` is a rate of world-steps divided by the rate of the calibration in the
+same run. The calibration is a very simple loop, whose rate depends almost only on the machine.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ SCENARIO = "paper-random"
 SEED = 7
 _VEHICLES = 3
 STEP_S = 0.1
-SHARE = 0.75  # of its braking capacity, with which a learner brakes
+SHARE = 0.75  # a learner brakes with this share of its braking capacity
 WORLD_STEPS = "world-steps/s"
-MOST_STEPS = 1000  # by then every world is at rest, or none will be
+MOST_STEPS = 1000  # limit, in case some world never comes to rest
 
-Work = Callable[[], int]  # does some work and says how much it was
+Work = Callable[[], int]  # does some work, and returns its amount
 
 
 class Effort(NamedTuple):
-    """How long to look: repetitions of each measurement, and processor seconds of each at least."""
+    """Effort per measurement: number of repetitions, and least processor seconds of each repetition."""
 
     repetitions: int
     seconds: float
@@ -59,22 +59,22 @@ FULL = Effort(7, 0.4)
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """One measured figure."""
+    """One measurement."""
 
     name: str
     workload: str
-    worlds: int  # at once
-    vehicles: int  # in each world
+    worlds: int  # simulated together
+    vehicles: int  # per world
     unit: str
     value: float  # median over repetitions
     lowest: float
     highest: float
-    floor: float | None = None  # what the project aims at: at least this (for seconds: at most)
-    relative: float | None = None  # rate of world-steps over that of the calibration
+    floor: float | None = None  # aim of the project: at least this rate, at most this number of seconds
+    relative: float | None = None  # rate of world-steps / rate of the calibration
 
 
 def rates(work: Work, effort: Effort) -> Floats:
-    """Units of work per second of processor time, one for each repetition, ascending."""
+    """Return the units of work per second of processor time, one value per repetition, ascending."""
     work()
     found = []
     for _ in range(effort.repetitions):
@@ -88,31 +88,31 @@ def rates(work: Work, effort: Effort) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Benchmark:
-    """A figure before it is measured."""
+    """Description of a measurement."""
 
     name: str
     workload: str
     unit: str
     worlds: int
     floor: float | None
-    look: Callable[[Effort], Floats]  # one value for each repetition, ascending
+    look: Callable[[Effort], Floats]  # returns one value per repetition, ascending
 
     def measure(self, effort: Effort) -> Speed:
-        """Measure it now."""
+        """Run the measurement."""
         found = self.look(effort)
         low, middle, high = float(found[0]), float(np.median(found)), float(found[-1])
         return Speed(self.name, self.workload, self.worlds, _VEHICLES, self.unit, middle, low, high, self.floor)
 
 
 def measure(*, quick: bool = False) -> list[Speed]:
-    """Every figure of ``BENCHMARKS``, one after the other; world-steps are set against the first, the calibration."""
+    """Run all measurements of ``BENCHMARKS``, in order. The first one is the calibration, used for ``relative``."""
     found = [benchmark.measure(QUICK if quick else FULL) for benchmark in BENCHMARKS]
     first = found[0].value
     return [replace(speed, relative=speed.value / first) if speed.unit == WORLD_STEPS else speed for speed in found]
 
 
 def braking(n: int, share: float) -> Work:
-    """Worlds from their first decision until all are at rest; Vehicle 2 brakes with a share of its capacity."""
+    """Simulate worlds from the first decision until all are at rest; Vehicle 2 brakes with a share of its capacity."""
     worlds = make_engine(SCENARIO, n, seed=SEED).worlds
     command = -worlds.vehicles.braking_capacity_mps2
     command[:, 1] *= share
@@ -120,7 +120,7 @@ def braking(n: int, share: float) -> Work:
 
 
 def until_rest(worlds: Worlds, command_mps2: Floats) -> Work:
-    """``advance`` and the ledger, step by step under constant commands, until all worlds are at rest."""
+    """``advance`` and the ledger: steps with constant commands, until all worlds are at rest."""
     after, steps = worlds, 0
     while after.speeds_mps.any() and steps < MOST_STEPS:
         after, steps = advance(after, command_mps2, STEP_S)[0], steps + 1
@@ -136,7 +136,7 @@ def until_rest(worlds: Worlds, command_mps2: Floats) -> Work:
 
 
 def stepping(n: int, steps: int = 100) -> Work:
-    """The engine: dynamics, ledger, rewards, ends of episodes, the learner's observation, and new episodes."""
+    """Steps of the engine: motion, ledger, rewards, ends of episodes, the learner's observation, and new episodes."""
     engine = make_engine(SCENARIO, n, seed=SEED)
     learners = np.array(engine.learners)
     actions = np.full((n, len(learners)), -SHARE)
@@ -152,7 +152,7 @@ def stepping(n: int, steps: int = 100) -> Work:
 
 
 def vec_env(n: int, steps: int = 100) -> Work:
-    """The Stable-Baselines3 ``VecEnv``: the engine's step, infos, and new episodes as old ones end."""
+    """Steps of the Stable-Baselines3 ``VecEnv``: the engine's step, infos, and automatic new episodes."""
     environment = eb.make_sb3_vec_env(SCENARIO, n, seed=SEED)  # imports torch, hence only now
     environment.reset()
     actions = np.full((n, 1), -SHARE, np.float32)
@@ -166,7 +166,7 @@ def vec_env(n: int, steps: int = 100) -> Work:
 
 
 def parallel(n: int, episodes: int = 20) -> Work:
-    """Whole episodes of one world (``n`` is 1) through PettingZoo's parallel API, resets included."""
+    """Whole episodes of one world (``n`` is 1) with PettingZoo's parallel API, including resets."""
     environment = parallel_env(SCENARIO)
     actions = {f"vehicle_{i + 1}": np.array([-SHARE], np.float32) for i in environment.engine.learners}
     environment.reset(seed=SEED)
@@ -208,7 +208,7 @@ def _calibration(n: int) -> Work:
 
 @compiled
 def brake_apart(speeds: Floats, ways: Floats, steps: int) -> int:
-    """The calibration: vehicles that brake without seeing each other, and start again when at rest."""
+    """Run the calibration: vehicles brake independently, and restart when they are at rest. Return the world-steps."""
     for _ in range(steps):
         for k in range(speeds.shape[0]):
             for i in range(speeds.shape[1]):
@@ -227,7 +227,7 @@ environment.step({"vehicle_2": [-1.0]})
 
 
 def _start_seconds(effort: Effort) -> Floats:
-    """Processor seconds of a fresh interpreter that makes one world and steps it once; the kernels' cache is warm."""
+    """Return the processor seconds of a new Python process that makes one world and steps it, with compiled kernels."""
     found = []
     for _ in range(effort.repetitions + 1):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -247,7 +247,7 @@ def _rate_of(
     return Benchmark(name, workload, unit, n, floor, lambda effort: rates(make(n), effort))
 
 
-# The calibration comes first: the others are set against it.
+# The calibration comes first, because other rates are divided by its rate.
 BENCHMARKS: tuple[Benchmark, ...] = (
     _rate_of("calibration", "constant deceleration, no event", _calibration, 1024),
     *(
@@ -277,33 +277,32 @@ BENCHMARKS: tuple[Benchmark, ...] = (
 
 
 def main() -> None:
-    """Measure, and print a table and the machine."""
+    """Run the measurements, and print a table and the machine."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="in about 20 s instead of a minute or two; coarser")
+    parser.add_argument("--quick", action="store_true", help="coarser: about 20 s instead of one to two minutes")
     parser.add_argument("--json", action="store_true", help="print JSON")
     given = parser.parse_args()
     machine, figures = this_machine(), measure(quick=given.quick)
     if given.json:
-        told = {"machine": asdict(machine), "figures": [asdict(speed) for speed in figures]}
-        print(json.dumps(told, indent=2))
+        print(json.dumps({"machine": asdict(machine), "figures": [asdict(speed) for speed in figures]}, indent=2))
         return
     rows = [
         (
             *(speed.name, f"{speed.worlds:,}", f"{plain(speed.value)} {speed.unit.removesuffix('/s')}"),
             f"{plain(speed.lowest)} - {plain(speed.highest)}",
-            "" if speed.relative is None else plain(speed.value * speed.vehicles),  # of world-steps alone
+            "" if speed.relative is None else plain(speed.value * speed.vehicles),  # only for world-steps
             "" if speed.floor is None else plain(speed.floor),
         )
         for speed in figures
     ]
     columns: list[Column | str] = ["per CPU-second", *map(Column, ("worlds", "median", "range", "x vehicles", "aim"))]
     print(Sheet("", columns, rows).markdown())
-    print("Medians over repetitions, and their range. Aim: at least, for seconds at most.")
+    print("Medians and ranges over repetitions. Aim: at least this rate, at most this number of seconds.")
     print(f"Machine: {machine}")
 
 
 def plain(value: float) -> str:
-    """Three digits, with k for thousands, M for millions and G beyond."""
+    """Return a number with three digits, and k for thousands, M for millions or G for billions."""
     for size, letter in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if value >= size:
             return f"{value / size:#.3g}".removesuffix(".") + letter

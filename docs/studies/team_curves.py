@@ -1,12 +1,12 @@
 """Learning curves of several learners at equal processor time: five algorithms, four levels, several seeds.
 
-    python docs/studies/team_curves.py runs/teams --seconds 60 --jobs 16    # trains what is missing there
-    python docs/studies/team_curves.py runs/teams --draw                    # figure, numbers, table of the docs
+    python docs/studies/team_curves.py runs/teams --seconds 60 --jobs 16    # runs the missing trainings
+    python docs/studies/team_curves.py runs/teams --draw                    # draws figure and table, writes numbers
 
-Needs the extras `train` and `marl`. ``--seconds`` are processor seconds of learning of each training, in one thread:
-a short training of each algorithm on each level first says how many decisions fit. Imports, compiling and measuring
-do not count. Every algorithm observes the same, and trains for first-impact harm. Every job leaves one file, and the
-same command does what is missing.
+Needs the extras `train` and `marl`. ``--seconds`` are the processor seconds of learning of each training, in one
+thread. First a short training of each algorithm on each level measures how many decisions fit into this time. Imports,
+compiling and evaluations do not count. All algorithms have the same observations and minimise first-impact harm. Every
+job writes one file, and the same command runs the missing jobs.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from ethbrake_marl.training.fixed_list import drive_list
 from ethbrake_marl.training.random_state import own_random_state
 from ethbrake_marl.training.team import load_team
 
-ALGORITHMS = {  # label, and about so many decisions per processor second, for the first short training
+ALGORITHMS = {  # name -> label, and estimated decisions per processor second for the first short training
     "ippo": ("IPPO (`train/ippo.py`)", 16_000),
     "mappo": ("MAPPO (`train/mappo.py`)", 8_000),
     "benchmarl": ("BenchMARL's MAPPO", 13_000),
@@ -64,26 +64,26 @@ ALGORITHMS = {  # label, and about so many decisions per processor second, for t
 }
 LEVELS = ("cooperation-3-pair", "cooperation-3-congested", "cooperation-4-all", "cooperation-4-congested")
 SEEN = ["own", "front_1", "rear_1", "role", "obstacle"]
-WORLDS, SEED, BUDGET = 2000, 2059, 5000  # the list of worlds, and candidates per world of the search on it
-POINTS = 11  # measurements after the first, which comes before the first update
-SHORT = 8  # the first short training takes this part of the time
+WORLDS, SEED, BUDGET = 2000, 2059, 5000  # number and seed of the evaluated worlds; candidates per world of the search
+POINTS = 11  # evaluations of a training, in addition to one before the first update
+SHORT = 8  # the first short training takes this fraction of the time: 1 / SHORT
 DOCS = Path(__file__).resolve().parents[1]
 NUMBERS = DOCS / "studies" / "team_curves.json"
 PICTURE = DOCS / "figures" / "team-curves.png"
 HEAD = ["scenario", "who drives the learners", "decisions", "processor time", "first-impact harm", "total harm"]
-Results = dict[str, Any]  # what a folder of results holds: ``gather``
+Results = dict[str, Any]  # content of a folder of results, from ``gather``
 
 
 def level_of(name: str) -> eb.Scenario:
-    """A level, on which everybody observes the same features whatever the algorithm."""
+    """Return the scenario of a level, with the same observation for all algorithms."""
     return eb.load_scenario(name).replace(observation=SEEN)
 
 
-# 1. A training, which is measured on its way
+# 1. A training with evaluations
 
 
 class Clock:
-    """Measures a team at about equal distances of a training, and says how much processor time learning has taken."""
+    """Evaluates a team at about equal intervals of a training, and records the processor time of learning."""
 
     def __init__(self, scenario: eb.Scenario, steps: int, worlds: int) -> None:
         self.scenario, self.steps, self.worlds = scenario, steps, scenario.sample(worlds, SEED).worlds
@@ -91,7 +91,7 @@ class Clock:
         self.begun = 0.0
 
     def look(self, decisions: int, make_team: Callable[[], Team]) -> None:
-        """Measure, if it is time; the first call is made before the first decision."""
+        """Evaluate the team if an evaluation is due. The first call comes before the first decision."""
         spent = time.process_time() - self.begun if self.points else 0.0
         if decisions >= len(self.points) * self.steps / POINTS:
             ledgers = [part.ledger for part in drive_list(self.worlds, make_team(), self.scenario)]
@@ -102,17 +102,17 @@ class Clock:
 
 @cache
 def script(name: str) -> Any:
-    """The module ``train/NAME.py``."""
+    """Return the module ``train/NAME.py``."""
     spec = importlib.util.spec_from_file_location(f"train_{name}", DOCS.parent / "train" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where its data classes look for it
+    sys.modules[spec.name] = module  # its data classes look up annotations here
     spec.loader.exec_module(module)
     return module
 
 
 def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
-    """Train by ``train/NAME.py`` as it is; its ``Copies`` also call the clock before every rollout."""
+    """Train with ``train/NAME.py``. A subclass of its ``Copies`` calls the clock before every rollout."""
     module, scenario = script(name), clock.scenario
     settings = module.Settings(scenario=scenario, steps=clock.steps, seed=seed)
     decisions = settings.copies * settings.rollout * len(scenario.learners)
@@ -139,8 +139,9 @@ def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
 
 
 def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
-    """Train by BenchMARL's MAPPO, with the numbers of `cooperation-ppo`; the callback lowers the learning rate as it
-    says, which BenchMARL does not do by itself.
+    """Train BenchMARL's MAPPO with the hyperparameters of the recipe `cooperation-ppo`.
+
+    A callback applies the recipe's schedule of the learning rate, because BenchMARL has no schedule.
     """
     from benchmarl.experiment import Callback
 
@@ -171,7 +172,7 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
 
 
 def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
-    """Train by a recipe of ours, all learners by one shared policy."""
+    """Train with one of our recipes; all learners share one policy."""
     recipe = eb.load_recipe(name)
     often = max(clock.steps // (recipe.n_envs * recipe.rounds) // 100, 1)
     measured = {**recipe.evaluation.model_dump(), "every_updates": often}
@@ -187,7 +188,10 @@ def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
 
 
 def learn(algorithm: str, level: str, steps: int, seed: int, worlds: int = WORLDS) -> list[list[float]]:
-    """Train ``steps`` decisions; the points of the curve."""
+    """Train for ``steps`` decisions, and return the points of the learning curve.
+
+    A point: decisions, processor seconds, first-impact harm, total harm.
+    """
     clock = Clock(level_of(level), steps, worlds)
     with TemporaryDirectory() as scratch, open(devnull, "w") as nowhere:
         folder = Path(scratch) / "run"
@@ -202,23 +206,23 @@ def learn(algorithm: str, level: str, steps: int, seed: int, worlds: int = WORLD
     return clock.points
 
 
-# 2. Jobs, each of which writes one file
+# 2. Jobs; each job writes one file
 
 
 @cache
 def warm(algorithm: str) -> None:
-    """Import and compile in this process what an algorithm needs."""
+    """Import and compile everything that an algorithm needs, in this process."""
     learn(algorithm, LEVELS[-1], 1, 0, worlds=2)
 
 
 def write(file: Path, content: Results) -> str:
-    """Write the result of a job whole; returns the file's name."""
+    """Write the result of a job to ``file``, and return the name of the file."""
     write_file(file, json.dumps(content).encode() + b"\n")
     return file.name
 
 
 def measure_speed(file: Path, algorithm: str, level: str, seconds: float) -> str:
-    """How many decisions fit into a processor second, by a short training."""
+    """Measure the decisions per processor second in a short training."""
     warm(algorithm)
     steps = max(round(ALGORITHMS[algorithm][1] * seconds / SHORT), 1)
     done, spent, *_ = learn(algorithm, level, steps, 99, worlds=2)[-1]
@@ -226,14 +230,14 @@ def measure_speed(file: Path, algorithm: str, level: str, seconds: float) -> str
 
 
 def train(file: Path, algorithm: str, level: str, steps: int, seed: int) -> str:
-    """One training, and its curve."""
+    """Train once, and write the learning curve."""
     warm(algorithm)
     points = learn(algorithm, level, steps, seed)
     return write(file, {"algorithm": algorithm, "level": level, "seed": seed, "points": points})
 
 
 def refer(file: Path, level: str) -> str:
-    """Harm of full braking and of E-V2X-BM on the list of a level, and the least harm that a search found there."""
+    """Write the harm of full braking, of E-V2X-BM and of the joint optimum of a search, on the list of a level."""
     scenario = level_of(level)
     sample = scenario.sample(WORLDS, SEED)
     table = search_list(scenario, sample, budget=BUDGET, threads=1, chunks=file.with_suffix(".search"))
@@ -246,7 +250,7 @@ def refer(file: Path, level: str) -> str:
 
 
 def finish_jobs(jobs: Mapping[Future[str], str]) -> int:
-    """Wait for jobs, and say what became of each; how many failed."""
+    """Wait for jobs, print the end of each job, and return the number of failed jobs."""
     failed, begun = 0, time.monotonic()
     for number, job in enumerate(as_completed(jobs), 1):
         error, spent = job.exception(), time.monotonic() - begun
@@ -258,7 +262,7 @@ def finish_jobs(jobs: Mapping[Future[str], str]) -> int:
 
 
 def work(folder: Path, given: argparse.Namespace) -> int:
-    """Do all that ``folder`` has not; how many jobs failed."""
+    """Run the jobs whose files are missing in ``folder``, and return the number of failed jobs."""
     folder.mkdir(parents=True, exist_ok=True)
     check(folder, given)
     pairs = list(product(given.levels, given.algorithms))
@@ -281,18 +285,18 @@ def work(folder: Path, given: argparse.Namespace) -> int:
 
 
 def check(folder: Path, given: argparse.Namespace) -> None:
-    """Stop here, with one message, if an algorithm cannot run or the folder holds another study. Compiles."""
+    """Exit with a message if an algorithm cannot run or ``folder`` has another study. Compiles the kernels."""
     study = {"seconds": given.seconds, "worlds": WORLDS, "seed": SEED, "budget": BUDGET, "seen": SEEN}
     file = folder / "study.json"
     if file.exists() and {name: json.loads(file.read_bytes()).get(name) for name in study} != study:
-        raise SystemExit(f"{folder}: holds a study with other settings ({file.name}); give another folder")
+        raise SystemExit(f"{folder}: has a study with other settings ({file.name}); give another folder")
     for algorithm in given.algorithms:
         begun = time.monotonic()
         try:
             warm(algorithm)
         except Exception as error:
-            raise SystemExit(f"{algorithm}: does not run here: {type(error).__name__}: {error}") from error
-        print(f"{algorithm}: runs here; {time.monotonic() - begun:.0f} s to import and compile", flush=True)
+            raise SystemExit(f"{algorithm} does not run on this machine: {type(error).__name__}: {error}") from error
+        print(f"{algorithm} runs; {time.monotonic() - begun:.0f} s to import and compile", flush=True)
     if not file.exists():
         today = datetime.datetime.now(datetime.UTC).date().isoformat()
         write(file, {**study, "machine": str(this_machine()), "date": today})
@@ -302,7 +306,7 @@ def check(folder: Path, given: argparse.Namespace) -> None:
 
 
 def gather(folder: Path) -> Results:
-    """Everything in a folder of results: the study, speeds, references by level, curves."""
+    """Read a folder of results: settings of the study, speeds, references by level, learning curves."""
     found: Results = json.loads((folder / "study.json").read_bytes())
     found["speeds"] = [json.loads(file.read_bytes()) for file in sorted(folder.glob("speed.*.json"))]
     every = [json.loads(file.read_bytes()) for file in sorted(folder.glob("references.*.json"))]
@@ -312,7 +316,7 @@ def gather(folder: Path) -> Results:
 
 
 def text_of(found: Results) -> str:
-    """The file of numbers, each curve on a line of its own."""
+    """Return the text of the file of numbers, with one line per learning curve."""
     for curve in found["curves"]:
         curve["points"] = [[int(d), round(s, 2), *(round(h, 4) for h in harms)] for d, s, *harms in curve["points"]]
     whole = {key: json.dumps(value) for key, value in found.items() if key not in ("curves", "speeds")}
@@ -322,18 +326,21 @@ def text_of(found: Results) -> str:
 
 
 def curves_of(found: Results, level: str, algorithm: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """The curves of all seeds, [seeds, points, 4]: decisions, processor seconds, first-impact harm, total harm."""
+    """Return the learning curves of all seeds, [seeds, points, 4].
+
+    The last axis: decisions, processor seconds, first-impact harm, total harm.
+    """
     own = [each["points"] for each in found["curves"] if (each["level"], each["algorithm"]) == (level, algorithm)]
     return np.array(own, np.float64)
 
 
 def levels_of(found: Results) -> list[str]:
-    """The levels of which there is a curve."""
+    """Return the levels that have a learning curve."""
     return [level for level in LEVELS if any(curve["level"] == level for curve in found["curves"])]
 
 
 def table(found: Results) -> list[list[str]]:
-    """The rows: what each algorithm reaches at the end of its time, and what it compares with."""
+    """Return the rows of the table: each algorithm at the end of its time, and the references."""
     rows = []
     for level in levels_of(found):
         harms = found["references"].get(level, {})
@@ -353,7 +360,7 @@ def table(found: Results) -> list[list[str]]:
 
 
 def draw(found: Results) -> Figure:
-    """First-impact harm over processor seconds, a panel for each level, with bands of the 95 % intervals."""
+    """Draw first-impact harm over processor seconds, with a panel per level and bands of 95 % intervals."""
     levels = levels_of(found)
     figure, panels = new_panels((9.4, 3.3 * -(-len(levels) // 2) + 0.6), -(-len(levels) // 2), min(len(levels), 2))
     for axes, level in zip(panels, levels, strict=False):
@@ -384,15 +391,15 @@ def draw(found: Results) -> Figure:
 
 
 def main() -> int:
-    """Train what is missing, or draw; 1 where a job failed."""
+    """Run the missing jobs, or draw the results. Return 1 if a job failed, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path, help="folder of results, or with --draw the file of their numbers")
+    parser.add_argument("results", type=Path, help="folder of results; with --draw also a file of numbers")
     parser.add_argument("--seconds", type=float, default=60.0, help="processor seconds of each training")
-    parser.add_argument("--jobs", type=int, default=1, help="processes at a time, one thread each")
+    parser.add_argument("--jobs", type=int, default=1, help="number of parallel processes, with one thread each")
     parser.add_argument("--algorithms", nargs="+", choices=[*ALGORITHMS], default=[*ALGORITHMS])
     parser.add_argument("--levels", nargs="+", choices=LEVELS, default=[*LEVELS])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--draw", action="store_true", help="draw figure and table from what is there; no training")
+    parser.add_argument("--draw", action="store_true", help="draw figure and table of existing results; no training")
     parser.add_argument("--numbers", type=Path, default=NUMBERS, help="where --draw writes the numbers")
     parser.add_argument("--picture", type=Path, default=PICTURE, help="where --draw writes the figure")
     given = parser.parse_args()

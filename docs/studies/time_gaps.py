@@ -1,9 +1,9 @@
-"""How much of full braking's harm can be saved, against the time gap: the figure of docs/findings.md.
+"""How much of full braking's harm can be avoided, by time gap: the figure of docs/findings.md.
 
     .venv/bin/python docs/studies/time_gaps.py docs/figures/time-gaps.png
 
-Lines drive at 20 m/s, and every vehicle keeps the same time gap; all else is drawn as in the scenario. Prints harm and
-saved share of each agent, for each scenario, time gap, and count of harm.
+Lines drive at 20 m/s, and all vehicles have the same time gap. All other quantities are drawn as in the scenario.
+Prints the harm of each agent, and the avoided share of full braking's harm, by scenario, time gap and count of harm.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ WORLDS, SEED = 2000, 7
 GAPS_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4)
 AGENTS = ("full_brake", "e_v2x_bm", "idm", "universal", "best_harm")
 SCENARIOS = ("paper-random", "realistic-motorway")
-LEAST = 0.05  # mean harm of full braking (m2/s2) below which no share of it is shown
+LEAST = 0.05  # no share is shown if the mean harm of full braking (m2/s2) is below this
 
 
-def kept_at(base: Scenario, gap_s: float) -> Scenario:
-    """Return ``base`` with lines at 20 m/s whose vehicles all keep the time gap ``gap_s``."""
+def with_time_gap(base: Scenario, gap_s: float) -> Scenario:
+    """Return ``base`` with a speed of 20 m/s and the time gap ``gap_s`` for all vehicles."""
     content = {key: value for key, value in base.declared().items() if key not in ("gaps_m", "speeds_mps")}
     deviations = content.get("speed_deviations_mps", {"uniform": [-2, 2]})
     return eb.load_scenario(content | {"time_gaps_s": gap_s, "line_speed_mps": 20, "speed_deviations_mps": deviations})
 
 
 def mean_harm(scenario: Scenario) -> dict[str, list[float]]:
-    """Return the mean harm of each agent in the same worlds (m2/s2), by count of harm."""
+    """Return the mean harm of each agent on the same worlds in m2/s2, by count of harm."""
     agents = {name: eb.make_agent(name, scenario=scenario) for name in AGENTS}
-    found = eb.evaluate(scenario.sample(WORLDS, SEED).worlds, agents, scenario=scenario, aftermath=False)
+    result = eb.evaluate(scenario.sample(WORLDS, SEED).worlds, agents, scenario=scenario, aftermath=False)
     return {
-        count: [float(found.outcome(name).ledger.world_harm(count).mean()) for name in AGENTS] for count in HARM_COUNTS
+        count: [float(result.outcome(name).ledger.world_harm(count).mean()) for name in AGENTS] for count in HARM_COUNTS
     }
 
 
 def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
-    """Return the figure: the saved share of each agent against the time gap, a panel for each scenario.
+    """Return the figure: the avoided share of full braking's harm by agent and time gap, with a panel per scenario.
 
-    ``harm`` [time gaps, agents] is the mean harm in each scenario.
+    ``harm``: scenario -> mean harm [time gaps, agents] in m2/s2.
     """
     figure, panels = new_panels((8.4, 3.6), columns=len(SCENARIOS), sharey=True)
     for axes, (name, rows) in zip(panels, harm.items(), strict=True):
-        told = rows[:, 0] > LEAST
+        shown = rows[:, 0] > LEAST
         for k, agent in enumerate(AGENTS[1:]):
-            share = 100.0 * (1.0 - rows[told, k + 1] / rows[told, 0])
-            axes.plot(np.array(GAPS_S)[told], share, label=agent, **series_style(k))
+            share = 100.0 * (1.0 - rows[shown, k + 1] / rows[shown, 0])
+            axes.plot(np.array(GAPS_S)[shown], share, label=agent, **series_style(k))
         name_axes(axes, name, "time gap (s)", "" if axes is not panels[0] else "saved of full braking's harm (%)")
         axes.set_xlim(GAPS_S[0] - 0.05, GAPS_S[-1] + 0.05)
         axes.set_ylim(0.0, 103.0)
@@ -67,9 +67,9 @@ def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
 if __name__ == "__main__":
     table: dict[str, dict[str, np.ndarray]] = {count: {} for count in HARM_COUNTS}
     for name in SCENARIOS:
-        found = [mean_harm(kept_at(eb.load_scenario(name), gap_s)) for gap_s in GAPS_S]
+        harms = [mean_harm(with_time_gap(eb.load_scenario(name), gap_s)) for gap_s in GAPS_S]
         for count in HARM_COUNTS:
-            table[count][name] = np.array([each[count] for each in found])
+            table[count][name] = np.array([each[count] for each in harms])
             for gap_s, row in zip(GAPS_S, table[count][name], strict=True):
                 saved = " ".join(f"{1.0 - harm / row[0]:6.1%}" if row[0] > LEAST else "     –" for harm in row[1:])
                 print(f"{name:20} {gap_s:.1f} s {count:5} {' '.join(f'{harm:6.2f}' for harm in row)}  saved {saved}")

@@ -1,6 +1,6 @@
-"""What asks more than a test may take. ``python -m tests.programmes`` lists the programmes.
+"""Programmes: checks that are too slow or too large for the tests. ``python -m tests.programmes`` lists them.
 
-Environments of other libraries and other versions are made by uv below ``.venvs/`` and kept for the next time.
+uv makes environments with other libraries and other versions in ``.venvs/``, and they stay there for the next run.
 """
 
 import argparse
@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ROOT / ".venvs"
-TORCH = "torch==2.13.0"  # as constraints.txt; without a number an index may offer another one, of gigabytes
+TORCH = "torch==2.13.0"  # as in constraints.txt; without a number an index may offer another build, of gigabytes
 NO_NETWORK = ("dns error", "error sending request", "failed to fetch", "could not connect", "timed out", "network")
 
 
 class Told(NamedTuple):
-    """How a case ended: whether it was good (None: nothing is claimed), and one line about it."""
+    """Result of a case: True (good), False (failed) or None (no verdict), and one line of text."""
 
     good: bool | None
     text: str = ""
@@ -35,15 +35,16 @@ Given = argparse.Namespace
 
 
 class NotInstalled(Exception):
-    """An environment cannot be made; the message says why in one line."""
+    """An environment cannot be made; the message gives the reason in one line."""
 
 
 def ready_python(
     name: str, requires: Sequence[str], overrides: Sequence[str] = (), *, project: bool = True, torch: bool = True
 ) -> Path:
-    """The interpreter of an environment that holds ``requires``, made if it is not there; raises ``NotInstalled``.
+    """Return the Python of an environment that has ``requires``. Make the environment if it does not exist.
 
-    ``overrides``: what these require, whatever they say. ``project``: this project too, as it stands.
+    ``overrides``: versions that replace the requirements of these packages. ``project``: install this project, too.
+    Raises ``NotInstalled``.
     """
     folder = KEPT / name
     python, stamp = folder / "bin" / "python", folder / ".installed"
@@ -63,7 +64,7 @@ def ready_python(
 
 
 def new_environment(python: Path, base: str) -> list[str]:
-    """Make the environment whose interpreter is to be ``python``; the begin of a command that installs into it."""
+    """Make the environment of ``python``, and return the beginning of a command that installs packages into it."""
     uv = find_uv()
     call_uv([uv, "venv", "--quiet", "--clear", "--python", base, str(python.parents[1])])
     return [uv, "pip", "install", "--quiet", "--python", str(python)]
@@ -72,12 +73,12 @@ def new_environment(python: Path, base: str) -> list[str]:
 def find_uv() -> str:
     found = shutil.which("uv", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     if found is None:
-        raise NotInstalled("uv is missing (`pip install uv`): it keeps what was downloaded, and links it")
+        raise NotInstalled("uv is missing (`pip install uv`)")
     return found
 
 
 def install_torch(install: list[str]) -> None:
-    """The build for this machine from where torch publishes them; where that is out of reach, what the index has."""
+    """Install torch's build for this machine from its own index, or the build of the usual index if that fails."""
     own = [] if os.environ.get("UV_FIND_LINKS") or os.environ.get("PIP_FIND_LINKS") else ["--torch-backend", "auto"]
     try:
         call_uv([*install, *own, "--no-deps", TORCH])
@@ -88,7 +89,7 @@ def install_torch(install: list[str]) -> None:
 
 
 def call_uv(command: list[str]) -> None:
-    """Run uv where pip's own settings hold too; raises ``NotInstalled`` with the line that says what is wrong."""
+    """Run uv with pip's settings. Raise ``NotInstalled`` with the reason in one line."""
     given = {"UV_HTTP_TIMEOUT": "60", "UV_HTTP_RETRIES": "1", "UV_PYTHON_DOWNLOADS": "never", **os.environ}
     if "PIP_FIND_LINKS" in given:
         given.setdefault("UV_FIND_LINKS", ",".join(given["PIP_FIND_LINKS"].split()))
@@ -98,11 +99,11 @@ def call_uv(command: list[str]) -> None:
     told = " ".join(done.stderr.split())
     if any(word in told.lower() for word in NO_NETWORK):
         raise NotInstalled("the package index cannot be reached")
-    raise NotInstalled(f"does not resolve: {told[:300]}")
+    raise NotInstalled(f"uv cannot resolve the requirements: {told[:300]}")
 
 
 def watched(command: Sequence[str], limit: float, **variables: str) -> tuple[int | None, str]:
-    """Exit status (None: not done after ``limit`` seconds) and output of a command; what it started ends with it."""
+    """Return exit status (None after ``limit`` seconds) and output of a command. Its child processes end with it."""
     given = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     with subprocess.Popen(
         command, cwd=ROOT, env=given, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,

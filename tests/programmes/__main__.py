@@ -1,9 +1,9 @@
-"""The programmes: what asks more than a test may take, ``python -m tests.programmes [NAME [options]]``.
+"""Command line of the programmes: ``python -m tests.programmes [NAME [options]]``; without a name it lists them.
 
-Without a name they are listed. Each is a module of this folder with a function ``cases(given)``, which yields a name
-and what is called for it, and where it has options of its own a table ``OPTIONS`` of what ``add_argument`` is told of
-each. What is called gives ``Told``: whether it was good (None: it was not tried, or claims nothing), and one line of
-text. An ``AssertionError`` is not good.
+A programme is a module of this folder with a function ``cases(given)``. The function yields the name of each case and a
+function that runs it. The optional table ``OPTIONS`` has the programme's own options, with the arguments of
+``add_argument``. A case returns ``Told``: True (good), False (failed) or None (skipped, or without a claim), and one
+line of text. An ``AssertionError`` is a failure.
 """
 
 import argparse
@@ -20,13 +20,13 @@ FOLDER = Path(__file__).parent
 
 
 def programmes() -> dict[str, str]:
-    """The first line of each programme, by its name."""
+    """Return the first line of each programme's docstring, by name."""
     texts = {file.stem: file.read_text("utf-8") for file in sorted(FOLDER.glob("*.py"))}
     return {name: text.partition("\n")[0].strip('"') for name, text in texts.items() if "\ndef cases(" in text}
 
 
 def main(words: list[str]) -> int:
-    """Run the cases of a programme; 0 where there was one, and none was not good."""
+    """Run the cases of a programme. Return 0 if a case ran and none failed, 1 if not, 2 for an unknown name."""
     if not words or words[0] not in programmes():
         print("\n".join(f"{name:12} {line}" for name, line in programmes().items()))
         return 2 if words else 0
@@ -36,13 +36,13 @@ def main(words: list[str]) -> int:
         description=programme.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name contains this, and no other")
-    parser.add_argument("--within", type=float, default=math.inf, metavar="SECONDS", help="begin no case after them")
-    parser.add_argument("--list", action="store_true", help="the names of the cases, and run none")
+    parser.add_argument("--only", default="", metavar="TEXT", help="run only cases whose name contains this")
+    parser.add_argument("--within", type=float, default=math.inf, metavar="SECONDS", help="start no case later")
+    parser.add_argument("--list", action="store_true", help="list the cases without running them")
     for option, how in getattr(programme, "OPTIONS", {}).items():
         parser.add_argument(option, **how)
     given = parser.parse_args(words[1:])
-    given.until = time.monotonic() + given.within  # a case may look at it
+    given.until = time.monotonic() + given.within  # cases may use it
     ended: list[bool | None] = []
     for name, run in programme.cases(given):
         if given.only not in name:

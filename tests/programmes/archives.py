@@ -1,4 +1,4 @@
-"""Hostile archives of arrays: tables of best known harm as numpy writes them, and as nobody should."""
+"""Hostile archives of arrays: tables of best known harm, as numpy writes them and as attackers might."""
 
 import io
 import json
@@ -63,33 +63,33 @@ Arrays = dict[str, Any]  # name -> array, or the bytes of its .npy
 
 @cache
 def good_bytes() -> bytes:
-    """A table of the three worlds that the command searches."""
+    """Return a valid table of the three worlds that the command searches."""
     scenario = load_scenario("paper-random")
     return table_bytes(best_harm(scenario, scenario.sample(3, 7).worlds, budget=1, threads=1))
 
 
 def good() -> Arrays:
-    """Its arrays."""
+    """Return the arrays of the valid table."""
     with np.load(io.BytesIO(good_bytes())) as arrays:
         return dict(arrays)
 
 
 def npy(array: Any) -> bytes:
-    """The bytes of a .npy, pickled where it holds objects."""
+    """Return the bytes of a .npy file; objects are pickled."""
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, np.asanyarray(array), allow_pickle=True)
     return buffer.getvalue()
 
 
 def raw_npy(header: str | bytes, data: bytes = b"", magic: bytes = b"\x93NUMPY\x01\x00") -> bytes:
-    """A .npy with a header of one's own."""
+    """Return a .npy file with this header."""
     text = header.encode("latin-1", "replace") if isinstance(header, str) else header
     size = struct.pack("<H", min(len(text), 65535)) if magic[6:7] == b"\x01" else struct.pack("<I", len(text))
     return magic + size + text + data
 
 
 def packed(arrays: Arrays, method: int = zipfile.ZIP_DEFLATED) -> bytes:
-    """The archive of some arrays."""
+    """Return an archive of these arrays."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", method) as archive:
         for name, array in arrays.items():
@@ -98,12 +98,12 @@ def packed(arrays: Arrays, method: int = zipfile.ZIP_DEFLATED) -> bytes:
 
 
 def without(arrays: Arrays, lost: list[str]) -> Arrays:
-    """The arrays without some."""
+    """Return the arrays without these."""
     return {name: array for name, array in arrays.items() if name not in lost}
 
 
 class Touch:
-    """What a pickle can do."""
+    """Pickle that creates a file when it is loaded."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Path.touch, (Path("pwned"),)
@@ -126,7 +126,7 @@ def good_header(**changes: Any) -> dict[str, Any]:
 
 
 def poked(rng: random.Random, signature: bytes, offset: int, value: bytes) -> bytes:
-    """The archive with a field of one of its records overwritten."""
+    """Return the archive with one field of one of its records overwritten."""
     data = bytearray(good_bytes())
     places = [k for k in range(len(data)) if data.startswith(signature, k)]
     at = rng.choice(places) + offset
@@ -135,7 +135,7 @@ def poked(rng: random.Random, signature: bytes, offset: int, value: bytes) -> by
 
 
 def bomb(size: int) -> bytes:
-    """Consistent headers of a huge table whose zeros take a thousandth of their size."""
+    """Return an archive of a huge table of zeros, with consistent headers, compressed to a thousandth of its size."""
     deflate = zlib.compressobj(9, zlib.DEFLATED, -15)
     header = f"{{'descr': '<u8', 'fortran_order': False, 'shape': ({size // 8},), }}".encode().ljust(117) + b"\n"
     stream = deflate.compress(raw_npy(header)) + deflate.flush(zlib.Z_FULL_FLUSH)
@@ -152,7 +152,7 @@ def bomb(size: int) -> bytes:
 
 
 def many_phases() -> bytes:
-    """Few bytes that would become 65,535 phases of a great many worlds."""
+    """Return a small archive that expands to 65,535 phases of many worlds."""
     n = 20_000
     phases = np.zeros(n, "<u2")
     phases[0] = 65535
@@ -424,7 +424,7 @@ CERTAIN: dict[str, Callable[[random.Random], bytes]] = {
 
 
 def table_cases(rng: random.Random) -> Iterator[Case]:
-    """Tables: 9 of each category, fewer where every case is the same, and 80 damaged ones."""
+    """Yield tables: 9 of each category (fewer if all cases of a category are equal), and 80 damaged tables."""
     for category, make in {**CERTAIN, "damaged": lambda r: damaged(r, good_bytes())}.items():
         reader = None if category in ONLY_A_PROBLEM_KNOWS else partial(BestHarmTable.load, Path("t.npz"))
         for _ in range({"bomb": 1, "many phases": 1, "empty": 1, "damaged": 80}.get(category, 9)):

@@ -1,12 +1,12 @@
-"""The tests at the lowest versions that ``pyproject.toml`` allows, and at the newest that resolve.
+"""Tests with the lowest versions that ``pyproject.toml`` allows, and with the newest versions.
 
-Each kind and each Python has an environment of its own below ``.venvs/``:
+Each kind and each Python has its own environment in ``.venvs/``:
 
-- ``lowest``, ``highest``: the project with what it needs to train and to be tested; pytest runs there.
-- ``lowest-light``, ``highest-light``: the core alone, without torch; the commands of the light wheel run there.
+- ``lowest``, ``highest``: the project with everything for training and tests; pytest runs there.
+- ``lowest-light``, ``highest-light``: only the core, without torch; the commands of the light wheel run there.
 
-At the lowest versions each bound of ``pyproject.toml`` must be the version that was installed: no bound is lower than
-what was tried. What cannot be installed is skipped with a clear word.
+In the environments of lowest versions, the installed versions must equal the bounds of ``pyproject.toml``, so every
+bound has been tried. What cannot be installed is skipped with the reason.
 """
 
 import json
@@ -60,7 +60,7 @@ CALM = "ignore::DeprecationWarning"  # that something will go from another packa
 
 OPTIONS = {
     "kinds": {"nargs": "*", "metavar": "KIND", "help": f"of {', '.join(KINDS)}; default: all"},
-    "--python": {"action": "append", "help": "or a version that uv finds; may be given often; default: this"},
+    "--python": {"action": "append", "help": "a version that uv finds; repeatable; default: this Python"},
     "--tests": {"nargs": "+", "default": [f"tests/{folder}" for folder in TESTS]},
     "--ci": {"action": "store_true", "help": "the light core with every Python found, the rest with this"},
 }
@@ -89,7 +89,7 @@ def attempt(kind: str, python: str, paths: list[str], until: float) -> Told:
 
 
 def make_environment(kind: str, python: str) -> Path:
-    """The interpreter of a new environment; raises ``NotInstalled``, also where this machine has no such Python."""
+    """Return the Python of a new environment. Raises ``NotInstalled``, also if this machine lacks that Python."""
     resolution, _, light = kind.partition("-")
     there = KEPT / f"{kind}-{Path(python).name}" / "bin" / "python"
     install = new_environment(there, python)
@@ -103,7 +103,7 @@ def make_environment(kind: str, python: str) -> Path:
 
 
 def untried_bounds(python: Path, light: bool) -> list[str]:
-    """What ``pyproject.toml`` allows below the versions that are installed there; torch's number is given."""
+    """Return bounds of ``pyproject.toml`` below the installed versions. torch's version is fixed."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     extras = () if light else EXTRAS
     asked = [*project["dependencies"], *(each for extra in extras for each in project["optional-dependencies"][extra])]
@@ -120,7 +120,7 @@ def untried_bounds(python: Path, light: bool) -> list[str]:
 
 
 def run_tests(python: Path, paths: list[str], until: float) -> Told:
-    """Whether pytest passes there, and its last line."""
+    """Check that pytest passes in the environment; the text has its last line."""
     command = [str(python), "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "-W", CALM, *paths]
     caches = {"NUMBA_CACHE_DIR": str(python.parents[1] / "numba"), "PYTHONWARNINGS": CALM}
     status, told = watched(command, until - time.monotonic(), **caches)
@@ -132,7 +132,7 @@ def run_tests(python: Path, paths: list[str], until: float) -> Told:
 
 
 def run_light(python: Path, until: float) -> Told:
-    """Whether all commands of the light core end as they must there, and how many."""
+    """Check that all commands of the light core end as expected, and count them."""
     done = []
     with tempfile.TemporaryDirectory(prefix="ethbrake-bounds-") as folder:
         for call in calls():

@@ -1,7 +1,7 @@
-"""What a hostile case is, and the cage in which it is judged: it can neither wait, grow, execute nor write unnoticed.
+"""Hostile cases, and the cage in which each case runs: a case can neither hang, grow, execute nor write unnoticed.
 
-Each case runs in a process of its own, whose folder is removed. An audit hook of Python keeps it from writing anywhere
-else, and what stands in and beside its folder is compared with what stood there before.
+Each case runs in its own process and folder, which is deleted afterwards. A Python audit hook prevents writing anywhere
+else. The content of the folder and of its surroundings is compared before and after.
 """
 
 import collections
@@ -35,18 +35,18 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.tables import read_worlds
 from tests.learning.tiny import OUTSIDE, PRECIOUS
 
-CPU_LIMIT_S = 10  # of a case
-WALL_LIMIT_S = 90.0  # on a machine that does other things too
-MEMORY_LIMIT_BYTES = 2 << 30  # beyond what the libraries take
-LINE_LIMIT = 2_000  # characters
+CPU_LIMIT_S = 10  # processor time of a case
+WALL_LIMIT_S = 90.0  # wall-clock time of a case, on a busy machine
+MEMORY_LIMIT_BYTES = 2 << 30  # in addition to the memory of the loaded libraries
+LINE_LIMIT = 2_000  # characters per line
 REFUSED = 2
 BROKEN = 99  # exit status of a traceback
 
 Build = Callable[[Path], object]
-INSIDE = "inside"  # of a case's folder: where the command runs
-HERE = "/@here"  # in a command or a variable: the absolute path of the folder where the command runs
+INSIDE = "inside"  # subfolder of a case's folder in which the command runs
+HERE = "/@here"  # in a command or variable it stands for the absolute path of that subfolder
 
-# Text of somebody who wants to move the cursor, hide or turn around what follows, or break a line.
+# Texts that try to move the cursor, to hide or reverse the following text, or to break a line.
 NASTY = (
     "\x1b[2J\x1b[1;1H", "\x1b]0;owned\x07", "\x1b[31mred", "\r\nethbrake: OK", "\u202egnp.exe", "\u2066\u2069",
     "\u200b\u200d", "\u2028line", "\u2029", "\x85", "\x9b31m", "\x08\x08\x08", "\x7f", "\ufeff",
@@ -56,28 +56,28 @@ NASTY = (
 
 @dataclass(frozen=True)
 class Case:
-    """One attempt. ``build`` fills the folder that becomes the current one of ``command``."""
+    """One attempt. ``build`` fills a folder, which becomes the current folder of ``command``."""
 
     category: str
     command: tuple[str, ...]
     build: Build
-    certain: bool = True  # it must be refused; otherwise it may also be found to be in order
-    reader: Callable[[], object] | None = None  # the same through Python: must raise an error of the project's family
+    certain: bool = True  # True: it must be refused; False: it may be valid
+    reader: Callable[[], object] | None = None  # reads the file in Python; must raise an ``EthBrakeError``
     environment: Mapping[str, str] = field(default_factory=dict)
-    may_change: tuple[str, ...] = ()  # what a command that is not refused may write, inside the folder
+    may_change: tuple[str, ...] = ()  # files in the folder that a command may write if it is not refused
 
 
 Generator = Callable[[random.Random], Iterator[Case]]
 
 
 def write(path: Path, content: bytes | str) -> None:
-    """Write a file and the folders above it; text in UTF-8, lone surrogates included."""
+    """Write a file, and create the folders above it. Text is written in UTF-8, with lone surrogates."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
 
 
 def damaged(rng: random.Random, data: bytes) -> bytes:
-    """Data as a disk or a bad connection leaves it: bits, bytes or blocks changed, lost, doubled or blank."""
+    """Return data as after damage by a disk or network: bits, bytes or blocks are changed, lost, repeated or zero."""
     at, length = rng.randrange(len(data)), rng.choice((1, 2, 16, 512))
     before, lost, after = data[:at], data[at : at + length], data[at + length :]
     changed = bytes([data[at] ^ 1 << rng.randrange(8)])
@@ -87,7 +87,7 @@ def damaged(rng: random.Random, data: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a case ended; ``faults`` are the rules that it broke."""
+    """How a case ended; ``faults`` are the broken rules."""
 
     status: int
     cpu_s: float
@@ -96,7 +96,7 @@ class Verdict:
 
 
 def judge(case: Case, folder: Path) -> Verdict:
-    """Build the case in the new ``folder``, run it, and compare what happened with the rules."""
+    """Build the case in the new ``folder``, run it, and check the rules."""
     inside, beside = folder / INSIDE, frozenset(os.listdir(folder.parent))
     write(folder / OUTSIDE / PRECIOUS, "years of work")
     write(folder / OUTSIDE / "step_000000000001" / "kept.txt", "years of work")
@@ -113,14 +113,14 @@ def judge(case: Case, folder: Path) -> Verdict:
     shutil.rmtree(folder, ignore_errors=True)
     for path in streams:
         path.unlink()
-    left = [f"left beside its folder: {name}" for name in sorted(frozenset(os.listdir(folder.parent)) - beside)]
+    left = [f"left a file outside its folder: {name}" for name in sorted(frozenset(os.listdir(folder.parent)) - beside)]
     deeds = [*map(json.loads, seen.splitlines()), *changed][:5]
     faults = (*_faults_of_end(case, status, out, err), *deeds, *left)
     return Verdict(status, cpu_s, max(map(len, (out + err).splitlines() or [""])), faults)
 
 
 def _forked(work: Callable[[], int]) -> int:
-    """A process that does this and exits with its status."""
+    """Start a child process that calls ``work`` and exits with its result. Return the process id."""
     sys.stdout.flush()
     sys.stderr.flush()
     child = os.fork()
@@ -138,14 +138,14 @@ def _forked(work: Callable[[], int]) -> int:
 
 
 def read_states(file: Path) -> None:
-    """A command of ours: drive in a table of initial states."""
+    """Command for the cases: evaluate an agent on a table of initial states."""
     with Out():
         paper = load_scenario("paper-random")
         evaluate(read_worlds(paper, file), "coast", scenario=paper)
 
 
 def read_table(file: Path) -> None:
-    """A command of ours: go on from a table of best known harm."""
+    """Command for the cases: continue a search from a table of best known harm."""
     with Out():
         paper = load_scenario("paper-random")
         search_list(paper, paper.sample(3, 7), budget=1, threads=1, known=BestHarmTable.load(file))
@@ -172,7 +172,7 @@ def _run(case: Case, inside: Path, streams: list[Path]) -> int:
 
 
 def _read(case: Case, seen: int) -> None:
-    """The same through Python; what comes back is told to the judge."""
+    """Read the file in Python as well, and report wrong exceptions to the judge."""
     try:
         case.reader()
     except EthBrakeError as error:
@@ -180,7 +180,7 @@ def _read(case: Case, seen: int) -> None:
         if not text.isprintable() or len(text) > LINE_LIMIT:
             _tell(seen, f"message of {type(error).__name__}: {text!r:.200}")
     except MemoryError:
-        _tell(seen, "memory: through Python")
+        _tell(seen, "python: MemoryError")
     except Exception as error:
         _tell(seen, f"python: {type(error).__name__}: {error!r:.200}")
     else:
@@ -189,7 +189,7 @@ def _read(case: Case, seen: int) -> None:
 
 
 def _wait(child: int) -> tuple[int, float]:
-    """Exit status (negative: signal) and processor time; what takes too long is killed."""
+    """Return exit status (negative: signal) and processor time of a child. Kill it after the time limit."""
     before = signal.signal(signal.SIGALRM, lambda *_: os.kill(child, signal.SIGKILL))
     signal.setitimer(signal.ITIMER_REAL, WALL_LIMIT_S)
     try:
@@ -205,24 +205,24 @@ def _faults_of_end(case: Case, status: int, out: str, err: str) -> Iterator[str]
     if status not in (0, REFUSED):
         yield f"exit status {status}: {err.strip().splitlines()[-1:]}"[:300]
     if status == 0 and case.certain:
-        yield "was not refused"
+        yield "the file was not refused"
     if status == REFUSED and (len(errors) != 1 or not err.endswith(errors[-1] + "\n")):
         yield f"not one line of error: {err!r:.300}"
     if status == REFUSED and case.certain and "not enough memory" in err:
-        yield "was unpacked before it was refused"
+        yield "the file was unpacked before it was refused"
     if "Traceback" in err + out:
         yield "traceback"
-    kept = "\t" if status else "\t\N{NO-BREAK SPACE}"  # the latter stands between the numbers and units of a result
+    kept = "\t" if status else "\t\N{NO-BREAK SPACE}"  # results have no-break spaces between number and unit
     asked = {"FORCE_COLOR", "TTY_COMPATIBLE"} & case.environment.keys()  # colours
     for line in (out + err).split("\n"):
         if not line.translate({ord(character): " " for character in kept}).isprintable() and (status or not asked):
-            yield f"a line commands the terminal: {line!r:.200}"
+            yield f"a line has control characters: {line!r:.200}"
         if status == REFUSED and len(line) > LINE_LIMIT:
             yield f"a line of {len(line)} characters"
 
 
 def _content(folder: Path) -> dict[str, str]:
-    """What stands in a folder: for each name its kind, and for a plain file what it holds."""
+    """Return the content of a folder: name -> kind, and for plain files size and hash."""
     found = {}
     for path in sorted(folder.rglob("*")):
         about = path.lstat()
@@ -244,7 +244,7 @@ _EXECUTING = (
     "socket.connect", "socket.bind", "webbrowser.open", "builtins.input",
 )  # fmt: skip
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-# The arguments that an event changes, each with the one that may hold the folder to which its name is relative.
+# Event -> indices of its arguments: (changed path, folder of a relative path or None).
 _CHANGING: dict[str, tuple[tuple[int, int | None], ...]] = {
     "os.mkdir": ((0, 2),), "os.remove": ((0, 1),), "os.rmdir": ((0, 1),), "os.truncate": ((0, None),),
     "os.chmod": ((0, 2),), "os.chown": ((0, 3),), "os.utime": ((0, 3),), "os.link": ((1, 3),), "os.symlink": ((1, 2),),
@@ -254,9 +254,9 @@ _READ_ANNOTATIONS = {inspect.__file__, typing.__file__, dataclasses.__file__, co
 
 
 def _watch(event: str, arguments: tuple[Any, ...], seen: int) -> None:
-    """Tell what is executed; code of a module that is imported late, or an annotation in it, is not."""
+    """Report executed code, except code and annotations of modules that are imported late."""
     if event not in _EXECUTING and event != "exec":
-        return  # asking for the caller is an event, too
+        return  # looking up the caller below is an event, too
     caller = sys._getframe(2)
     file = caller.f_code.co_filename
     if event.startswith("marshal.") and file.startswith("<frozen importlib"):
@@ -267,7 +267,7 @@ def _watch(event: str, arguments: tuple[Any, ...], seen: int) -> None:
 
 
 def _keep_inside(event: str, arguments: tuple[Any, ...], own: str, seen: int) -> None:
-    """Refuse, and tell, whatever would change something outside the case's own folder, whoever runs the attack."""
+    """Refuse and report every change outside the case's folder, so that an attack cannot harm the machine."""
     if event == "open":
         name, flags = arguments[0], arguments[2]
         writes = isinstance(flags, int) and flags & _WRITING and not isinstance(name, int)
@@ -281,12 +281,15 @@ def _keep_inside(event: str, arguments: tuple[Any, ...], own: str, seen: int) ->
         ]
     for place in places:
         if place != os.devnull and not f"{place}{os.sep}".startswith(own):
-            _tell(seen, f"would have changed what is outside: {event} {place}"[:300])
+            _tell(seen, f"tried to change a file outside: {event} {place}"[:300])
             raise PermissionError(errno.EPERM, "outside the case's folder", place)
 
 
 def _entry(path: str, base: int | None) -> str:
-    """A path whose last part is not followed; ``base`` is an open folder to which it is relative, or -1."""
+    """Return the real path, without following a link in its last part.
+
+    ``base``: an open folder to which the path is relative, or -1.
+    """
     if isinstance(base, int) and base >= 0:
         path = os.path.join(os.readlink(f"/proc/self/fd/{base}"), path)
     return os.path.join(os.path.realpath(os.path.dirname(path) or "."), os.path.basename(path))

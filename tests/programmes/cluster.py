@@ -1,8 +1,8 @@
-"""A sweep on a Ray cluster of two nodes on this machine, while its workers are killed at random and its driver once.
+"""A sweep on a Ray cluster of two nodes on this machine, while its workers and once its driver are killed.
 
-Jobs only count, with a checkpoint of every step (200 of them take two minutes), or they train a tiny policy (half an
-hour of two cores, most of it for loading torch after each kill). The table must be that of an undisturbed sweep on
-a Ray of this machine, byte for byte, and no job may be lost or done twice.
+A job either only counts, with a checkpoint at every step (200 jobs take two minutes), or trains a tiny policy (half an
+hour on two cores, mostly for loading torch after each kill). The table of results must equal the table of an
+undisturbed sweep, byte for byte. No job may be lost or run twice.
 """
 
 import os
@@ -27,7 +27,7 @@ WORK = {
     "counting": ([sys.executable, "-m", "tests.extensions.studies.counting"], []),
     "training": ([*PROGRAM, "study", "sweep"], ["--retries", "5", "--output"]),
 }
-NODES = 2  # with one core each
+NODES = 2  # nodes, with one core each
 LONGEST_S = 3600.0
 
 
@@ -42,8 +42,11 @@ def write_sweep(folder: Path, jobs: int) -> Path:
 def disturb(
     driver: subprocess.Popen[bytes], out: Path, hits: dict[str, int], wanted: int, chance: random.Random, ends_at: int
 ) -> int:
-    """Kill workers until ``wanted`` jobs were hit once, and the driver at so many finished jobs; its exit status."""
-    seen: dict[str, float] = {}  # job -> when it is killed
+    """Kill workers at random times, until ``wanted`` jobs were hit once. Return the driver's exit status.
+
+    The driver is killed when ``ends_at`` jobs are finished.
+    """
+    seen: dict[str, float] = {}  # job -> time at which its worker is killed
     end = time.monotonic() + LONGEST_S
     while driver.poll() is None and time.monotonic() < end:
         now = time.monotonic()
@@ -62,7 +65,7 @@ def disturb(
 
 
 def run(folder: Path, given: Given) -> Told:
-    """The sweep by local processes, then on the cluster."""
+    """Run the sweep undisturbed with local processes, then disturbed on the cluster, and compare the tables."""
     import ray
     from ray.cluster_utils import Cluster
 
@@ -81,7 +84,7 @@ def run(folder: Path, given: Given) -> Told:
     chance, started = random.Random(given.seed), time.monotonic()
     try:
         killed = disturb(subprocess.Popen(command), out, hits, wanted, chance, jobs // 2)
-        told = f"the driver by signal {-killed} after {finished(out)} jobs"
+        told = f"driver killed by signal {-killed} after {finished(out)} jobs"
         status = disturb(subprocess.Popen(command), out, hits, wanted, chance, jobs + 1)
     finally:
         ray.shutdown()
@@ -92,7 +95,7 @@ def run(folder: Path, given: Given) -> Told:
     return Told(
         same and not lost and not doubled and status == 0 and len(hits) == wanted,
         f"{NODES} raylets: {len(hits)} jobs hit, {told}, {time.monotonic() - started:.0f} s;"
-        f" lost {lost}, doubled {doubled}; table {'the same, byte for byte' if same else 'ANOTHER'}",
+        f" lost {lost}, run twice {doubled}; table {'equal, byte for byte' if same else 'DIFFERENT'}",
     )
 
 
@@ -105,7 +108,7 @@ OPTIONS = {
 
 
 def cases(given: Given) -> Cases:
-    # Before Ray is loaded: 127.0.0.1 is the address of both nodes, and a token is asked of everybody.
+    # These must be set before Ray is loaded: both nodes have the address 127.0.0.1, and every connection needs a token.
     os.environ |= {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0", "RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0"}
     os.environ |= {"RAY_AUTH_TOKEN": secrets.token_hex(32), "PYTHONPATH": os.getcwd()}
     with tempfile.TemporaryDirectory(prefix="ethbrake-") as folder:

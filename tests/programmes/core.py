@@ -1,9 +1,9 @@
-"""The core alone: a copy without extensions passes the core's tests, trains, evaluates and shields.
+"""The core without extensions: a copy passes the core's tests, trains, evaluates and uses the shield.
 
-It deletes ``ethbrake_marl/extensions``, ``tests/extensions``, and the entry points in ``pyproject.toml`` that lead
-there. ``make core`` runs it, in about 100 s of a processor: of each parametrised test the first case, in one process,
-and not those of the installation. With ``--whole`` every test of the core runs, all its cases. With ``--each`` it
-deletes one extension at a time, with those that use it, instead.
+The copy has neither ``ethbrake_marl/extensions`` nor ``tests/extensions``, and no entry points to them in
+``pyproject.toml``. ``make core`` runs this programme in about 100 s of processor time: the first case of each
+parametrised test, in one process, without the tests of the installation. ``--whole`` runs all tests of the core with
+all cases. ``--each`` instead deletes one extension at a time, with the extensions that use it.
 """
 
 import os
@@ -23,19 +23,19 @@ from tests.fixtures.installed import write_metadata
 from tests.programmes import ROOT, Cases, Given, Told
 
 OPTIONS = {
-    "--each": {"action": "store_true", "help": "delete one extension at a time, and those that use it"},
-    "--whole": {"action": "store_true", "help": "every case of every test of the core, minutes"},
+    "--each": {"action": "store_true", "help": "delete one extension at a time, with the extensions that use it"},
+    "--whole": {"action": "store_true", "help": "run all cases of all tests of the core (minutes)"},
 }
 COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
-APART = ("docs", "programmes")  # tests of the whole repository, which is more than its core
-INSTALLATION = ("test_imports.py", "test_install.py", "test_kernel_store.py")  # begin many processes of their own
+APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
+INSTALLATION = ("test_imports.py", "test_install.py", "test_kernel_store.py")  # start many processes
 RUN = "runs/core"
 COMMANDS = {
     "trains PPO on paper-random": ("train", "--steps", "20000", "--output", RUN),
     "evaluates": ("evaluate", "--agents", f"full_brake,e_v2x_bm,ppo@{RUN}", "--episodes", "500"),
     "evaluates behind the shield": ("evaluate", "--agents", f"ppo@{RUN}+step,ppo@{RUN}+episode", "--episodes", "200"),
     "compares the modes of the shield": ("shield", "--agents", f"ppo@{RUN}", "--episodes", "100"),
-    "says what there is": ("agent", "list"),
+    "lists the agents": ("agent", "list"),
 }
 IMPORTED = "import ethbrake_marl as eb; [getattr(eb, name) for name in eb.__all__]"
 SMALL = (
@@ -69,7 +69,7 @@ def cases(given: Given) -> Cases:
 
 
 def users_of(extension: str) -> set[str]:
-    """An extension, and those that cannot be without it."""
+    """Return an extension and all extensions that need it, directly or indirectly."""
     uses, gone = arrows(), {f"extensions.{extension}"}
     while more := {each for each, used in uses.items() if each.startswith("extensions.") and used & gone} - gone:
         gone |= more
@@ -77,7 +77,7 @@ def users_of(extension: str) -> set[str]:
 
 
 def copy_without(extensions: Iterable[str] | None, folder: Path) -> Path:
-    """The tree without these extensions, or without any; its metadata are those of its ``pyproject.toml``."""
+    """Copy the repository without these extensions (None: without any), with the package metadata of the copy."""
     folder.mkdir()
     for name in COPIED:
         source = ROOT / name
@@ -97,7 +97,7 @@ def copy_without(extensions: Iterable[str] | None, folder: Path) -> Path:
 
 
 def names_none(copy: Path) -> Told:
-    """Whether no file of the core, nor a test of it, mentions a module of an extension."""
+    """Check that no file and no test of the core names a module of an extension."""
     found = [
         path.relative_to(copy).as_posix()
         for path in sorted([*(copy / "ethbrake_marl").rglob("*.py"), *(copy / "tests").rglob("test_*.py")])
@@ -108,7 +108,7 @@ def names_none(copy: Path) -> Told:
 
 
 def ended(copy: Path, words: Sequence[str]) -> Told:
-    """Whether a Python program ends well in the copy."""
+    """Run a Python program in the copy, and check that it ends with status 0."""
     done = subprocess.run(
         [sys.executable, *words],
         cwd=copy,
@@ -122,6 +122,6 @@ def ended(copy: Path, words: Sequence[str]) -> Told:
 
 
 def used() -> Told:
-    """Seconds of a processor that all of it took."""
+    """Report the processor time of all child processes, in seconds."""
     times = resource.getrusage(resource.RUSAGE_CHILDREN)
     return Told(None, f"{times.ru_utime + times.ru_stime:.0f} s")

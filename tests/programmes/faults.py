@@ -1,19 +1,20 @@
-"""Faults that some test must notice: small random changes of the code in every folder, and planted bugs.
+"""Faults that some test must find: small random changes of the code in every folder, and planted bugs.
 
     make programme NAME=faults ARGS="mutants --folders physics,shield --sample 40 --seed 0"
     make programme NAME=faults ARGS="bugs --only WORD"
 
-A *mutant* changes one node of the syntax tree: an operator of arithmetic or comparison, a constant, a sign, a condition
-negated, a statement removed, min and max swapped. The *planted bugs* are those of ``bugs.yaml``: errors that people
-make in such code. A fault is written into a copy of the repository, never into the working tree. There the tests run
-that call the changed function, the likely and quick ones first, until one fails. What is compiled is tried without
-compilation before. A fault is found by a failed test, or where the tests do not end.
+A *mutant* changes one node of the syntax tree: an arithmetic or comparison operator, a constant, a sign, a negated
+condition, a removed statement, or min and max exchanged. The *planted bugs* are in ``bugs.yaml``: errors that people
+make in such code. A fault is written into a copy of the repository, never into the working tree. In the copy the tests
+run that call the changed function, likely and fast tests first, until one fails. Compiled functions are first tried
+without compilation. A fault is found if a test fails, or if the tests do not end.
 
-Which test calls which function is recorded once for a tree. As a plugin of pytest (``-p tests.programmes.faults``, with
-``CALLS`` naming a folder) this file writes, for each process, what every test called and how long it took. Compiled
-functions are not seen being called: whoever mentions their name stands for them.
+The calls of each test are recorded once per state of the repository. As a pytest plugin (``-p
+tests.programmes.faults``, with a folder in the variable ``CALLS``) this file records, per process, the functions that
+every test called, and its time. Calls of compiled functions are invisible; functions that mention their names count
+instead.
 
-``--journal`` notes each verdict, and takes those noted before as they are.
+``--journal`` writes each verdict to a file, and uses verdicts that are already there.
 """
 
 import ast
@@ -72,7 +73,7 @@ MOST_MEMORY_BYTES = 10 * 2**30
 
 
 class Recorder:
-    """Notes calls of Python functions; one thread after another may be inside."""
+    """Records calls of Python functions, in one thread at a time."""
 
     def __init__(self, file: Path) -> None:
         self.file, self.calls, self.inside = file, set[Any](), str(PACKAGE) + os.sep
@@ -83,7 +84,7 @@ class Recorder:
         self.calls.add(frame.f_code)
 
     def taken(self) -> set[str]:
-        """Functions called since the last time, as ``file:qualname``."""
+        """Return the functions called since the last time, as ``file:qualname``, and forget them."""
         calls, self.calls = self.calls, set()
         return {
             f"{code.co_filename.removeprefix(self.inside)}:{code.co_qualname.partition('.<locals>.<')[0]}"
@@ -93,7 +94,7 @@ class Recorder:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
-        """What a fixture calls, whoever asked for it first."""
+        """Record the calls of a fixture, for all tests that use it."""
         before = self.taken()
         try:
             return (yield)
@@ -120,19 +121,19 @@ class Recorder:
             self.tests[item.nodeid] = time.process_time() - begun, sorted(called)
 
     def pytest_sessionfinish(self) -> None:
-        """Write what this process saw."""
+        """Write the record of this process."""
         if self.tests:
             self.file.write_text(json.dumps(self.tests), "utf-8")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Record, if somebody asks for it."""
+    """Start recording if the variable ``CALLS`` is set."""
     if folder := os.environ.get("CALLS"):
         config.pluginmanager.register(Recorder(Path(folder) / f"{os.environ.get('PYTEST_XDIST_WORKER', 'main')}.json"))
 
 
 def record(jobs: int, *more: str) -> dict[str, tuple[float, list[str]]]:
-    """Test -> its processor time and the functions it calls; from the last record, if no file has changed since."""
+    """Return test -> (processor time, called functions); from the last record if no file has changed."""
     files = sorted([*PACKAGE.rglob("*.py"), *(ROOT / "tests").rglob("*.py")])
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
     folder = KEPT / digest.hexdigest()[:16]
@@ -162,7 +163,7 @@ class Function(NamedTuple):
 
 @cache
 def functions_of(file: Path) -> list[Function]:
-    """What a file defines: the module first, then what stands in it, each before its parts."""
+    """Return the module, functions and classes of a file; outer ones come before inner ones."""
     tree, place = ast.parse(file.read_text("utf-8")), file.relative_to(PACKAGE).as_posix()
     last = len(file.read_text("utf-8").splitlines())
     found = [Function(f"{place}:<module>", 1, last, False, False, frozenset())]
@@ -185,7 +186,7 @@ def functions_of(file: Path) -> list[Function]:
 
 
 class Callers:
-    """The tests of a tree, by what they call."""
+    """The tests of a repository, by the functions that they call."""
 
     def __init__(self, recorded: dict[str, tuple[float, list[str]]]) -> None:
         self.cpu_s = {test: seconds for test, (seconds, _) in recorded.items()}
@@ -196,7 +197,7 @@ class Callers:
         self.functions = {f.key: f for file in sorted(PACKAGE.rglob("*.py")) for f in functions_of(file)}
 
     def at(self, file: Path, line: int) -> Function:
-        """The innermost function around a line."""
+        """Return the innermost function that contains a line."""
         place = file.relative_to(PACKAGE).as_posix() + ":"
         around = [f for f in self.functions.values() if f.key.startswith(place) and f.first <= line <= f.last]
         return min(around, key=lambda f: f.last - f.first)
@@ -292,7 +293,7 @@ NO_CODE = (ast.Import, ast.ImportFrom, ast.JoinedStr, ast.arg)
 
 
 class Change(NamedTuple):
-    """A node of a syntax tree that is written anew."""
+    """A changed node of a syntax tree."""
 
     node: Any
     what: str
@@ -301,7 +302,7 @@ class Change(NamedTuple):
 
 
 def mutant(file: Path, change: Change) -> Fault:
-    """A file with a change; no line of it moves."""
+    """Return the text of a file with one change; line numbers stay."""
     node, what, new, words = change
     text, place = file.read_text("utf-8"), file.relative_to(PACKAGE).as_posix()
     lines = text.splitlines(keepends=True)
@@ -319,7 +320,7 @@ def mutant(file: Path, change: Change) -> Fault:
 
 
 def changes(node: ast.AST, words: tuple[str, ...] = ()) -> Iterator[Change]:
-    """The changes of a node and of all below it: no imports, annotations, decorators, docstrings, messages."""
+    """Yield changes of a node and all nodes below it, except imports, annotations, decorators and texts."""
     if isinstance(node, ast.Assign | ast.AnnAssign):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         words = tuple(n.id for target in targets for n in ast.walk(target) if isinstance(n, ast.Name))
@@ -369,7 +370,7 @@ def _of_expression(node: ast.expr) -> Iterator[tuple[str, ast.expr]]:
 
 
 def sample_of(folder: str, count: int, seed: int) -> list[Fault]:
-    """Mutants of a folder, drawn at random: a smaller sample is part of a larger one."""
+    """Return random mutants of a folder. A smaller sample is part of a larger one."""
     files = sorted(PACKAGE.glob("*.py") if folder == PACKAGE.name else (PACKAGE / folder).rglob("*.py"))
     every = [(file, change) for file in files for change in changes(ast.parse(file.read_text("utf-8")))]
     random.Random(seed).shuffle(every)
@@ -377,7 +378,7 @@ def sample_of(folder: str, count: int, seed: int) -> list[Fault]:
 
 
 def planted() -> tuple[list[Fault], list[str]]:
-    """The planted bugs that fit the code, and what does not."""
+    """Return the planted bugs that fit the code, and the names of those that do not."""
     bugs, misfits = [], []
     for name, patches in yaml.safe_load(BUGS.read_text("utf-8")).items():
         texts: dict[str, str] = {}
@@ -398,7 +399,7 @@ def planted() -> tuple[list[Fault], list[str]]:
 
 
 def folders() -> list[str]:
-    """The folders of the package that hold code, and the package for its own modules."""
+    """Return the folders of the package with code; the package itself stands for its own modules."""
     return [PACKAGE.name, *sorted(file.parent.name for file in PACKAGE.glob("*/__init__.py"))]
 
 
@@ -406,14 +407,14 @@ def folders() -> list[str]:
 
 
 class Listener:
-    """In the child, for pytest: which tests run in which order, and what failed first."""
+    """Pytest plugin in the child process: chooses and orders the tests, and notes the first failure."""
 
     def __init__(self, tests: list[str], each_s: float | None, pipe: int) -> None:
         self.places = {test: k for k, test in enumerate(tests)}
         self.each_s, self.pipe = each_s, pipe
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        """The chosen ones alone, in their order."""
+        """Keep only the chosen tests, in the chosen order."""
         items[:] = sorted((i for i in items if i.nodeid in self.places), key=lambda i: self.places[i.nodeid])
 
     @pytest.hookimpl(wrapper=True)
@@ -427,7 +428,7 @@ class Listener:
             signal.setitimer(signal.ITIMER_PROF, 0.0)
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """The first failure."""
+        """Note the first failure."""
         if report.failed:
             os.write(self.pipe, f"{report.nodeid}\n".encode())
 
@@ -439,7 +440,7 @@ def _too_slow(*_: object) -> None:
 
 
 class Copy:
-    """A copy of the repository with kernels of its own, in which faults are tried one after another."""
+    """A copy of the repository with its own kernels, in which faults are tried one after another."""
 
     def __init__(self, number: int, jobs: int) -> None:
         self.folder = COPIES / str(number)
@@ -458,7 +459,7 @@ class Copy:
 
     @contextmanager
     def changed(self, fault: Fault) -> Iterator[None]:
-        """While it lasts the copy has the fault."""
+        """Context manager: the copy has the fault inside the block."""
         kernels = COPIES / f"{self.folder.name}-kernels" / PACKAGE.name
         before = set(kernels.rglob("*")) if kernels.is_dir() else set()
         try:
@@ -476,7 +477,7 @@ class Copy:
         return self.tests.at(PACKAGE / fault.file, fault.line)
 
     def ask(self, what: Any, *given: Any, cpu_s: float = COMPILING_S) -> str:
-        """What a function writes to its pipe in a forked process of this folder; its end, where it wrote nothing."""
+        """Run a function in a forked process of this folder. Return its output, or how it ended if it wrote nothing."""
         ends, begins = os.pipe()
         child = os.fork()
         if child == 0:
@@ -496,7 +497,7 @@ class Copy:
         return answer or ("" if ended == 0 else "(no end)" if ended < 0 else f"(exit status {ended})")
 
     def _settle(self, cpu_s: float) -> None:
-        """In the child: silence, limits, this folder."""
+        """In the child process: silence output, set limits, and change the folder."""
         limit = round(cpu_s)
         resource.setrlimit(resource.RLIMIT_AS, (MOST_MEMORY_BYTES, MOST_MEMORY_BYTES))
         resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 5))
@@ -515,7 +516,7 @@ class Copy:
             del sys.modules[name]  # those of the working tree
 
     def red(self, tests: list[str], *, compiled: bool, own_kernels: bool = False, every: bool = False) -> list[str]:
-        """The first of these tests that fails as the copy is now, or every one; empty where none does."""
+        """Return the first of these tests that fails now, or all that fail; empty if none does."""
         tests = [test for test in tests if test not in self.red_anyway[compiled]]
         if not tests:
             return []
@@ -524,7 +525,7 @@ class Copy:
         return [] if not compiled and red == ["(no end)"] else red
 
     def verdict(self, fault: Fault) -> str:
-        """The first test that notices a fault; empty where none does."""
+        """Return the first test that finds a fault; empty if none does."""
         function = self.function(fault)
         tests = self.tests.ordered(function, fault.words, fault.name, BUDGET_S, MOST_FILES)
         for compiled in (False, True) if function.compiled else (True,):
@@ -579,17 +580,17 @@ _COPIES: list[Copy] = []  # that of this process
 
 
 def make_copy(numbers: Any, jobs: int) -> None:
-    """The copy of a process that tries faults."""
+    """Make the copy of the repository for this worker process."""
     _COPIES.append(Copy(numbers.get(), jobs))
 
 
 def try_fault(fault: Fault) -> str:
-    """The verdict on one fault, in the copy of this process."""
+    """Return the verdict on one fault, in the copy of this process."""
     return _COPIES[0].verdict(fault)
 
 
 def preload() -> None:
-    """Load what every process needs once, before forking; nothing of the package itself."""
+    """Import modules that every process needs, before forking; none of them is part of the package."""
     os.environ |= {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
     sys.path[:] = [p for p in sys.path if Path(p or ".").resolve() != ROOT]
     for name in PRELOADED:
@@ -598,22 +599,22 @@ def preload() -> None:
 
 OPTIONS = {
     "what": {"choices": ("mutants", "bugs")},
-    "--folders": {"default": ",".join(folders()), "help": "comma list; default: all"},
+    "--folders": {"default": ",".join(folders()), "help": "folders, separated by commas; default: all"},
     "--sample": {"type": int, "default": 40, "help": "mutants of each folder"},
-    "--seed": {"type": int, "default": 0, "help": "of the sample"},
-    "--jobs": {"type": int, "default": 2, "help": "processes"},
-    "--journal": {"type": Path, "help": "verdicts are noted here, and taken from here"},
+    "--seed": {"type": int, "default": 0, "help": "seed of the sample"},
+    "--jobs": {"type": int, "default": 2, "help": "number of processes"},
+    "--journal": {"type": Path, "help": "file for verdicts; recorded verdicts are used"},
 }
 
 
 def cases(given: Given) -> Cases:
-    """Each fault, and by which test it is found; then the table of folders."""
+    """Yield all faults with the test that finds each; then print a table of folders."""
     wanted = given.folders.split(",")
     faults, misfits = planted()
     if given.what == "mutants":
         faults, misfits = [fault for folder in wanted for fault in sample_of(folder, given.sample, given.seed)], []
     for wrong in misfits:
-        yield wrong, partial(Told, False, "does not fit the code")
+        yield wrong, partial(Told, False, "the bug's text is not in the code")
     faults = [fault for fault in faults if given.only in fault.name and fault.folder in wanted]
     known = verdicts_of(given.journal)
     fresh = [] if given.list else [fault for fault in faults if fault.digest not in known]
@@ -632,7 +633,7 @@ def cases(given: Given) -> Cases:
             if red is None:
                 red = known[fault.digest] = tried[fault.digest].result()
                 note(given.journal, fault, red)
-            return Told(True, red) if red else Told(False if given.what == "bugs" else None, "no test notices it")
+            return Told(True, red) if red else Told(False if given.what == "bugs" else None, "no test finds it")
 
         for fault in faults:
             yield fault.name, partial(told, fault)
@@ -643,13 +644,13 @@ def cases(given: Given) -> Cases:
 
 
 def verdicts_of(journal: Path | None) -> dict[str, str]:
-    """Digest of a fault -> the test that found it, as noted before."""
+    """Return the recorded verdicts: digest of a fault -> the test that found it."""
     lines = journal.read_text("utf-8").splitlines() if journal is not None and journal.exists() else []
     return {line["digest"]: line["red"] for line in map(json.loads, lines)}
 
 
 def note(journal: Path | None, fault: Fault, red: str) -> None:
-    """Keep a verdict."""
+    """Write a verdict to the journal."""
     if journal is not None:
         with journal.open("a", encoding="utf-8") as out:
             out.write(json.dumps({"digest": fault.digest, "name": fault.name, "red": red}) + "\n")

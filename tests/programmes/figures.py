@@ -1,8 +1,8 @@
-"""Every printed block, table and picture of the pages that a command makes in minutes, made again and compared.
+"""Blocks, tables and pictures of the pages that commands make in minutes: make them again and compare.
 
-Blocks must be the same lines, pictures the same pixels; each figure of a table, to its decimals, must be among the
-numbers that its commands tell. What is compared by `make test`, and what by nothing because it takes a training, a long
-search or one machine's speed, is said in tests/docs/printed.py.
+Blocks must have equal lines, and pictures equal pixels. Each number of a table must be among the numbers that its
+commands print, to the decimals shown. tests/docs/printed.py says what `make test` compares, and what nothing compares
+because it needs a training, a long search or one machine's speed.
 """
 
 import os
@@ -41,7 +41,7 @@ PROGRESS = re.compile(r": [\d,]+ of [\d,]+$|^compiling ")
 
 
 def run(command: str, folder: Path) -> str:
-    """What a command tells on stderr and stdout, in this order; raises ``RuntimeError`` where it fails."""
+    """Return the output of a command: stderr, then stdout. Raises ``RuntimeError`` if the command fails."""
     words = shlex.split(command)
     words[1:] = [str(ROOT / word) if word.startswith("docs/studies/") else word for word in words[1:]]
     called = [sys.executable, *(["-m", "ethbrake_marl"] if words[0] == "ethbrake" else []), *words[1:]]
@@ -54,13 +54,13 @@ def run(command: str, folder: Path) -> str:
 
 @cache
 def told_by(command: str) -> str:
-    """What a command tells that several tables may show."""
+    """Return the output of a command, cached, because several tables may use it."""
     with tempfile.TemporaryDirectory() as folder:
         return run(command, Path(folder))
 
 
 def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
-    """What the commands of a block print that is not shown; how far they are (``500 of 2,000``) is not compared."""
+    """Return the lines of a block that differ from the page. Progress (``500 of 2,000``) is not compared."""
     found = []
     for command, shown in commands_of(block.text):
         wanted, told = (
@@ -73,7 +73,7 @@ def differing_block(block: Shown, place: How, folder: Path) -> list[str]:
 
 
 def differing_picture(picture: Shown, place: How, folder: Path) -> list[str]:
-    """Whether a picture has other pixels, in words."""
+    """Return in words whether a picture has other pixels; empty if not."""
     for command in place.by:
         run(command, folder)
     if picture.begin.endswith(".svg"):
@@ -90,7 +90,7 @@ def differing_picture(picture: Shown, place: How, folder: Path) -> list[str]:
 
 
 def nightly() -> Iterator[tuple[str, Shown, How]]:
-    """(kind, what is shown, how it is made) of all that is compared here; one that several pages show, once."""
+    """Yield (kind, item, how it is made) for everything that is compared here; items of several pages only once."""
     kinds = (("block", printed_blocks, BLOCKS), ("table", tables_of_figures, TABLES), ("picture", pictures, PICTURES))
     found = [(kind, each, how(table, each.begin)) for kind, shown, table in kinds for each in shown()]
     found += [("table", each, ("", place)) for each, place in results()]
@@ -109,7 +109,7 @@ COMPARE: dict[str, Callable[[Shown, How, Path], list[str]]] = {
 
 
 def compare(kind: str, shown: Shown, place: How) -> Told:
-    """Make one of them again."""
+    """Make one item again, and compare it."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             found = COMPARE[kind](shown, place, Path(folder))

@@ -1,8 +1,8 @@
-"""Hostile files: text as strangers write it, and folders that were edited, swapped, cut or made up.
+"""Hostile text files, and folders that were edited, exchanged, truncated or invented.
 
-Scenarios, recipes, sweeps, tunings, named worlds and tables of states are changed in the same ways: what is no YAML,
-the wrong YAML, each value exchanged for others, and what ``hostile.yaml`` lists for their own keys. Policy bundles and
-run folders are damaged in ways of their own.
+Scenarios, recipes, sweeps, tunings, named worlds and tables of states are changed in the same ways: invalid YAML, wrong
+YAML, exchanged values, and the changes of their own keys that ``hostile.yaml`` lists. Policy bundles and run folders
+have their own changes.
 """
 
 import atexit
@@ -150,7 +150,7 @@ Change = Callable[[random.Random, str], "str | bytes"]
 
 
 def lines_of(text: str) -> list[str]:
-    """The lines that give a key at the top level, with those that belong to it."""
+    """Return the parts of a text, one per key at the top level."""
     return re.split(r"\n(?! )", text.removesuffix("\n"))
 
 
@@ -159,7 +159,7 @@ def joined(parts: list[str]) -> str:
 
 
 def with_value(rng: random.Random, text: str, value: str, *, numeric: bool = False) -> str:
-    """The text with another value under one of its keys."""
+    """Return the text with another value for one of its keys."""
     parts = lines_of(text)
     k = rng.choice([k for k, p in enumerate(parts) if not numeric or p.split(": ", 1)[-1][0] in string.digits])
     parts[k] = f"{parts[k].split(':')[0]}: {value}"
@@ -167,21 +167,21 @@ def with_value(rng: random.Random, text: str, value: str, *, numeric: bool = Fal
 
 
 def with_line(rng: random.Random, text: str, line: str) -> str:
-    """The text with one more line."""
+    """Return the text with one more line."""
     parts = lines_of(text)
     parts.insert(rng.randrange(len(parts) + 1), line)
     return joined(parts)
 
 
 def without(rng: random.Random, text: str) -> str:
-    """The text without one of the keys that are needed."""
+    """Return the text without one of its required keys."""
     parts = lines_of(text)
     del parts[rng.choice([k for k, part in enumerate(parts) if part.startswith(NEEDED)])]
     return joined(parts)
 
 
 def misspelt(rng: random.Random, text: str) -> str:
-    """The text with one letter of one key changed."""
+    """Return the text with one changed letter in one key."""
     parts = lines_of(text)
     k = rng.randrange(len(parts))
     at = rng.randrange(len(parts[k].partition(":")[0]))
@@ -190,19 +190,19 @@ def misspelt(rng: random.Random, text: str) -> str:
 
 
 def spliced(rng: random.Random, text: str) -> str:
-    """Pieces of the text in another order."""
+    """Return parts of the text in another order."""
     i, j, k = sorted(rng.randrange(len(text)) for _ in range(3))
     a, b, c, d = text[:i], text[i:j], text[j:k], text[k:]
     return rng.choice((a + c + b + d, a + d, a + b + b + c + d, b + a + c + d))
 
 
 def quoted(rng: random.Random) -> str:
-    """A double-quoted scalar whose escapes make what YAML forbids in the open."""
+    """Return a double-quoted scalar with escapes for characters that YAML forbids."""
     return f'"{rng.choice(ESCAPES)}{rng.randrange(99)}"'
 
 
 def changed_somewhere(rng: random.Random, content: Any) -> Any:
-    """JSON with one value, anywhere in it, replaced, removed, or given another key."""
+    """Return the JSON content with one value replaced or removed, or with one key renamed."""
     places: list[tuple[Any, Any]] = []
 
     def walk(part: Any) -> None:
@@ -225,7 +225,7 @@ def changed_somewhere(rng: random.Random, content: Any) -> Any:
 
 
 def one_of(*texts: str, at: Callable[..., str] = with_line, **how: bool) -> Change:
-    """One of these as a line, or in the place of a value."""
+    """Return a change that adds one of these texts as a line, or as a value."""
     return lambda r, t: at(r, t, r.choice(texts), **how)
 
 
@@ -237,7 +237,7 @@ def times(text: str, *counts: int) -> tuple[str, ...]:
     return tuple(text * count for count in counts)
 
 
-# What is refused for certain, whatever the values of the random choices, of every kind of file.
+# Changes that must be refused in every kind of file.
 OF_EVERY_FILE: dict[str, Change] = {
     "unknown key": lambda r, t: with_line(r, t, f"{''.join(r.choices(string.ascii_lowercase, k=9))}_q: 1"),
     "misspelt key": misspelt,
@@ -274,7 +274,7 @@ OF_EVERY_FILE: dict[str, Change] = {
     "something else": lambda r, t: r.choice(ELSE),
     "too large": lambda r, t: t + "#" + "x" * (10 << 20),
 }
-# Of files with numbers at their top level.
+# Changes that must be refused in files with numbers at their top level.
 WITH_NUMBERS: dict[str, Change] = {
     "missing key": without,
     "not finite": number(*NOT_FINITE),
@@ -291,7 +291,7 @@ WITH_NUMBERS: dict[str, Change] = {
         "name: mine", f"name: {r.choice(('', 'Mine', '../mine', 'a' * 65, 'mine ine', '-x', '7' * 3000 + '_'))}"
     ),
 }
-# What may be in order too.
+# Changes after which a file may be valid.
 UNCERTAIN: dict[str, Change] = {
     "any value": lambda r, t: json.dumps(changed_somewhere(r, yaml.safe_load(t)), ensure_ascii=False),
     "spliced": spliced,
@@ -322,15 +322,15 @@ SLOW: dict[str, Change] = {
 
 
 class Text(NamedTuple):
-    """A kind of text file: one that is in order, the command and the function that read it, and how often it is tried.
+    """A kind of text file: a valid example, the command and the function that read it, and the number of cases.
 
-    The output of some commands is taken: what is in order is refused for that, before anything is trained.
+    The output of some commands exists already, so a valid file is refused before any training.
     """
 
     text: str
     command: tuple[str, ...]
     reader: Callable[[str], object]
-    each: int = 4  # cases of each category
+    each: int = 4  # number of cases per category
     certain: dict[str, Change] = OF_EVERY_FILE
     uncertain: dict[str, Change] = UNCERTAIN
     file: str = "mine.yaml"
@@ -338,7 +338,7 @@ class Text(NamedTuple):
 
 @cache
 def worlds_text() -> str:
-    """A file of two named worlds that is in order; nobody does more harm than it says."""
+    """Return a valid file of two named worlds, with harms that no agent exceeds."""
     scenario = eb.load_scenario("paper-random")
     states = states_of(scenario.sample(2, 7).worlds, scenario)
     worlds = [NamedWorld(name=f"world-{k}", score=1e6, harm=1e6, state=state) for k, state in enumerate(states)]
@@ -351,11 +351,12 @@ def worlds_text() -> str:
 HEADER = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps"
 ROW = "7,7,20,18,20"
 STATES = f"{HEADER}\n{ROW}\n{ROW}\n{ROW}\n"
-LATER = ("scenario of worlds", "settings of worlds", "agent of worlds", "measure")  # looked at when they are driven
+# Categories that are checked only when the worlds are simulated.
+LATER = ("scenario of worlds", "settings of worlds", "agent of worlds", "measure")
 
 
 def texts() -> dict[str, Text]:
-    """Every kind of text."""
+    """Return all kinds of text files."""
     both, own = {**OF_EVERY_FILE, **WITH_NUMBERS}, {**UNCERTAIN, **SLOW}
     train = ("train", "--recipe", "mine.yaml", "--output", "taken")
     sweep = ("study", "sweep", "mine.yaml", "--output", "taken", "--jobs", "1")
@@ -376,7 +377,7 @@ def texts() -> dict[str, Text]:
 
 
 def text_cases(kind: str, rng: random.Random) -> Iterator[Case]:
-    """Every way to change a kind of file, and what is listed for its own keys."""
+    """Yield the cases of one kind of file: all common changes, and the listed changes of its own keys."""
     text = texts()[kind]
     for certain, changes in ((True, text.certain), (False, text.uncertain)):
         for category, change in changes.items():
@@ -389,7 +390,7 @@ def text_cases(kind: str, rng: random.Random) -> Iterator[Case]:
 
 
 def _exchanged(text: str, listed: dict[str, Any], new: str) -> str:
-    """What is listed, which stands in the text, exchanged."""
+    """Return the text with a listed part replaced."""
     if "of" in listed:
         assert listed["of"] in text, listed["of"]
         return text.replace(listed["of"], new, 1)
@@ -410,7 +411,7 @@ def _case(text: Text, category: str, content: Callable[[], str | bytes], certain
 
 
 def with_field(*texts: str, line: int | None = None) -> Change:
-    """The table with another field in one place."""
+    """Return a change that replaces one field of the table."""
 
     def change(rng: random.Random, text: str) -> str:
         rows = [row.split(",") for row in text.splitlines()]
@@ -462,7 +463,7 @@ NO_JSON = (
 
 
 def edited(rng: random.Random, path: Path) -> None:
-    """A value somewhere in a JSON file changed."""
+    """Change one value in a JSON file."""
     path.write_text(json.dumps(changed_somewhere(rng, json.loads(path.read_text()))))
 
 
@@ -486,7 +487,7 @@ EVALUATE = ("evaluate", "--episodes", "2", "--agents", "ppo@policy")
 
 
 def _signed(folder: Path, **changes: str) -> None:
-    """A manifest with some changes, and its hash anew."""
+    """Change a manifest, and compute its hash again."""
     content = json.loads((folder / MANIFEST).read_text())
     if isinstance(content, dict):
         content |= changes
@@ -495,7 +496,7 @@ def _signed(folder: Path, **changes: str) -> None:
 
 
 def _header(folder: Path, change: Callable[[dict[str, Any]], Any]) -> None:
-    """Another header of the weights, with hashes that fit."""
+    """Change the header of the weights, with correct hashes."""
     data = (folder / WEIGHTS).read_bytes()
     size = struct.unpack("<Q", data[:8])[0]
     header = change(json.loads(data[8 : 8 + size]))
@@ -508,7 +509,7 @@ def _weights(folder: Path, data: bytes) -> None:
     _signed(folder, weights_sha256=hashlib.sha256(data).hexdigest())
 
 
-# What becomes of a tensor, by its name in the header.
+# Changes of a tensor in the header, by its name.
 Entries = dict[str, Any]
 TENSORS: tuple[Callable[[random.Random, Entries, str], object], ...] = (
     lambda r, h, name: h[name].update(dtype=r.choice(("F64", "BF16", "I8", "F8_E4M3", "OBJECT", None, 7, "x" * 5000))),
@@ -571,7 +572,7 @@ BUNDLES: dict[str, Spoil] = {
 
 
 def bundle_cases(rng: random.Random) -> Iterator[Case]:
-    """Bundles: 15 of each category, 60 of those that may be in order."""
+    """Yield bundles: 15 cases of each category, and 60 of categories that may be valid."""
     uncertain: dict[str, Spoil] = {
         "manifest edited and hashed anew": lambda r, f: (edited(r, f / MANIFEST), _signed(f)),
         "damaged": damaged_file,
@@ -584,14 +585,14 @@ def bundle_cases(rng: random.Random) -> Iterator[Case]:
 
 
 def bundle(folder: Path) -> Path:
-    """A bundle that is in order, and may be changed."""
+    """Copy a valid bundle that may be changed."""
     shutil.copytree(shipped_policies()["ppo"] / "policy", folder / "policy", copy_function=shutil.copyfile)
     (folder / "policy").chmod(0o755)
     return folder / "policy"
 
 
 def _changed(begin: Callable[[Path], Path], change: Spoil, seed: float, folder: Path) -> None:
-    """What ``begin`` makes, changed."""
+    """Apply ``change`` to the result of ``begin``."""
     change(random.Random(seed), begin(folder))
 
 
@@ -619,7 +620,7 @@ SETTINGS = {
 
 @cache
 def stopped(algorithm: str) -> Path:
-    """A training that was interrupted, with its checkpoints; it goes on for a few updates."""
+    """Return the folder of an interrupted training with checkpoints, which can be resumed for a few updates."""
     folder = Path(tempfile.mkdtemp(prefix="hostile-runs-")) / RUN
     atexit.register(shutil.rmtree, folder.parent, ignore_errors=True)
     seen = []
@@ -665,7 +666,7 @@ def _pipe(rng: random.Random, run: Path) -> None:
 
 
 def _swapped(rng: random.Random, run: Path) -> None:
-    """Two files of the run in each other's place."""
+    """Exchange the contents of two files of the run."""
     one, other = rng.sample(plain_files(run), 2)
     data = one.read_bytes()
     one.write_bytes(other.read_bytes())
@@ -699,7 +700,7 @@ def _more(rng: random.Random, run: Path) -> None:
         write(run / name, "x")
 
 
-# Category -> (algorithms, cases of each, whether it must be refused, the change).
+# Category -> (algorithms, cases per algorithm, whether it must be refused, change).
 CHANGES: dict[str, tuple[tuple[str, ...], int, bool, Spoil]] = {
     "config.json edited": (("ppo",), 60, False, lambda r, f: edited(r, f / "config.json")),
     "config.json is no JSON": (("ppo",), 17, True, lambda r, f: no_json(r, f / "config.json")),
@@ -729,7 +730,7 @@ CHANGES: dict[str, tuple[tuple[str, ...], int, bool, Spoil]] = {
 
 
 def run_cases(kind: str, rng: random.Random) -> Iterator[Case]:
-    """Interrupted trainings that are resumed: a ``checkpoint`` changed, or anything else of the ``run``."""
+    """Yield interrupted trainings, resumed after a change in a ``checkpoint``, or elsewhere in the ``run``."""
     for category, (algorithms, count, certain, change) in CHANGES.items():
         if category.startswith("checkpoint: ") == (kind == "checkpoint"):
             for algorithm in [each for each in algorithms for _ in range(count)]:

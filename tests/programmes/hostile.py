@@ -1,9 +1,9 @@
-"""Files that a stranger wrote or a disk damaged, each met by the command that reads it; and hostile command lines.
+"""Hostile and damaged files, each read by its command, and hostile command lines.
 
-Every case must end within 10 s of processor time and 2 GiB of memory, with exit status 2 and one line of error of at
-most 2,000 characters without control characters (or, where that cannot be said beforehand, in order), and through
-Python with an exception of the project's family; nothing may be executed, and nothing written but what the command is
-for. The whole attack stands in a folder that is removed at the end.
+Every case must end within 10 s of processor time and 2 GiB of memory. The exit status must be 2, with one error line of
+at most 2,000 characters without control characters; a case that may be valid can also succeed. In Python the error must
+be an ``EthBrakeError``. Nothing may be executed, and nothing written except the command's output. The folder of the
+attack is deleted at the end.
 """
 
 import functools
@@ -68,9 +68,9 @@ class Target(NamedTuple):
 
     name: str
     right: bytes
-    command: tuple[str, ...]  # in which its name stands
+    command: tuple[str, ...]  # command with the file's name
     reader: Callable[[str], object]
-    beside: Build = lambda folder: None  # what must be there too
+    beside: Build = lambda folder: None  # makes other files that the command needs
 
 
 def targets() -> Iterator[Target]:
@@ -89,7 +89,7 @@ def targets() -> Iterator[Target]:
 
 
 def _socket(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as server, chdir(path.parent):  # its name has at most 107 bytes
+    with socket.socket(socket.AF_UNIX) as server, chdir(path.parent):  # the name of a socket has at most 107 bytes
         server.bind(path.name)
 
 
@@ -130,7 +130,7 @@ LONG = ("a" * 300, "a/" * 3000, "a" * 5000, f"../{INSIDE}/" * 300 + "x", HERE + 
 
 
 def places(rng: random.Random) -> Iterator[Case]:
-    """Every kind of file replaced by everything, and called by names that bite."""
+    """Yield cases with every kind of file replaced by pipes, links, folders and so on, and with hostile file names."""
     for target in targets():
         for place, put in PLACES.items():
             yield _at(target, place, put)
@@ -158,7 +158,7 @@ def _write(name: str, content: bytes, folder: Path) -> None:
 
 
 def _at(target: Target, category: str, put: Callable[[Path], object]) -> Case:
-    """Something else in the place of the file."""
+    """Return a case with something else in the place of the file."""
 
     def build(folder: Path) -> None:
         target.beside(folder)
@@ -170,7 +170,7 @@ def _at(target: Target, category: str, put: Callable[[Path], object]) -> Case:
 
 
 def _named(target: Target, category: str, name: str, build: Build = lambda folder: None) -> Case:
-    """The file by another name."""
+    """Return a case in which the file has another name."""
     command = tuple(name if word == target.name else word for word in target.command)
     reader = None if name.startswith("--") or not name else lambda: target.reader(name.replace(HERE, f"{Path.cwd()}"))
     return Case(category, command, build, reader=reader)
@@ -194,7 +194,7 @@ VARIABLES = (
     {"OMP_NUM_THREADS": "-1"}, {"MPLCONFIGDIR": f"{HERE}/file"}, {"PWD": f"{HERE}/nowhere"}, {"TZ": "\x1b"},
     {"_ETHBRAKE_COMPLETE": "bash_source"}, {"_TYPER_STANDARD_TRACEBACK": "1"},
 )  # fmt: skip
-# Command lines with a word (``@``) that bites.
+# Command lines in which ``@`` is replaced by a hostile word.
 LINES = (
     "scenario show @", "scenario new @", "compare @ @", "train --resume @", "@",
     "evaluate --episodes 3 --set @", "evaluate --episodes 3 --set mass_t=@", "evaluate --episodes 3 --set harm_count=@",
@@ -202,7 +202,7 @@ LINES = (
     "shield --episodes 3 --agents @", "agent export @ --onnx x.onnx", "study falsify --budget 10 --scenario @",
     "study ablate --levels @ --output o",
 )  # fmt: skip
-# Places below the case's own folder where nothing can be written, not even by the superuser.
+# Places in the case's folder where not even the superuser can write.
 TARGETS = ("file", "file/x", "full", "link", "dangling", "loop", "pipe", "pipe/x", f"{HERE}/loop/x", "x" * 300, "\0b")
 WRITERS: dict[str, tuple[str, ...]] = {
     "results": ("evaluate", "--agents", "coast", *FEW, "--output"),
@@ -224,16 +224,16 @@ def _taken(folder: Path) -> None:
 
 
 def commands(rng: random.Random) -> Iterator[Case]:
-    """Command lines, the places where their results are to go, and the variables around them."""
+    """Yield hostile command lines, output paths and environment variables."""
     line = partial(Case, build=lambda folder: None, may_change=MAY_CHANGE)
     for spec in (*SPECS, *(f"ppo@{word}" for word in WORDS), *(f"{word}:1" for word in WORDS if word)):
         good = spec in ("ppo", "ladder", "constant:-7")
         yield line("agent", ("evaluate", *FEW, "--agents", spec), certain=not good)
     for number in NUMBERS:
         certain = number not in ("0", "0x10", "\u0663", "10000001", "1e3", "1_000")
-        for option in ("--seed", *(["--episodes"] if number != "10000001" else [])):  # that many take a while
+        for option in ("--seed", *(["--episodes"] if number != "10000001" else [])):  # so many worlds take long
             yield line("number", ("evaluate", "--agents", "coast", option, number), certain=certain)
-        if number != "10000001":  # a budget that takes its time is the user's own wish
+        if number != "10000001":  # a large budget is allowed to take long
             wrong = number in ("", "-1", "0", "1.5", "nan")
             yield line(
                 "number",
@@ -267,11 +267,11 @@ KINDS: dict[str, Generator] = {
 # ---------------------------------------------------------------- the attack
 
 
-OPTIONS = {"--sample": {"type": int, "help": "so many cases of each category"}, "--seed": {"type": int, "default": 0}}
+OPTIONS = {"--sample": {"type": int, "help": "number of cases per category"}, "--seed": {"type": int, "default": 0}}
 
 
 def by_category(kind: str, seed: int) -> dict[str, list[Case]]:
-    """The cases of a kind, each category shuffled."""
+    """Return the cases of a kind by category, each category shuffled."""
     grouped: dict[str, list[Case]] = defaultdict(list)
     for case in KINDS[kind](random.Random(f"{seed} {kind}")):
         grouped[case.category].append(case)
@@ -305,8 +305,8 @@ def attack(tried: list[Case], folder: Path) -> Told:
     slowest, longest = max(verdict.cpu_s for verdict in verdicts), max(verdict.longest for verdict in verdicts)
     return Told(
         not broken,
-        f"{refused} refused, {len(tried) - refused - broken} in order, {broken} broke a rule; at most {slowest:.2f} s"
-        f" of a processor, {longest} characters",
+        f"{refused} refused, {len(tried) - refused - broken} valid, {broken} broke a rule; at most {slowest:.2f} s"
+        f" of processor time and {longest} characters per line",
     )
 
 
@@ -327,9 +327,9 @@ WARM = (
 
 
 def warm_up(folder: Path) -> None:
-    """Import what commands import late and compile the kernels, so that only what a case does itself is seen."""
+    """Import late modules and compile the kernels, so that a case is charged only for its own work."""
     torch.set_num_threads(1)
-    typer.main.get_command = functools.cache(typer.main.get_command)  # built anew for every command line otherwise
+    typer.main.get_command = functools.cache(typer.main.get_command)  # else built per command line
     write(folder / "file", "")
     for place in (folder, folder / "bad"):
         for kind, text in texts().items():

@@ -1,11 +1,11 @@
-"""Other people's libraries: every block of libraries.md, beside this file, runs as it stands, and its policy drives.
+"""Other libraries: every program of libraries.md in this folder runs unchanged, and its policy can be used as an agent.
 
-So do the programs of docs/train.md and docs/extensions/benchmarl.md, in the environment of BenchMARL.
+The programs of docs/train.md and docs/extensions/benchmarl.md run, too, in the environment of BenchMARL.
 
-Each library has an environment of its own below ``.venvs/``, kept for the next run, with this project as it stands.
-What cannot be installed is skipped, and the reason told. A policy is measured on a fixed list of worlds beside full
-braking, and where the library evaluates policies by itself, its harm is compared with ours, world by world.
-``--write`` puts the rows into docs/results/libraries.json. ``--ci`` takes the libraries that are cheap to install.
+Each library has its own environment in ``.venvs/``, with this project in its present state. A library that cannot be
+installed is skipped with the reason. A policy is evaluated on a fixed list of worlds, together with full braking. If
+the library can evaluate policies itself, its harm is compared with ours, world by world. ``--write`` writes the rows to
+docs/results/libraries.json. ``--ci`` runs only the libraries that are cheap to install.
 """
 
 import json
@@ -32,7 +32,7 @@ PAGE = Path(__file__).with_name("libraries.md")
 TRAIN, BENCHMARL = ROOT / "docs" / "train.md", ROOT / "docs" / "extensions" / "benchmarl.md"
 MEASURED = load("results")
 SCENARIO, EPISODES, SEED = "paper-random", 500, 7
-OWN_EPISODES, CLOSE = 50, 1e-5  # of the library's own evaluation; m2/s2
+OWN_EPISODES, CLOSE = 50, 1e-5  # worlds of the library's own evaluation, and tolerance in m2/s2
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 BLOCK = re.compile(
     r"^(?P<title>[^\n]+) \((?P<ran>[^\n]+)\):\n\n"
@@ -43,24 +43,24 @@ BLOCK = re.compile(
 
 
 class Way(NamedTuple):
-    """One way to train with a library, as the page shows it."""
+    """One program for a library, as the page shows it."""
 
     library: str
     title: str
-    ran: str  # which algorithm, and how long
+    ran: str  # algorithm and length of the training
     language: str
-    code: str  # what a user copies
-    whole: str  # with networks or settings before it, and a loop after it
+    code: str  # the part that a user copies
+    whole: str  # the code with the networks or settings before it and the loop after it
 
 
 class Library(NamedTuple):
-    """What the environment of a library holds beside this project, at the versions that were tried."""
+    """Requirements of a library's environment, at the versions that were tried."""
 
     requires: tuple[str, ...]
-    package: str = ""  # the distribution whose version is told; empty: the first that is required
+    package: str = ""  # distribution whose version is reported; empty: the first of ``requires``
     in_ci: bool = False
     finish: Callable[[dict[str, Any]], Any] = lambda names: names.get("agent")  # names of a block -> agent or policy
-    overrides: tuple[str, ...] = ()  # of what they require
+    overrides: tuple[str, ...] = ()  # versions that replace requirements of these packages
 
     @property
     def told(self) -> str:
@@ -68,7 +68,7 @@ class Library(NamedTuple):
 
 
 def ways() -> list[Way]:
-    """Every way, in the order of the page."""
+    """Return all programs, in the order of the page."""
     found = []
     for section in PAGE.read_text("utf-8").split("\n## ")[1:]:
         for each in BLOCK.finditer(section):
@@ -83,7 +83,7 @@ def ways() -> list[Way]:
 
 
 def deterministic(policy: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """What a policy of TorchRL does, without exploration."""
+    """Return a policy of TorchRL without exploration."""
     import torch
     from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -103,7 +103,7 @@ def of_torchrl(names: dict[str, Any]) -> Any:
 
 def of_benchmarl(names: dict[str, Any]) -> Any:
     if "experiment" not in names:
-        assert list(Path("outputs").rglob(".hydra")), "its command line left nothing"
+        assert list(Path("outputs").rglob(".hydra")), "its command line wrote no files"
         return None
     from tensordict import TensorDict
 
@@ -130,7 +130,7 @@ def of_cleanrl(names: dict[str, Any]) -> None:
         if any(env.step(env.action_space.sample())[2:4]):
             env.reset()
     env.close()
-    assert list(Path("videos").rglob("*.mp4")), "no film"
+    assert list(Path("videos").rglob("*.mp4")), "no film was written"
 
 
 def of_skrl(names: dict[str, Any]) -> Any:
@@ -165,7 +165,7 @@ def of_omnisafe(names: dict[str, Any]) -> Any:
 
 
 def of_minari(names: dict[str, Any]) -> None:
-    """The recovered environment plays every episode again, to the bit."""
+    """Check that the recovered environment repeats every episode, bit for bit."""
     env = names["data"].recover_environment()
     assert env.unwrapped.engine.observation.front == 2
     for k, episode in enumerate(names["data"].iterate_episodes()):
@@ -199,20 +199,20 @@ LIBRARIES = {  # by the heading of their section
     "MOMAland": Library(("momaland==0.2.0", "supersuit==3.11.0", "stable-baselines3==2.9.2")),
     "morl-baselines": Library(("morl-baselines==1.3.0",)),
 }
-BRIEF = ("Tianshou", "AgileRL")  # run two iterations: too little to learn, so need not beat full braking
+BRIEF = ("Tianshou", "AgileRL")  # two iterations are too few to learn: these need not beat full braking
 
 
 # ---------------------------------------------------------------- in the library's own environment
 
 
 def tell(k: int) -> None:
-    """Run the k-th way in the current folder, measure what it trained, and print its cells of the table as JSON."""
+    """Run the k-th program in the current folder, evaluate its policy, and print the cells of its row as JSON."""
     import ethbrake_marl as eb
 
     way = ways()[k]
     library, scenario = LIBRARIES[way.library], eb.load_scenario(SCENARIO)
     drive = partial(eb.evaluate, scenario=scenario)
-    drive(scenario.sample(10, SEED), {"coast": eb.make_agent("coast")})  # compiles the physics: no way's time
+    drive(scenario.sample(10, SEED), {"coast": eb.make_agent("coast")})  # compiles the physics before the measurement
     begun, names = cpu_seconds(), {"__name__": "copied"}
     if way.language == "sh":
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
@@ -231,19 +231,19 @@ def tell(k: int) -> None:
         harm, braking = f"{theirs:.2f}", f"{full:.2f}"
         if way.library == "Stable-Baselines3":
             difference = evaluated_by_itself(names["model"], agent)
-            assert difference <= CLOSE, f"{difference:.2g} m2/s2 from the library's own evaluation"
+            assert difference <= CLOSE, f"our harm differs by {difference:.2g} m2/s2 from the library's own evaluation"
             own = f"{difference:.0e}"
         if way.library not in BRIEF:
-            assert theirs < full, f"{harm}: does not beat full braking"
+            assert theirs < full, f"harm {harm} is not below the harm of full braking, {braking}"
             verdict = "beats full braking"
     print(json.dumps([version(library.told), harm, braking, own, f"{seconds:.0f}", verdict]))
 
 
 def harm_of_programs() -> dict[str, dict[str, float]]:
-    """Mean harm of each policy that the programs of docs/train.md and docs/extensions/benchmarl.md train.
+    """Return the mean harm of full braking and of each policy of docs/train.md and docs/extensions/benchmarl.md.
 
-    Each stands beside full braking. Without BenchMARL only those of docs/train.md run. A minute is too little for MAPPO
-    to beat full braking, which the page says.
+    Without BenchMARL only the programs of docs/train.md run. MAPPO need not beat full braking: the page says that a
+    minute is too short.
     """
     names: dict[str, Any] = {"__name__": "copied"}
     for page in (TRAIN, BENCHMARL) if find_spec("benchmarl") else (TRAIN,):
@@ -262,7 +262,10 @@ def tell_programs() -> None:
 
 
 def evaluated_by_itself(model: Any, agent: Any) -> float:
-    """Largest difference of any world's harm, m2/s2, by its own ``evaluate_policy``: the reward is minus the harm."""
+    """Return the largest difference in a world's harm between our and the library's evaluation, m2/s2.
+
+    The library's ``evaluate_policy`` gives returns, which are minus the harm.
+    """
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -277,7 +280,7 @@ def evaluated_by_itself(model: Any, agent: Any) -> float:
 
 
 def cpu_seconds() -> float:
-    """Of this process and of all that it started and that has ended."""
+    """Return the processor seconds of this process and of its ended children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(one.ru_utime + one.ru_stime for one in used)
 
@@ -287,8 +290,8 @@ def cpu_seconds() -> float:
 
 OPTIONS = {
     "--ci": {"action": "store_true", "help": "only the libraries that are cheap to install"},
-    "--limit": {"type": float, "default": 900.0, "help": "seconds for one way"},
-    "--write": {"action": "store_true", "help": "write the rows into docs/results/libraries.json"},
+    "--limit": {"type": float, "default": 900.0, "help": "limit for one program, in seconds"},
+    "--write": {"action": "store_true", "help": "write the rows to docs/results/libraries.json"},
 }
 
 
@@ -305,7 +308,7 @@ def cases(given: Given) -> Cases:
 
 
 def run(library: str, function: str, given: Given, way: Way | None = None) -> Told:
-    """Run one way, or the programs, in its library's environment."""
+    """Run one program, or the programs of the pages, in the environment of its library."""
     name = re.sub(r"\W+", "_", library.lower())
     try:
         python = ready_python(name, LIBRARIES[library].requires, LIBRARIES[library].overrides)
@@ -315,14 +318,14 @@ def run(library: str, function: str, given: Given, way: Way | None = None) -> To
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     call = f"import os; os.chdir({str(folder)!r}); from tests.programmes import libraries; libraries.{function}"
-    variables = {"MINARI_DATASETS_PATH": str(folder), "PYTHONUNBUFFERED": "1", **ONE_THREAD}  # not among the user's own
+    variables = {"MINARI_DATASETS_PATH": str(folder), "PYTHONUNBUFFERED": "1", **ONE_THREAD}  # apart from the user's
     limit = min(given.limit, given.until - time.monotonic())
     status, told = watched([str(python), "-W", "ignore", "-c", call], limit, **variables)
     if status is None:
-        return Told(None if limit < given.limit else False, f"not done after {limit:.0f} s")
+        return Told(None if limit < given.limit else False, f"not finished after {limit:.0f} s")
     last = (told.strip().splitlines() or [""])[-1]
     if status:
-        return Told(False, f"status {status}: {last}")
+        return Told(False, f"exit status {status}: {last}")
     cells = json.loads(last)
     if given.write and way is not None:
         write_row(way, cells)
@@ -330,15 +333,15 @@ def run(library: str, function: str, given: Given, way: Way | None = None) -> To
 
 
 def write_row(way: Way, cells: list[str]) -> None:
-    """Put a row into docs/results/libraries.json, in the place of the one of the same library and way."""
+    """Replace the row of the same library and title in docs/results/libraries.json."""
     row = [way.library, cells[0], lowered(way.title), way.ran, *cells[1:]]
     (table,) = MEASURED.read_tables("libraries")
     rows = [row if (each[0], each[2]) == (row[0], row[2]) else each for each in table.rows]
-    assert row in rows, f"no row of {way.library}, {way.title}"
+    assert row in rows, f"docs/results/libraries.json has no row for {way.library}, {way.title}"
     changed = table.model_copy(update={"rows": rows})
     (MEASURED.RESULTS / "libraries.json").write_text(MEASURED.text_of([changed]), "utf-8")
 
 
 def lowered(title: str) -> str:
-    """A title as it stands in the table."""
+    """Return a title as it is written in the table."""
     return title if title[:2].isupper() else title[0].lower() + title[1:]

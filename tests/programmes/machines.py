@@ -1,9 +1,9 @@
-"""The same bits on other processors: every recorded result, computed again as nine older ones would.
+"""The same bits on other processors: computes recorded results again under settings of nine older processors.
 
-Computes one hash for each thing that is recorded somewhere: worlds of every shipped scenario,
-physics, episodes with rewards and observations, E-V2X-BM, searches, bounds, shield decisions, tallies, intervals and
-the actions of policies. First as this machine does, then in one process for each of the settings below, which make
-numpy, the C library, OpenBLAS or numba behave as on an older processor.
+It computes one hash per recorded result: worlds of every shipped scenario, physics, episodes with rewards and
+observations, E-V2X-BM, searches, bounds, decisions of the shield, tallies, intervals and actions of policies. First it
+uses this machine as it is. Then it uses one process per setting below, in which numpy, the C library, OpenBLAS or numba
+behave as on an older processor.
 """
 
 import hashlib
@@ -43,11 +43,11 @@ SETTINGS: dict[str, dict[str, str]] = {
     "kernels for x86-64-v2": {"NUMBA_CPU_NAME": "x86-64-v2", "NUMBA_CPU_FEATURES": ""},
     "kernels for x86-64": {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""},
 }
-HARD = ("stress-wide", "realistic-mixed", "paper-random")  # two with distributions that need functions of our own
+HARD = ("stress-wide", "realistic-mixed", "paper-random")  # the distributions of the first two use our own functions
 
 
 def digest(*columns: Any) -> str:
-    """The first 16 digits of a hash of these arrays."""
+    """Return the first 16 digits of a hash of these arrays."""
     found = hashlib.sha256()
     for column in columns:
         found.update(np.ascontiguousarray(column).tobytes())
@@ -55,7 +55,7 @@ def digest(*columns: Any) -> str:
 
 
 def episodes() -> dict[str, str]:
-    """Observations and rewards of random actions, with every term and an angle as objective."""
+    """Return hashes of observations and rewards for random actions, with all reward terms and an angle as objective."""
     reward = {"harm": 1.0, "risk": 1.0, "jerk": 1e-5, "collision": 1.0, "shaping": 1.0, "objective": "social:37"}
     found = {}
     for name in HARD:
@@ -115,7 +115,7 @@ KINDS: tuple[Callable[[], dict[str, str]], ...] = (
 TELL = "from tests.programmes import machines; machines.tell()"
 
 
-OPTIONS = {"--sample": {"action": "store_true", "help": "without the settings that compile everything anew"}}
+OPTIONS = {"--sample": {"action": "store_true", "help": "skip settings that compile all kernels again"}}
 
 
 def cases(given: Given) -> Cases:
@@ -125,7 +125,7 @@ def cases(given: Given) -> Cases:
         here.update(here or measured({}))
         found = measured(setting)
         other = [key for key in here if found[key] != here[key]]
-        return Told(not other, ", ".join(other) or f"all {len(here)} hashes")
+        return Told(not other, ", ".join(other) or f"all {len(here)} hashes equal")
 
     for name, setting in SETTINGS.items():
         if not (given.sample and "NUMBA_CPU_NAME" in setting):
@@ -138,7 +138,7 @@ def tell() -> None:
 
 
 def measured(setting: dict[str, str]) -> dict[str, str]:
-    """All hashes, computed in a process of its own."""
+    """Return all hashes, computed in a separate process with this ``setting``."""
     status, told = watched([sys.executable, "-c", TELL], math.inf, **setting)
     assert status == 0, f"exit status {status}\n{told}"
     return json.loads(told.splitlines()[-1])

@@ -1,9 +1,9 @@
-"""Beside other simulators: speeds, all measured now, by one loop, on this machine.
+"""Speed of other simulators and of this one, measured with the same loop on this machine.
 
-Each peer has an environment of its own below ``.venvs/``: some have licences or dependencies that this project does not
-want. One that cannot be installed or measured is told with the reason. Work is counted per second of processor time of
-a process that does nothing else, all its threads together, in whatever environment holds the simulator: hence the
-imports inside functions.
+Each other simulator has its own environment in ``.venvs/``, because some have licences or dependencies that this
+project does not want. If one cannot be installed or measured, the reason is printed. A rate is work per second of
+processor time (all threads) of a process that does nothing else. Imports are inside functions, because each process
+runs in the environment of its simulator.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SETTINGS = {  # one thread for every library: threads that wait also cost proces
 
 
 def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) -> list[float]:
-    """Units of work per second of processor time, ascending; the first round does not count."""
+    """Return units of work per second of processor time, ascending. The first round does not count."""
     work()
     found = []
     for _ in range(repetitions):
@@ -46,13 +46,13 @@ def rates(work: Work, repetitions: int = REPETITIONS, seconds: float = SECONDS) 
 
 
 def ours(name: str, n: int) -> Work:
-    """A loop of ``python docs/studies/speed.py``."""
+    """Return a loop of ``docs/studies/speed.py``."""
     work: Work = getattr(load("../studies/speed"), name)(n)
     return work
 
 
 def highway_env(vehicles: int) -> Work:
-    """highway-v0, the ego vehicle and others on one lane; one step is one decision (1 s: 15 steps of the dynamics)."""
+    """highway-v0 with other vehicles on one lane; one step is one decision (1 s, 15 steps of the motion)."""
     import gymnasium
     import highway_env  # noqa: F401  # registers its environments
 
@@ -71,7 +71,7 @@ def highway_env(vehicles: int) -> Work:
 
 
 def mpe2_parallel() -> Work:
-    """simple_spread with three agents through PettingZoo's parallel API, resets included."""
+    """simple_spread with three agents, with PettingZoo's parallel API, including resets."""
     from mpe2 import simple_spread_v3
 
     environment = simple_spread_v3.parallel_env(N=3)
@@ -89,7 +89,7 @@ def mpe2_parallel() -> Work:
 
 
 def supersuit_mpe2(n: int) -> Work:
-    """The same, n copies as one vector environment by SuperSuit in one process."""
+    """simple_spread, n copies as one vector environment of SuperSuit in one process."""
     import numpy
     import supersuit
     from mpe2 import simple_spread_v3
@@ -126,7 +126,7 @@ def vmas(n: int) -> Work:
 
 
 def gymnax_cartpole(n: int) -> Work:
-    """CartPole in jax, n worlds, 100 steps with automatic resets compiled as one loop."""
+    """CartPole in jax, n worlds; 100 steps with automatic resets are compiled as one loop."""
     import gymnax
     import jax
 
@@ -150,7 +150,7 @@ def gymnax_cartpole(n: int) -> Work:
 
 
 class Loop(NamedTuple):
-    """Something to measure."""
+    """A loop that can be measured."""
 
     distribution: str
     what: str
@@ -175,13 +175,13 @@ NEEDS = {"supersuit": ("supersuit", "mpe2")}  # what a peer's environment holds 
 
 
 def tell(name: str) -> None:
-    """Measure one loop in this process, and print what was found as JSON."""
+    """Measure one loop in this process, and print its rates as JSON."""
     loop = LOOPS[name]
     print(json.dumps({"version": version(loop.distribution), "rates": rates(loop.make())}))
 
 
 def measured(name: str, medians: dict[str, float]) -> Told:
-    """What is told of a loop; of a peer also how many times our loop is faster."""
+    """Report the rate of a loop; for another simulator also how many times faster our loop is."""
     loop = LOOPS[name]
     pins = ["-c", str(VERSIONS)]
     try:
@@ -203,12 +203,12 @@ def measured(name: str, medians: dict[str, float]) -> Told:
 
 
 def plain(value: float) -> str:
-    """Three digits, with commas from 1,000 on."""
+    """Return a number with three digits, and with commas from 1,000 on."""
     return f"{float(f'{value:.3g}'):,.{0 if value >= 99.95 else 1 if value >= 9.995 else 2}f}"
 
 
 def cases(given: Given) -> Cases:
-    """Each loop: world-steps per second of processor time, the median of ``REPETITIONS``, lowest and highest."""
+    """Yield all loops: world-steps per second of processor time, as median, lowest and highest of ``REPETITIONS``."""
     medians: dict[str, float] = {}
     for name, loop in LOOPS.items():
         yield f"{name}: {loop.distribution}, {loop.what}", partial(measured, name, medians)

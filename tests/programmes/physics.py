@@ -1,6 +1,6 @@
-"""The physics on many worlds: one figure per gate, and its threshold.
+"""The physics on many worlds: one measured value per check, and its threshold.
 
-The claims of ``tests/physics``, with the tolerances of ``tests/reference/tolerances.py``, on many more worlds.
+The checks of ``tests/physics``, with the tolerances of ``tests/reference/tolerances.py``, on many more worlds.
 """
 
 import json
@@ -73,11 +73,11 @@ from tests.test_harm import booked
 
 
 class Figure(NamedTuple):
-    """One measured figure, good when it does not exceed its threshold; NaN does."""
+    """A measured value. It is good if it is at most the threshold; NaN is not."""
 
     value: float
     threshold: float
-    of: str  # what it was measured on
+    of: str  # description of the worlds
 
 
 def measured(measure: Callable[[], Figure]) -> Told:
@@ -86,12 +86,12 @@ def measured(measure: Callable[[], Figure]) -> Told:
 
 
 OPTIONS = {
-    "--small-step-worlds": {"type": int, "default": 10_000, "help": "of 'brakes that build up'"},
-    "--one-physics-worlds": {"type": int, "default": 10_000, "help": "of 'one physics'"},
+    "--small-step-worlds": {"type": int, "default": 10_000, "help": "worlds of 'brakes that build up'"},
+    "--one-physics-worlds": {"type": int, "default": 10_000, "help": "worlds of 'one physics'"},
     "--bounded-worlds": {
         "type": int,
         "default": 3_500,
-        "help": "of each region of 'lower bound where brakes build up'",
+        "help": "worlds of each region of 'lower bound where brakes build up'",
     },
 }
 
@@ -116,7 +116,7 @@ def cases(given: Given) -> Cases:
 
 
 def never_above(region: str, worlds: int) -> Figure:
-    """How far the lower bound is above the least harm of searched, random and constant profiles, under either count."""
+    """Return the largest excess of the lower bound over the least harm of all tried profiles, for both counts."""
     found = [(bound.harm, least) for bound, least in bounded_and_found(region, worlds, 600, seed=7)]
     bounds, least = (np.concatenate(each) for each in zip(*found, strict=True))
     above = float(np.max(bounds - least, initial=0.0))
@@ -124,9 +124,9 @@ def never_above(region: str, worlds: int) -> Figure:
 
 
 def small_steps(N: int, obstacle: bool, in_pieces: bool, worlds: int) -> Figure:
-    """The largest relative error beside steps of 1e-5 s, or of down to 1e-8 s where those are too coarse.
+    """Return the largest relative difference from a simulation in steps of 1e-5 s, or finer steps down to 1e-8 s.
 
-    Two bounces within a step change their order, and with it the rest of a cascade. Worlds with more than thirty
+    If two bounces fall into one step, their order and the rest of the cascade can change. Worlds with more than 30
     impacts are not compared.
     """
     key = 100 + 2 * N + obstacle + 50 * in_pieces
@@ -151,7 +151,7 @@ def small_steps(N: int, obstacle: bool, in_pieces: bool, worlds: int) -> Figure:
 
 
 def one_physics(kind: tuple[int, tuple[int, ...], bool, bool], worlds: int) -> Figure:
-    """The largest error of first-impact harm beside small steps; infinite where engine, search and shield differ.
+    """Return the largest error of first-impact harm from small steps; infinite if engine, search and shield differ.
 
     As in ``small_steps``, worlds with more than thirty impacts are not compared with small steps.
     """
@@ -172,7 +172,7 @@ def one_physics(kind: tuple[int, tuple[int, ...], bool, bool], worlds: int) -> F
 
 
 def inexactly(cases: list[Case]) -> Figure:
-    """How many worlds are not what rational arithmetic says to the last bit, at once and in steps."""
+    """Return how many worlds differ from rational arithmetic in any bit, in one segment or in steps."""
     hits = sum(len(case.outcome.hits) for case in cases)
     wrong = sum(bool(at_once(case) or in_steps(case)) for case in cases)
     return Figure(wrong, 0, f"{len(cases)} worlds, {hits} impacts, at once and in steps of 1/8 s")
@@ -180,7 +180,7 @@ def inexactly(cases: list[Case]) -> Figure:
 
 @cache
 def impact_batches() -> list[tuple[Worlds, Worlds, Impacts]]:
-    """Touching lines of 2 to 50 vehicles before and after their impacts, with mass ratios up to a million."""
+    """Return touching lines of 2 to 50 vehicles before and after their impacts, with mass ratios up to a million."""
     batches = []
     for N in (2, 3, 5, 10, 50):
         for ratio in (1.0, 1e3, 1e6):
@@ -190,13 +190,13 @@ def impact_batches() -> list[tuple[Worlds, Worlds, Impacts]]:
 
 
 def of_impacts(error: Callable[[Worlds, Worlds, Impacts], Floats], threshold: float) -> Figure:
-    """The largest error at their impacts."""
+    """Return the largest error at the impacts of these lines."""
     worst = max(float(np.max(error(*batch))) for batch in impact_batches())
     return Figure(worst, threshold, f"{sum(int(i.count.sum()) for *_, i in impact_batches()):,} impacts, N = 2 to 50")
 
 
 def restitution() -> Figure:
-    """Separation speed against e times closing speed."""
+    """Compare separation speeds with e times the closing speed."""
     worst, pairs = 0.0, 0
     for key in range(5):
         before, command = touching_lines(30 + key, 1_000_000, 2, heaviest_ratio=10.0**key)
@@ -206,26 +206,26 @@ def restitution() -> Figure:
 
 
 def gaps() -> Figure:
-    """Stored gaps against those that follow from the speeds."""
+    """Compare stored gaps with gaps computed from the speeds."""
     runs = [Watched(41 + N, 3_000 // N, N, drive=drive) for N in (2, 3, 5, 10) for drive in (False, True)]
     return Figure(max(run.worst for run in runs), GAP_M, f"{sum(run.checked for run in runs):,} steady steps")
 
 
 @cache
 def braking_runs() -> list[Watched]:
-    """Braking lines in short steps."""
+    """Return braking lines simulated in short steps."""
     return [Watched(51 + N, 3_000 // N, N, drive=False) for N in (2, 3, 5, 10)]
 
 
 def of_braking(count: Callable[[Watched], int]) -> Figure:
-    """How often something happens to them."""
+    """Return how often ``count`` finds something in the braking lines."""
     seen = sum(int((state.speeds_mps < 0).sum()) for run in braking_runs() for state in run.states)
     of = f"{len(braking_runs()) * 300:,} steps of 3,000 vehicles, {seen:,} negative speeds seen"
     return Figure(sum(map(count, braking_runs())), 0, of)
 
 
 def shares() -> Figure:
-    """Random harm and masses."""
+    """Check that harm shares of random harms and masses add up exactly."""
     draws, n = Draws(61), 2_000_000
     harm, mass = draws.uniform(0.0, 2_000.0, (n, 1)), 10.0 ** draws.uniform(-2.0, 4.0, (n, 2))
     both = split(harm, mass)
@@ -234,7 +234,7 @@ def shares() -> Figure:
 
 
 def ledgers() -> Figure:
-    """First-impact and total harm, to the last bit, over three segments."""
+    """Compare first-impact and total harm of the ledger with the impacts of three segments, bit for bit."""
     wrong, impacts_seen = 0, 0
     for N in (2, 3, 6, 20):
         book, first, total, count = booked(62, 60_000 // N, N)
@@ -253,7 +253,7 @@ SEGMENTS = {2: 10_000_000, 3: 1_000_000, 5: 500_000}
 
 @cache
 def scans() -> list[Scan]:
-    """The scans of all random segments."""
+    """Return the scans of all random segments."""
     found = []
     for N, n in SEGMENTS.items():
         rng = np.random.default_rng([71, N])
@@ -262,21 +262,23 @@ def scans() -> list[Scan]:
 
 
 def of_scans(kind: str) -> Figure:
-    """Contacts against the smallest value of each gap's closed form; the doubtful ones against exact arithmetic.
+    """Compare contacts with the smallest value of each gap's closed form, and doubtful ones with exact arithmetic.
 
-    What is wrong: time and closing speed of the first contact, or final gaps and speeds where there is none.
+    Time and closing speed of the first contact are compared, or final gaps and speeds if there is no contact.
     """
     pairs, contacts, in_doubt = (sum(getattr(s, name) for s in scans()) for name in ("pairs", "contacts", "in_doubt"))
     of = f"{pairs:,} random segments of pairs, {contacts:,} with contact, {in_doubt:,} decided by exact arithmetic"
     return Figure(sum(getattr(s, kind).size for s in scans()), 0, of)
 
 
-CASCADE = 100  # impacts of a world; between an obstacle and a line they come ever faster, and rounding multiplies
-OTHER_CASCADES = 1e-3  # share of worlds in which it may change the order of impacts after so many
+CASCADE = 100  # number of impacts of a world after which rounding may change their order
+OTHER_CASCADES = 1e-3  # largest share of worlds in which rounding may do so
 
 
 def run_difference(end: Worlds, found: Floats, k: int, line: Worlds, command: list[float]) -> float:
-    """Largest difference of world k from the exact run; infinite if the impacts are others, NaN if after a cascade.
+    """Return the largest difference of world k from the exact run.
+
+    It is infinite if other impacts happen, and NaN if this is so only after ``CASCADE`` impacts.
 
     ``found`` [impacts, 3]: pair, time, closing speed.
     """
@@ -292,7 +294,7 @@ def run_difference(end: Worlds, found: Floats, k: int, line: Worlds, command: li
 
 @cache
 def differences(obstacle: bool) -> tuple[Floats, int, int]:
-    """``run_difference`` of every world, and how many impacts there were, and how many with the obstacle."""
+    """Return ``run_difference`` of every world, the number of impacts, and the number of impacts with the obstacle."""
     worst, impacts_seen, with_it = [], 0, 0
     for N, n in (
         {2: 1_500, 3: 1_000, 5: 300, 10: 40}.items()
@@ -311,14 +313,17 @@ def differences(obstacle: bool) -> tuple[Floats, int, int]:
 
 
 def of_runs(obstacle: bool) -> Figure:
-    """Every impact's time and closing speed, in order, final gaps and speeds, after up to hundreds of events."""
+    """Compare whole runs with exact runs: time and closing speed of every impact, final gaps and speeds."""
     found, impacts_seen, with_it = differences(obstacle)
     of = f"{np.isfinite(found).sum():,} worlds, {impacts_seen:,} impacts of pairs, {with_it:,} with an obstacle"
     return Figure(float(np.nanmax(found)), EXACT_RUN, of)
 
 
 def law(key: int, counts: dict[int, int], obstacle: bool) -> Figure:
-    """Speeds after simultaneous impacts against the exact law, in so many touching lines of each number of vehicles."""
+    """Compare speeds after simultaneous impacts of touching lines with the exact law.
+
+    ``counts``: number of vehicles -> number of lines.
+    """
     worst = 0.0
     for (N, n), ratio in product(counts.items(), (1.0, 1e3)):
         before, command = touching_lines(key, n, N, heaviest_ratio=ratio)
@@ -330,7 +335,7 @@ def law(key: int, counts: dict[int, int], obstacle: bool) -> Figure:
 
 
 def resting() -> Figure:
-    """Accelerations of touching lines at rest, moving, and at a speed limit."""
+    """Compare accelerations of touching lines at rest, moving, and at a speed limit with exact ones."""
     draws, found = Draws(83), []
     for N, speed, _ in product((2, 3, 5, 10, 25, 50), (0.0, 4.0, 8.0), range(150)):
         command, mass = draws.uniform(-16.0, 16.0, (N,)), draws.uniform(0.5, 8.0, (N,))
@@ -343,13 +348,13 @@ def resting() -> Figure:
 
 
 def cascades() -> Figure:
-    """Worlds in which rounding changes the order of impacts, after so many of them and never before."""
+    """Return the share of worlds in which rounding changes the order of impacts after ``CASCADE`` impacts."""
     found, *_ = differences(obstacle=True)
     return Figure(float(np.isnan(found).mean()), OTHER_CASCADES, f"{found.size:,} worlds of 2 to 10 vehicles")
 
 
 def out_of_reach() -> Figure:
-    """The same lines without an obstacle, and with one that they never reach."""
+    """Compare lines without an obstacle and with an obstacle that they never reach."""
     n, changed = 20_000, 0
     for N in (2, 3, 5):
         worlds, command = driving_lines(185, n, N)
@@ -367,7 +372,10 @@ INSTANT_CHUNK = 10_000
 
 
 def unfinished(counts: dict[int, int], make: Callable[[int, int], Batch], until_s: float) -> int:
-    """How many worlds cannot be advanced, of so many for each number of vehicles, ``make(vehicles, chunk)`` at once."""
+    """Return how many worlds cannot be advanced.
+
+    ``counts``: number of vehicles -> number of worlds. ``make(vehicles, chunk)`` makes the worlds of a chunk.
+    """
     failed = 0
     for N, n in counts.items():
         for chunk in range(n // INSTANT_CHUNK):
@@ -380,7 +388,7 @@ def unfinished(counts: dict[int, int], make: Callable[[int, int], Batch], until_
 
 
 def joined_clusters() -> Figure:
-    """Touching lines at one speed but for the last digits, half of them against an obstacle."""
+    """Check touching lines with equal speeds except for the last digits, half of them at an obstacle."""
 
     def make(N: int, chunk: int) -> Batch:
         worlds = nearly_joined(1_000 * N + chunk, INSTANT_CHUNK, N, obstacle=chunk % 2 == 1)
@@ -391,7 +399,7 @@ def joined_clusters() -> Figure:
 
 
 def thrown() -> Figure:
-    """Whole runs of 6 s."""
+    """Check that whole runs of 6 s of lines thrown at an obstacle can be advanced."""
     failed = unfinished(THROWN, lambda N, chunk: thrown_lines(100_000 + 1_000 * N + chunk, INSTANT_CHUNK, N), HORIZON_S)
     return Figure(failed, 0, f"{sum(THROWN.values()):,} worlds of 2 to 50 vehicles, masses 0.05 to 100 t")
 
@@ -401,18 +409,21 @@ def thrown() -> Figure:
 
 @cache
 def splits() -> list[Split]:
-    """All split worlds."""
+    """Return worlds whose segment was split into parts."""
     return [split_errors(N, 60_000 // N, cuts, 91) for N in (2, 3, 5, 10, 20) for cuts in (2, 7, 80)]
 
 
 def splitting() -> Figure:
-    """Gaps, speeds and harm, relative to at least 100 m, 30 m/s, 900 m2/s2; up to 30 impacts."""
+    """Return the largest relative error of gaps, speeds and harm of split segments, for worlds with up to 30 impacts.
+
+    Errors are relative to at least 100 m, 30 m/s and 900 m2/s2.
+    """
     worst = max(float(s.error[s.few].max()) for s in splits() if s.few.any())
     return Figure(worst, SPLIT, f"{sum(int(s.few.sum()) for s in splits()):,} worlds in 2, 7 and 80 parts")
 
 
 def splitting_cascades() -> Figure:
-    """The same for worlds with more impacts; beside it what another last digit of the initial gaps changes in them."""
+    """Return the same error for worlds with more impacts, and the effect of the last digit of their gaps."""
     worst = max(float(s.error[~s.few].max()) for s in splits() if not s.few.all())
     digits = [last_digit_errors(N, 60_000 // N, 91) for N in (3, 5, 10, 20)]
     known = max(float(s.error[~s.few].max()) for s in digits)
@@ -423,7 +434,7 @@ def splitting_cascades() -> Figure:
 
 
 def origin() -> Figure:
-    """To the last bit; times on a grid of 2^-20 s."""
+    """Compare worlds with shifted times, bit for bit. Times are on a grid of 2^-20 s."""
     batch = driving_lines(92, 50_000, 4)
     v = batch.worlds.vehicles
     grid = replace(batch.worlds, vehicles=replace(v, latency_s=np.round(v.latency_s * 2**20) / 2**20))
@@ -443,7 +454,7 @@ def origin() -> Figure:
 
 
 def batches() -> Figure:
-    """One world alone, in any order, in one thread or two."""
+    """Compare worlds alone, in other orders, and in one or two threads, bit for bit."""
     n, changed = 20_000, 0
     batch = driving_lines(93, n, 3)
     whole = state_bytes(*once(batch))
@@ -469,7 +480,7 @@ def batches() -> Figure:
 
 
 def golden() -> Figure:
-    """``tests/golden/physics_worlds.json``."""
+    """Compare with ``tests/golden/physics_worlds.json``."""
     found = figures()
     return Figure(
         int(found != json.loads(GOLDEN.read_text("utf-8"))["all"]), 0, f"sha256 {str(found['sha256'])[:16]}..."
@@ -477,7 +488,7 @@ def golden() -> Figure:
 
 
 def bounces() -> Figure:
-    """Against the geometric sum of flights, for e from 0.05 to 0.99."""
+    """Compare series of bounces with the geometric sum of their flight times, for e from 0.05 to 0.99."""
     worst = 0.0
     for e in np.linspace(0.05, 0.99, 95):
         wall = replace(touching_lines(0, 1, 2).worlds, speeds_mps=np.array([[0.0, 8.0]]))
@@ -511,7 +522,7 @@ GATES: dict[str, Callable[[], Figure]] = {
     "restitution of pairs [eps of the larger speed]": restitution,
     "gap against its closed form, and below 0 [m]": gaps,
     "speeds below 0 that no bounce-back explains": lambda: of_braking(Watched.unexplained_negative_speeds),
-    "steps in which energy rose though nobody drives": lambda: of_braking(Watched.energy_rises),
+    "steps in which energy rose although no vehicle drives": lambda: of_braking(Watched.energy_rises),
     "harm shares that do not add up to the last bit": shares,
     "worlds whose ledger is not the sum of its rows": ledgers,
     "contacts missed": lambda: of_scans("missed"),

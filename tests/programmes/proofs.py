@@ -1,9 +1,9 @@
-"""Statements about the package's own code that a solver proves, and bugs with which each must be left unproven.
+"""Statements about the package's own code that a solver proves, and planted bugs that must break the proofs.
 
-Every statement is a function that raises ``AssertionError`` where the solver does not prove it. It is about real
-numbers, for all values that its assumptions allow. Compilation must be switched off (``NUMBA_DISABLE_JIT=1``), so that
-the functions run as Python: on symbols, along every path that their comparisons can take. What is proven of them is
-proven of the code; rounding is not part of it.
+Every statement is a function that raises ``AssertionError`` if the solver does not prove it. The statements are about
+real numbers, for all values that the assumptions allow; rounding is not covered. Compilation must be switched off
+(``NUMBA_DISABLE_JIT=1``): then the functions of the package run in Python, with symbols instead of numbers, along every
+path of their comparisons. So the proofs are about the code itself.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from tests.programmes import Cases, Given, Told
 
 # ---------------------------------------------------------------- symbolic execution
 
-PATIENCE_MS = 60_000  # of the solver, for one question
-_PATH: list[Path] = []  # the one that is being run
+PATIENCE_MS = 60_000  # time limit of the solver for one question
+_PATH: list[Path] = []  # the path that is being run
 
 
 class Path:
-    """One way through a function: what it has decided, and what is known along it."""
+    """One path through a function: its decisions, and the conditions that hold on it."""
 
     def __init__(self, known: list[Any], decided: list[bool]) -> None:
         self.known = list(known)
         self.decided = decided
         self.next = 0
-        self.left: list[list[bool]] = []  # other ways that branch off here
+        self.left: list[list[bool]] = []  # branches to be run later
         self.roots = 0
 
     def decide(self, condition: Any) -> bool:
-        """Whether a condition holds on this path; where both are possible, the other way is kept for later."""
+        """Return whether a condition holds on this path. If both are possible, store the other branch for later."""
         if self.next < len(self.decided):
             holds = self.decided[self.next]
         else:
@@ -60,7 +60,7 @@ class Path:
 
 
 class Condition:
-    """A comparison of symbols, which decides when it is asked."""
+    """A comparison of symbols, which is decided when its truth value is asked for."""
 
     def __init__(self, expression: Any) -> None:
         self.expression = expression
@@ -70,7 +70,7 @@ class Condition:
 
 
 class Symbol:
-    """A real number that is not known; infinity is above and minus infinity below every one."""
+    """An unknown real number. Plus infinity is above, and minus infinity below, every symbol."""
 
     def __init__(self, expression: Any) -> None:
         self.expression = expression
@@ -108,13 +108,13 @@ class Symbol:
 
 
 class SymbolicMath:
-    """What the package's functions ask of ``math``, for symbols."""
+    """The functions of ``math`` that the package uses, for symbols."""
 
     inf, nan = math.inf, math.nan
 
     @staticmethod
     def sqrt(value: Any) -> Symbol:
-        """The root: a new symbol, not negative, whose square is the value, which must not be negative here."""
+        """Return the root: a new symbol, at least 0, whose square is the value."""
         path, square = _PATH[-1], exact(value)
         if not holds_always(path.known, square >= 0):
             raise AssertionError(f"the root of what may be negative: {square}")
@@ -125,7 +125,7 @@ class SymbolicMath:
 
     @staticmethod
     def isnan(value: Any) -> bool:
-        """A symbol is a number."""
+        """Return False: a symbol is a number."""
         return not isinstance(value, Symbol) and math.isnan(value)
 
 
@@ -137,12 +137,12 @@ class Ended(NamedTuple):
 
 
 def is_infinite(value: Any) -> bool:
-    """Whether a value is no symbol, and infinite."""
+    """Return whether a value is a number and infinite, not a symbol."""
     return isinstance(value, float) and math.isinf(value)
 
 
 def exact(value: Any) -> Any:
-    """A symbol's expression; of a number its exact value."""
+    """Return the expression of a symbol, or the exact value of a number."""
     if isinstance(value, Symbol):
         return value.expression
     if isinstance(value, float | int):
@@ -152,12 +152,12 @@ def exact(value: Any) -> Any:
 
 
 def symbols(names: str) -> list[Symbol]:
-    """One symbol for each name."""
+    """Return one symbol per name."""
     return [Symbol(z3.Real(name)) for name in names.split()]
 
 
 def paths(function: Callable[[], Any], known: list[Any]) -> Iterator[Ended]:
-    """Every path through ``function``, under what is ``known`` of its symbols."""
+    """Yield every path through ``function`` under the conditions ``known``."""
     waiting: list[list[bool]] = [[]]
     while waiting:
         path = Path(known, waiting.pop())
@@ -171,7 +171,7 @@ def paths(function: Callable[[], Any], known: list[Any]) -> Iterator[Ended]:
 
 
 def possible(statements: list[Any]) -> bool:
-    """Whether they can hold together; what the solver cannot tell counts as possible."""
+    """Return whether all conditions can hold together. If the solver cannot decide, the answer is True."""
     solver = z3.Solver()
     solver.set("timeout", PATIENCE_MS)
     solver.add(*statements)
@@ -179,18 +179,18 @@ def possible(statements: list[Any]) -> bool:
 
 
 def holds_always(known: list[Any], statement: Any) -> bool:
-    """Whether a statement follows from what is known; what the solver cannot tell does not."""
+    """Return whether a statement follows from the known conditions; False if the solver cannot decide."""
     return not possible([*known, z3.Not(statement)])
 
 
 # ---------------------------------------------------------------- statements
 
-Statement = Callable[[], int]  # the number of paths it was proven along
+Statement = Callable[[], int]  # returns the number of paths
 STATEMENTS: dict[str, Statement] = {}
 
 BOUNCING, PLASTIC = 1.0, 0.01  # m/s, closing speeds above and below ``PLASTIC_SPEED_MPS``
-DECISIONS = ((0, 3), (2, 3), (2, 1))  # in the statements about the shield: how many were made, how many are left
-TEAM_DECISIONS = ((0, 2), (1, 1))  # ... about two shielded vehicles
+DECISIONS = ((0, 3), (2, 3), (2, 1))  # statements about the shield: decisions made, decisions left
+TEAM_DECISIONS = ((0, 2), (1, 1))  # the same for two shielded vehicles
 
 
 def states(text: str) -> Callable[[Statement], Statement]:
@@ -199,15 +199,13 @@ def states(text: str) -> Callable[[Statement], Statement]:
 
 
 def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
-    """Demand that a statement follows at the end of a path."""
+    """Raise ``AssertionError`` unless a statement follows at the end of a path."""
     assert holds_always([*end.known, *assumed], statement), f"not proven: {what}"
 
 
-@states(
-    "a pair's contact: found where its gap closes, never earlier, never missed; the closing speed there is the root"
-)
+@states("contact of a pair: found when the gap closes, never earlier, never missed, with the right closing speed")
 def contact() -> int:
-    """``events.contact`` against ``events.drift``, the gap as a function of time."""
+    """Check ``motion.contact`` against ``motion.drift``, the gap as a function of time."""
     gap, closing, pressing, when = symbols("gap closing pressing when")
     found = list(_run(motion, lambda: motion.contact(gap, closing, pressing), [exact(gap) >= 0]))
     after = exact(motion.drift(gap, closing, pressing, when))
@@ -225,9 +223,9 @@ def contact() -> int:
     return len(found)
 
 
-@states("a vehicle that brakes stands after v tau + v^2 / (2 a), and never drives backwards")
+@states("a braking vehicle stops after the distance v tau + v^2 / (2 a), and never moves backwards")
 def stopping() -> int:
-    """``events.solo_motion`` against ``events.stopping_distance``."""
+    """Check ``motion.solo_motion`` against the stopping distance."""
     speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
     known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
     found = list(_run(motion, lambda: motion.solo_motion(speed, -capacity, latency, limit, time), known))
@@ -245,7 +243,7 @@ def stopping() -> int:
 
 
 def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol], Symbol, list[Ended]]:
-    """Masses, speeds, restitution, and every path of one impact of so many touching vehicles; results: speeds after."""
+    """Return masses, speeds, restitution, and every path of an impact of touching vehicles; results are new speeds."""
     mass = symbols(" ".join(f"m{i}" for i in range(vehicles)))
     speed = symbols(" ".join(f"v{i}" for i in range(vehicles)))
     (restitution,) = symbols("e")
@@ -262,13 +260,13 @@ def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol],
 
 
 def _sum(*columns: list[Symbol]) -> Any:
-    """The sum over vehicles of the product of these."""
+    """Return the sum over vehicles of the product of these values."""
     return sum(math.prod((exact(x) for x in row), start=exact(1)) for row in zip(*columns, strict=True))
 
 
-@states("an impact of two: momentum is kept, they part with e times the closing speed, as in the paper's equation")
+@states("impact of two vehicles: momentum is conserved; they separate with e times the closing speed, as in the paper")
 def two() -> int:
-    """``impact.resolve_cluster`` of two vehicles, against Newton's law."""
+    """Check ``impact.resolve_cluster`` for two vehicles against Newton's law."""
     mass, speed, restitution, found = _cluster(2, BOUNCING)
     approaching = exact(speed[1]) > exact(speed[0])
     for end in found:
@@ -281,9 +279,9 @@ def two() -> int:
     return len(found)
 
 
-@states("an impact of two or three: momentum is kept, and just (1 - e^2) of the energy of what is pooled is lost")
+@states("impact of two or three vehicles: momentum is conserved, and the energy loss is (1 - e^2) of the plastic loss")
 def energy() -> int:
-    """The energy by an identity, from which the inequality follows: masses are positive and e is at most 1."""
+    """Prove the energy as an identity. The inequality follows, because masses are positive and e is at most 1."""
     count = 0
     for vehicles in (2, 3):
         mass, speed, restitution, found = _cluster(vehicles, BOUNCING)
@@ -297,9 +295,9 @@ def energy() -> int:
     return count
 
 
-@states("a plastic impact of two or three: momentum is kept, and no pair approaches any more")
+@states("plastic impact of two or three vehicles: momentum is conserved, and no pair approaches afterwards")
 def plastic() -> int:
-    """Below the plastic speed nobody bounces, and the line is in order afterwards."""
+    """Below the plastic speed no vehicle bounces, and afterwards no vehicle is faster than the vehicle ahead."""
     count = 0
     for vehicles in (2, 3):
         mass, speed, _, found = _cluster(vehicles, PLASTIC)
@@ -312,9 +310,9 @@ def plastic() -> int:
     return count
 
 
-@states("a free body's acceleration is the nearest to zero that its forces allow")
+@states("the acceleration of a free body is the value nearest to zero that its forces allow")
 def settling() -> int:
-    """``events.settle`` on any range of forces."""
+    """Check ``motion.settle`` for any range of forces."""
     low, high, other = symbols("low high other")
     found = list(_run(motion, lambda: motion.settle(low, high), [exact(low) <= exact(high)]))
     for end in found:
@@ -326,29 +324,29 @@ def settling() -> int:
 
 
 class _Line:
-    """A world as the shield sees it: what each action leads to, and the harm of each sequence of actions, unknown.
+    """A world as the shield sees it: the effects of actions and the harm of plans are unknown functions.
 
-    An action is one number for each of the shielded ``vehicles``. Of several, a step before the last ends nothing.
+    An action is one number per shielded vehicle. With several vehicles, only the last step can end the episode.
     """
 
     def __init__(self, made: int, left: int, vehicles: int = 1) -> None:
         number = z3.RealSort()
         self.made, self.goes_on = made, vehicles > 1 and left > 1
-        self.harm = z3.Function("harm", *[number] * (left * vehicles), number)  # of the whole episode
-        self.so_far = z3.Function("so_far", *[number] * vehicles, number)  # after the first action
-        self.going = z3.Function("going", *[number] * vehicles, z3.IntSort())  # after the first action: -1, 0 or 1
-        self.plan = np.array(  # of the whole episode
+        self.harm = z3.Function("harm", *[number] * (left * vehicles), number)  # whole episode
+        self.so_far = z3.Function("so_far", *[number] * vehicles, number)  # harm after the first action
+        self.going = z3.Function("going", *[number] * vehicles, z3.IntSort())  # -1 fails, 0 ends, 1 continues
+        self.plan = np.array(  # plan of the whole episode
             [symbols(" ".join(f"plan{k}_{c}" for c in range(vehicles))) for k in range(made + left)], object
         )
         self.proposed = symbols(" ".join(f"proposed{c}" for c in range(vehicles)))
         self.budget, self.certified = symbols("budget certified")
-        self.constants = np.array(  # more than are asked for on any path
+        self.constants = np.array(  # more than any path uses
             [symbols(" ".join(f"constant{k}_{c}" for c in range(vehicles))) for k in range(9)], object
         )
         self.fresh = 0
 
     def known(self) -> list[Any]:
-        """The invariant: the plan's harm is certified, and within the budget; its first step does not fail."""
+        """Return the invariant: the plan's harm is certified and within the budget, and its first step works."""
         plan, first = _exact(self.plan[self.made :]), _exact(self.plan[self.made])
         return [
             self.harm(*plan) == exact(self.certified),
@@ -359,8 +357,8 @@ class _Line:
         ]
 
     def take_steps(self, _: Any, __: Any, ___: Any, step: int, action: Any, after: Any, ____: Any) -> int:
-        """The step of one action: it fails, ends the episode, or leaves it going; the same each time it is asked."""
-        assert step == self.made, "another step is taken"
+        """Take the step of one action: it fails, ends the episode or continues it. Equal actions have equal effects."""
+        assert step == self.made, "a wrong step was taken"
         after[0] = np.array(action, object)
         going = self.going(*_exact(action))
         if self.goes_on:
@@ -370,25 +368,25 @@ class _Line:
         return 0 if Condition(going == 0) else 1
 
     def worst_so_far(self, _: Any, after: Any) -> Any:
-        """Harm after the action."""
+        """Return the harm after the action."""
         return Symbol(self.so_far(*_exact(after[0])))
 
     def worst_of_plan(self, _: Any, after: Any, __: Any, step: int, plan: Any, most: Any) -> Any:
-        """Harm of the action and then the plan; infinite above ``most``."""
-        assert step == self.made + 1, "the plan is followed from another step on"
+        """Return the harm of the action followed by the plan; infinite above ``most``."""
+        assert step == self.made + 1, "the plan is followed from a wrong step"
         harm = self.harm(*_exact(after[0]), *_exact(plan[step:]))
         if isinstance(most, float) and most == math.inf:
             return Symbol(harm)
         return Symbol(harm) if Condition(harm <= exact(most)) else math.inf
 
     def best_constant(self, *_: Any) -> tuple[int, Symbol]:
-        """Some constant, and what a search says of it, which need not be true."""
+        """Return some constant, and a harm that the search claims for it and that may be wrong."""
         self.fresh += 1
         (least,) = symbols(f"least{self.fresh}")
         return self.fresh - 1, least
 
     def better_plan(self, *given: Any) -> tuple[Any, Any]:
-        """What ``better_plan`` is proven to do for one vehicle: another plan where it is better, or nothing."""
+        """Follow the specification of ``better_plan`` for one vehicle: replace the plan only by a better one."""
         _, after, __, step, constants, value, most, plan, ___ = given
         constant, least = self.best_constant()
         rest = [_exact(constants[constant])] * (len(plan) - step)
@@ -401,30 +399,28 @@ class _Line:
 
 
 def _exact(actions: Any) -> list[Any]:
-    """The expressions of some actions."""
+    """Return the expressions of these actions."""
     return [exact(each) for each in np.ravel(actions)]
 
 
-@states(
-    "a decision of the step shield: what is applied and the plan after it have the bound, which is within the budget"
-)
+@states("a decision of the step shield: applied action and plan have the bound as harm, and it is within the budget")
 def decision() -> int:
-    """The induction step, of ``decide_world`` and ``better_plan`` themselves, for a proposal and for none.
+    """Prove the induction step for ``decide_world`` and ``better_plan``, with and without a proposal.
 
-    What the physics does is an unknown function of the actions: the same for the same actions, which is all it needs.
+    The physics is an unknown function of the actions: equal actions have equal effects. The proof needs nothing else.
     """
     return sum(_decided(_Line(*when), (usable,)) for usable, when in product((True, False), DECISIONS))
 
 
-@states("a decision about two shielded vehicles: the same of the vector of their actions, taken one after the other")
+@states("a decision about two shielded vehicles: the same statement for the vector of their actions")
 def decision_of_two() -> int:
-    """``decide_world`` for two vehicles, each with a proposal or with none; ``better_plan`` by what it is to do."""
+    """Prove ``decide_world`` for two vehicles; ``better_plan`` is replaced by its specification."""
     usable = product((True, False), repeat=2)
     return sum(_decided(_Line(*when, 2), both) for both, when in product(usable, TEAM_DECISIONS))
 
 
 def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
-    """Prove the induction step of a decision on which these vehicles propose a number; the number of paths."""
+    """Prove the induction step of a decision, and return the number of paths. ``usable``: who proposes a number."""
     vehicles, made = len(usable), line.made
 
     def decide() -> tuple[Any, Any, Any]:
@@ -444,9 +440,9 @@ def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
         assert good
         assert not is_infinite(out[0, 2]), "the bound is infinite"
         applied, bound = _exact(out[:, 0]), exact(out[0, 2])
-        assert all(exact(each).eq(bound) for each in out[:, 2]), "two vehicles are told two bounds"
+        assert all(exact(each).eq(bound) for each in out[:, 2]), "two vehicles get different bounds"
         prove(end, bound <= exact(line.budget), "the bound is within the budget")
-        assert all(a.eq(b) for a, b in zip(_exact(plan[made]), applied, strict=True)), "what is applied is not planned"
+        assert all(a.eq(b) for a, b in zip(_exact(plan[made]), applied, strict=True)), "the plan has another action"
         goes_on = z3.BoolVal(True) if line.goes_on else line.going(*applied) > 0
         rest = _exact(plan[made + 1 :])
         prove(end, line.harm(*applied, *rest) == bound, "the plan that is kept has the bound", goes_on)
@@ -455,7 +451,7 @@ def _decided(line: _Line, usable: tuple[bool, ...]) -> int:
 
 
 def _run(module: ModuleType, function: Callable[[], Any], known: list[Any], line: _Line | None = None) -> Any:
-    """The paths of a function of ``module``, with symbolic roots, and ``line`` in the place of the physics."""
+    """Yield the paths of a function of ``module``, with symbolic roots, and with ``line`` as the physics."""
     names = ("take_steps", "worst_so_far", "worst_of_plan", "best_constant") if line else ()
     if line and len(line.proposed) > 1:
         names = (*names, "better_plan")
@@ -467,7 +463,7 @@ def _run(module: ModuleType, function: Callable[[], Any], known: list[Any], line
 
 
 class Bug(NamedTuple):
-    """``old``, which stands in the function once, replaced by ``new``; and the statement that fails then."""
+    """Planted bug: ``old``, which must occur once in the function, becomes ``new``; then ``breaks`` must fail."""
 
     module: ModuleType
     function: str
@@ -555,21 +551,21 @@ BUGS = {
 
 
 def proven(statement: Statement) -> Told:
-    return Told(True, f"along {statement()} paths")
+    return Told(True, f"proven along {statement()} paths")
 
 
 def unproven(bug: Bug) -> Told:
-    """Whether the bug matters: its statement must not be proven any more."""
+    """Check that the statement is no longer proven with the bug."""
     source = inspect.getsource(getattr(bug.module, bug.function))
     times = source.count(bug.old)
-    assert times == 1, f"{bug.function}: {bug.old!r} stands there {times} times, not once"
+    assert times == 1, f"{bug.function}: {bug.old!r} occurs {times} times, not once"
     with mock.patch.object(bug.module, bug.function):
         exec(compile(source.replace(bug.old, bug.new), bug.function, "exec"), vars(bug.module))
         try:
             bug.breaks()
         except AssertionError as error:
             return Told(True, str(error))
-    return Told(False, "MISSED: its statement is proven all the same")
+    return Told(False, "MISSED: the statement is proven in spite of the bug")
 
 
 def cases(given: Given) -> Cases:

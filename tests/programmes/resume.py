@@ -1,4 +1,4 @@
-"""Resuming: processes that train are killed (-9) at random moments, and must lose nothing."""
+"""Resuming: training processes are killed (-9) at random moments, and must lose nothing."""
 
 import hashlib
 import multiprocessing
@@ -43,11 +43,11 @@ RECIPES: dict[str, eb.TrainingRecipe] = {
     "writing": SAC.replace(checkpoint_every_updates=5, total_steps=4000 * 16, evaluation=PPO.evaluation.model_dump()),
 }
 
-FORK = multiprocessing.get_context("fork")  # a fresh interpreter needs seconds; tests/learning kills some of those
+FORK = multiprocessing.get_context("fork")  # a new Python process needs seconds; tests/learning kills some of these
 
 
 def work(what: str, run: Path) -> None:
-    """Train from the beginning (``what`` names the recipe), or resume what is there."""
+    """Train from the beginning with the recipe ``what``, or resume the run if it exists."""
     if run.exists():
         resume(run)
     else:
@@ -56,20 +56,20 @@ def work(what: str, run: Path) -> None:
 
 
 def start(what: str, run: Path) -> ForkProcess:
-    """A process that does ``work``."""
+    """Start a process that runs ``work``."""
     process = FORK.Process(target=work, args=(what, run))
     process.start()
     return process
 
 
 def digest(run: Path) -> str:
-    """What a finished run says and holds: the weights of its policies, the best and the last."""
+    """Return a hash of the weights of a finished run: its best and its last policies."""
     weights = [file.read_bytes() for file in sorted(run.glob("policy*/**/weights.safetensors"))]
     return hashlib.sha256(b"".join(weights)).hexdigest()
 
 
 def finish(what: str, run: Path) -> str:
-    """Train or resume to the end, undisturbed."""
+    """Train or resume to the end without kills, and return the hash of the weights."""
     process = start(what, run)
     process.join()
     assert process.exitcode == 0, f"{run}: the process failed"
@@ -77,9 +77,10 @@ def finish(what: str, run: Path) -> str:
 
 
 def random_kills(what: str, kills: int, folder: Path, rng: random.Random) -> Told:
-    """How many of ``kills`` trainings, each killed at a random moment and resumed, end with the same weights.
+    """Kill ``kills`` trainings at random moments, resume them, and count those that end with the same weights.
 
-    Moments are even in the progress of the training, and a fraction of a second after it; every fourth is killed twice.
+    The moments are uniform in the progress of the training, plus a random fraction of a second. Every fourth training
+    is killed twice.
     """
     expected = finish(what, folder / "whole")
     rows = table_rows(folder / "whole")
@@ -100,22 +101,22 @@ def random_kills(what: str, kills: int, folder: Path, rng: random.Random) -> Tol
         good = (digest(run) if finished else finish(what, run)) == expected
         same += good
         print(f"  {what} {k}: killed at {', '.join(at)}: {'same' if good else 'OTHER WEIGHTS'}", flush=True)
-    return Told(same == kills, f"{same}/{kills} random kills end with the same weights")
+    return Told(same == kills, f"{same} of {kills} killed trainings end with the same weights")
 
 
 def table_rows(run: Path) -> int:
-    """Rows of the progress table."""
+    """Return the number of rows in the progress table."""
     table = run / "progress.csv"
     return table.read_text().count("\n") - 1 if table.is_file() else 0
 
 
 def newest(run: Path) -> str:
-    """The newest checkpoint of a run by name."""
+    """Return the name of the newest checkpoint of a run."""
     return max((path.name for path in run.glob("checkpoints/step_*")), default="the beginning")
 
 
 def torn_writes(kills: int, folder: Path, rng: random.Random) -> Told:
-    """How many of ``kills`` that hit the writing of a checkpoint leave one that can be used."""
+    """Kill ``kills`` trainings while they write a checkpoint, and count those that leave a usable checkpoint."""
     run, usable, hit = folder / "torn", 0, 0
     while hit < kills:
         process = start("writing", run)
@@ -128,13 +129,13 @@ def torn_writes(kills: int, folder: Path, rng: random.Random) -> Told:
         process.kill()
         process.join()
         if not list(run.glob("checkpoints/.ethbrake-*.partial")):
-            continue  # the write was over
+            continue  # the write was finished
         hit += 1
         state, damaged = newest_usable(run / "checkpoints")
         usable += state is not None
         where = "none" if state is None else state.steps
         print(f"  kill {hit} while writing: usable checkpoint at step {where}, {len(damaged)} damaged", flush=True)
-    return Told(usable == kills, f"{usable}/{kills} kills while writing leave a usable one")
+    return Told(usable == kills, f"{usable} of {kills} kills while writing leave a usable checkpoint")
 
 
 OPTIONS = {

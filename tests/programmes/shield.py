@@ -1,15 +1,15 @@
-"""Trying to break the step shield: no realised harm may be above the bound at the alert.
+"""Attacks on the step shield: the harm of an episode must not be above its bound at the alert.
 
 bound         random worlds against every adversary of ``tests/shield/attacks.py``, both counts, N = 3 and 5, e to 0.3
-build-up      the same with brakes that build up, at rates from 5 to 60 m/s3; and where others brake in pieces
-joint         teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5; harm must be the last bound
-pieces        the same where messages contain some pieces alone, every selection of them: the shield refuses, or holds
-interfaces    worlds through every shielded interface, alone and with a team
-interference  refused calls, exceptions and interrupts at random lines on every interface, and wrappers in between
-search        restarts of a search against the shield, and against twelve leaks of it, each of which must be found
-estimated      worlds that are corners of what was not received, and worlds from between them
-inside        worlds drawn from the inside of intervals, behind robust mode; corner mode beside it claims no such thing
-horizon       what a bound is worth beyond its horizon; nothing is claimed
+build-up      as bound, with brakes that build up at 5 to 60 m/s3, and with other vehicles that brake by profiles
+joint         teams of hostile learners at cooperation levels 3 and 4, N = 3 and 5; harm must equal the last bound
+pieces        as joint, with every selection of message pieces: the shield must refuse or keep its bound
+interfaces    worlds in every shielded interface, with one learner and with a team
+interference  refused calls, exceptions and interrupts at random lines in every interface, and wrappers in between
+search        restarts of a search against the shield, and against twelve planted leaks, each of which must be found
+estimated     true worlds that are corners of the unknown ranges, and true worlds inside the ranges
+inside        true worlds inside intervals, with robust mode; for corner mode the result is only reported
+horizon       harm after the horizon, which no bound covers; only reported
 """
 
 import time
@@ -44,18 +44,18 @@ from tests.shield.attacks import (
 )
 from tests.shield.plays import INSIDE as WRAPPED, PLAYS, WRAPPERS, Tally, disturbed, played, wrapped
 
-CHUNK = 2_000  # worlds attacked at once
-BATCH = 50_000  # worlds driven at once by what was applied
-CELLS = {3: 3.0, 5: 1.0}  # how many of the worlds each number of vehicles gets: lines of five take five times as long
-SLOW = {"worst_case": 0.14}  # and of those, a search in every step
+CHUNK = 2_000  # worlds attacked together
+BATCH = 50_000  # worlds simulated together with the applied actions
+CELLS = {3: 3.0, 5: 1.0}  # number of vehicles -> weight of its worlds; lines of five take five times as long
+SLOW = {"worst_case": 0.14}  # adversary -> factor of its weight; it searches at every step
 RATES = {"brake_rate_mps3": {"uniform": [5, 40]}, "release_rate_mps3": {"uniform": [5, 60]}}
-UNSURE = "brake_rate_mps3=20%"  # of every vehicle; the truth is a corner
+UNSURE = "brake_rate_mps3=20%"  # uncertainty of every vehicle; the true value is a corner
 ANY_RATE = {
     "brake_rate_mps3": {"loguniform": [2, 200]},
     "release_rate_mps3": {"loguniform": [2, 200]},
     "restitution": {"uniform": [0, 1]},
 }
-RATED = {  # scenarios in which brakes build up, and what is not known in them
+RATED = {  # scenarios with brakes that build up, and their uncertainty
     "12.65 m/s3": ("paper-random-buildup", "brake_rate_mps3=20%"),
     "2 to 200 m/s3": (
         load_scenario("paper-random").replace(**ANY_RATE),
@@ -66,22 +66,22 @@ RATED = {  # scenarios in which brakes build up, and what is not known in them
         "brake_rate_mps3=20%,release_rate_mps3=20%,braking_capacity_mps2=5%,speeds_mps=0.2",
     ),
 }
-TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # by what they cost
+TEAM_CELLS = {(3, 3): 5.0, (4, 3): 1.25, (3, 5): 1.0, (4, 5): 0.75}  # (level, N) -> weight of its worlds
 
 
 OPTIONS = {
-    "--worlds": {"type": int, "default": 1_000_000, "help": "of 'bound', all cells together, about"},
-    "--build-up-worlds": {"type": int, "default": 1_000_000, "help": "of 'build-up', all cells together, about"},
-    "--joint-worlds": {"type": int, "default": 300_000, "help": "of 'joint', all cells together, about"},
-    "--piece-decisions": {"type": int, "default": 100_000, "help": "of 'pieces', all teams together, at least"},
-    "--interface-worlds": {"type": int, "default": 2_000, "help": "through each interface"},
+    "--worlds": {"type": int, "default": 1_000_000, "help": "worlds of 'bound' in all, about"},
+    "--build-up-worlds": {"type": int, "default": 1_000_000, "help": "worlds of 'build-up' in all, about"},
+    "--joint-worlds": {"type": int, "default": 300_000, "help": "worlds of 'joint' in all, about"},
+    "--piece-decisions": {"type": int, "default": 100_000, "help": "decisions of 'pieces' in all, at least"},
+    "--interface-worlds": {"type": int, "default": 2_000, "help": "worlds of each interface"},
     "--interfered": {"type": int, "default": 1_000, "help": "episodes with failing calls on each interface"},
-    "--corner-worlds": {"type": int, "default": 60_000, "help": "of 'estimated'"},
-    "--range-worlds": {"type": int, "default": 1_200, "help": "of 'estimated', from between the corners"},
-    "--restarts": {"type": int, "default": 1_000, "help": "of the search"},
-    "--intervals": {"default": "gaps_m=0.5", "help": "of 'inside'"},
-    "--boxes": {"type": int, "default": 20, "help": "of 'inside'"},
-    "--draws": {"type": int, "default": 50_000, "help": "worlds out of each box"},
+    "--corner-worlds": {"type": int, "default": 60_000, "help": "worlds of 'estimated' at corners"},
+    "--range-worlds": {"type": int, "default": 1_200, "help": "worlds of 'estimated' inside the ranges"},
+    "--restarts": {"type": int, "default": 1_000, "help": "restarts of the search"},
+    "--intervals": {"default": "gaps_m=0.5", "help": "uncertainty of 'inside'"},
+    "--boxes": {"type": int, "default": 20, "help": "boxes of 'inside'"},
+    "--draws": {"type": int, "default": 50_000, "help": "worlds from each box"},
     "--seed": {"type": int, "default": 1},
 }
 
@@ -114,13 +114,13 @@ def cases(given: Given) -> Cases:
 
 
 def attacks(given: Given) -> Cases:
-    """Every adversary of one learner, and of teams, each with its share of the worlds; no two cases share a world."""
+    """Yield every adversary of one learner and of teams, each with its number of worlds. No two cases share a world."""
     one, rates, teams, draws = [], [], [], np.random.default_rng(given.seed)
     for N, count, name in product(CELLS, ("first", "total"), ADVERSARIES):
         case, share = {"harm_count": count, "adversary": ADVERSARIES[name]}, CELLS[N] * SLOW.get(name, 1.0)
         one.append((f"bound: N = {N}, {count}, {name}", share, line(N), case))
         rates.append((f"build-up: N = {N}, {count}, {name}", share, line(N).replace(**RATES), case))
-        if name != "worst_case":  # which looks for one world
+        if name != "worst_case":  # this adversary searches in one world
             unsure = {**case, "uncertain": (RobustShield, parse_uncertainty(UNSURE))}
             rates.append(
                 (f"build-up: {UNSURE}, N = {N}, {count}, {name}", 0.25 * share, line(N).replace(**RATES), unsure)
@@ -135,7 +135,7 @@ def attacks(given: Given) -> Cases:
         case = {"harm_count": count, "hostile": hostile, "adversary": TEAM_ADVERSARIES[name], "cap": cap}
         told = f"joint: level {which[0]}, N = {which[1]}, {count}, {hostile} hostile, {name}, cap {cap}"
         scenario = load_scenario(TEAMS[which])
-        if which[0] == 3 and k % 3 == 0:  # Vehicle 1 is no learner
+        if which[0] == 3 and k % 3 == 0:  # on level 3 Vehicle 1 is no learner
             told = told.replace("joint:", "joint: in pieces,")
             scenario = scenario.replace(roles={**scenario.roles, "vehicle_1": {"profile": [[0, 2], [0.4, 6], [1, 1]]}})
         teams.append((told, TEAM_CELLS[which], scenario, case))
@@ -149,7 +149,10 @@ def attacks(given: Given) -> Cases:
 
 
 def attacked(scenario: Any, worlds: int, first: int, seed: int, case: dict[str, Any]) -> Told:
-    """One adversary in some worlds. Of one learner rounding may exceed the bound; of a team harm is the last bound."""
+    """Run one adversary in some worlds.
+
+    With one learner, rounding may exceed the bound by a tolerance. With a team, harm must equal the last bound.
+    """
     found: list[Attack] = []
     for begin in range(first, first + worlds, CHUNK):
         sample = scenario.sample(min(CHUNK, first + worlds - begin), seed, first=begin).worlds
@@ -170,7 +173,7 @@ def attacked(scenario: Any, worlds: int, first: int, seed: int, case: dict[str, 
 
 
 def pieces(which: tuple[int, int], decisions: int, seed: int) -> Told:
-    """A team whose messages contain any selection of pieces, or lack one of one vehicle: refused, or attacked."""
+    """Attack a team for every selection of message pieces. The shield must refuse or keep its bound."""
     team = load_scenario(TEAMS[which])
     channel = team.v2x.model_dump(exclude_none=True)
     every = [list(some) for size in range(len(PIECES) + 1) for some in combinations(PIECES, size)]
@@ -208,7 +211,7 @@ def interface(name: str, worlds: int, seed: int) -> Told:
 
 
 def disturbance(name: str, episodes: int, seed: int) -> Told:
-    """Whatever fails: no episode above its bound, and the shield where the engine is."""
+    """Check that failing calls never lead to harm above the bound, and leave shield and engine in the same state."""
     found = disturbed(name, episodes, seed)
     good = (found.above, found.broken) == (0, 0) and found.refused > 0 and found.interrupted > 0
     return Told(
@@ -219,7 +222,7 @@ def disturbance(name: str, episodes: int, seed: int) -> Told:
 
 
 def in_between(wrapper: str, calls: int, seed: int) -> Told:
-    """Whatever stands in between, on every interface."""
+    """Check all interfaces with a wrapper between shield and environment."""
     tallies = [wrapped(name, wrapper, calls, seed) for name in WRAPPED]
     total = Tally(*(sum(column) for column in zip(*tallies, strict=True)))
     good = total.above == total.broken == 0 and all(each.episodes > 0 for each in tallies)
@@ -231,17 +234,17 @@ def in_between(wrapper: str, calls: int, seed: int) -> Told:
 
 
 def searched(restarts: int, seed: int, leak: Any = None, harm_count: str = "first") -> Told:
-    """The search against the shield, which must find nothing, or against a leak, which it must find."""
+    """Search against the shield, where nothing must be found, or against a planted leak, which must be found."""
     found = search(restarts, seed, leak, until_found=leak is not None, harm_count=harm_count)
     if leak is None:
         told = f"{found.restarts:,} restarts, {found.above} above the bound, largest excess {found.excess:.1e}"
-        return Told(found.above == 0, f"{told}; the same proposals without it: {found.loose:.0%} above")
+        return Told(found.above == 0, f"{told}; {found.loose:.0%} above with the same proposals without the shield")
     first = "NOT FOUND" if found.first is None else f"found in restart {found.first}"
     return Told(found.first is not None, f"{first}, largest excess {found.excess:.2g} m2/s2")
 
 
 def estimated(scenario: Any, way: str, worlds: int, seed: int, robust: str) -> Told:
-    """Where the world is a corner of what is not known, or anywhere in the ranges, whatever is proposed."""
+    """Check the bound if the true world is a corner or an inner point of the unknown ranges, for all proposals."""
     harm, bound, replaced = shielded(way, scenario, worlds, seed, robust=robust)
     above, kept = int((harm > bound + ABOVE).sum()), np.isfinite(bound)
     excess = float(np.maximum(harm - bound, 0.0)[kept].max(initial=0.0))
@@ -253,10 +256,10 @@ def estimated(scenario: Any, way: str, worlds: int, seed: int, robust: str) -> T
 
 
 def inside(robust: str, given: Given, scenario: Any = "paper-random", intervals: str = "") -> Told:
-    """Worlds out of boxes around worlds of a scenario, behind one robust shield to which ``coast`` is proposed.
+    """Check worlds from boxes around the worlds of a scenario, with one robust shield per box and the agent ``coast``.
 
-    What robust mode applies does not depend on which world of the box is the true one. So one shield decides for a box,
-    and many worlds of it are driven by what it applied.
+    The actions of robust mode do not depend on which world of the box is the true one. So one shield decides per box,
+    and many worlds of the box are simulated with its actions.
     """
     scenario, uncertainty = load_scenario(scenario), parse_uncertainty(intervals or given.intervals)
     boxes = given.boxes
@@ -286,4 +289,4 @@ def inside(robust: str, given: Given, scenario: Any = "paper-random", intervals:
 
 def beyond_horizon(proposer: str) -> Told:
     now, later = above_later(proposer, 2_000)
-    return Told(None, f"above the bound at 3 s: {now:.1%}, once all stand: {later:.1%}")
+    return Told(None, f"worlds above the bound at 3 s: {now:.1%}, when all vehicles are at rest: {later:.1%}")

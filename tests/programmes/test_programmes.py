@@ -158,9 +158,12 @@ def test_proofs__refuse_compiled_functions():
 @pytest.mark.parametrize(
     ("case", "fault"),
     [
-        (Case("x", ("nonsense",), lambda folder: (folder / "../../x").touch()), "left beside its folder: x"),
-        (Case("x", ("--version",), lambda folder: None), "was not refused"),
-        (Case("x", ("nonsense",), Path.resolve, reader=lambda: os.mkdir("/tmp/x-of-a-test")), "would have changed"),
+        (Case("x", ("nonsense",), lambda folder: (folder / "../../x").touch()), "left a file outside its folder: x"),
+        (Case("x", ("--version",), lambda folder: None), "the file was not refused"),
+        (
+            Case("x", ("nonsense",), Path.resolve, reader=lambda: os.mkdir("/tmp/x-of-a-test")),
+            "tried to change a file outside",
+        ),
         (Case("x", ("nonsense",), Path.resolve, reader=lambda: os.system("true")), "executed: os.system"),
         (Case("x", ("nonsense",), Path.resolve, reader=lambda: 1), "python: no error"),
         (Case("x", ("nonsense",), Path.resolve, reader=lambda: Path("new").touch()), "changed: inside/new"),
@@ -211,7 +214,7 @@ def test_mutants__are_code_of_as_many_lines_and_the_same_for_the_same_seed() -> 
 def test_licence__that_is_not_known_is_a_fault(licence: str, family: str) -> None:
     package = Package("mine", "1.0", "1.0", licence)
     assert (package.family or "") == family
-    assert package.fault == ("" if family else f"licence {licence!r} is none that is known")
+    assert package.fault == ("" if family else f"licence {licence!r} is unknown")
 
 
 def test_version__that_is_not_the_pinned_one_is_a_fault_but_not_its_local_part() -> None:

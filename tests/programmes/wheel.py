@@ -1,8 +1,8 @@
-"""The packages: wheel and sdist with the same bytes twice, and the wheel alone without torch.
+"""The packages: two builds of wheel and sdist give the same bytes, and the wheel works without torch.
 
-``built`` leaves wheel and sdist in ``--output``, if two builds have the same SHA-256. ``light`` installs the wheel in
-an empty environment, weighs it, and runs there what must do without torch; then the sdist in its place, which must
-bring the same files. ``make programme NAME=wheel ARGS="--only built"`` runs one of them.
+``built`` writes wheel and sdist to ``--output`` if two builds have the same SHA-256. ``light`` installs the wheel in an
+empty environment, checks its size, and runs the commands that must work without torch. Then it installs the sdist,
+which must install the same files. ``make programme NAME=wheel ARGS="--only built"`` runs only the first part.
 """
 
 import hashlib
@@ -19,12 +19,12 @@ from typing import NamedTuple
 from tests.programmes import ROOT, Cases, Given, Told, find_uv
 
 LIMIT_MB = 650
-NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # what an empty environment begins with
+NOT_OURS = ("pip", "setuptools", "pkg_resources", "wheel", "_distutils_hack")  # packages of an empty environment
 SHIPPED = "ppo,ppo+episode"
 NEEDS_TRAIN = "-m pip install 'ethbrake-marl[train]'"
 
 
-OPTIONS = {"--output": {"type": Path, "default": ROOT / "dist", "help": "folder of what is built"}}
+OPTIONS = {"--output": {"type": Path, "default": ROOT / "dist", "help": "folder for wheel and sdist"}}
 
 
 def cases(given: Given) -> Cases:
@@ -34,13 +34,13 @@ def cases(given: Given) -> Cases:
 
 
 def build(folder: Path) -> dict[str, bytes]:
-    """Build wheel and sdist into ``folder``, by uv; every file's content by its name."""
+    """Build wheel and sdist into ``folder`` with uv. Return the content of each file by name."""
     subprocess.run([find_uv(), "build", "--quiet", "--out-dir", str(folder), str(ROOT)], check=True)
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.suffix in (".whl", ".gz")}
 
 
 def built_twice(output: Path) -> Told:
-    """Build twice, compare, and keep the second."""
+    """Build twice, compare the builds, and save the second."""
     with tempfile.TemporaryDirectory(prefix="ethbrake-dist-") as first, tempfile.TemporaryDirectory() as second:
         files, again = build(Path(first)), build(Path(second))
     if files != again or len(files) != 2:
@@ -56,7 +56,7 @@ def built_twice(output: Path) -> Told:
 
 
 class Call(NamedTuple):
-    """A command in the environment, the status it must end with, and the end of what it then says on stderr."""
+    """A command in the environment, its expected exit status, and the expected end of its message on stderr."""
 
     arguments: tuple[str, ...]
     status: int = 0
@@ -78,28 +78,28 @@ COMMANDS = (
     Call(("ethbrake", "train", "--steps", "1000"), 2, NEEDS_TRAIN),
     Call(("ethbrake", "run"), 2, NEEDS_TRAIN),
     Call(("ethbrake", "agent", "export", "ppo", "--onnx", "ppo.onnx"), 2, "'ethbrake-marl[export]'"),
-    Call(("python", "-c", "import ethbrake_marl as eb; eb.train"), 1, NEEDS_TRAIN),  # an exception, whose end says it
+    Call(("python", "-c", "import ethbrake_marl as eb; eb.train"), 1, NEEDS_TRAIN),  # an exception ends with it
 )
-SMOKE = (COMMANDS[0], COMMANDS[1], COMMANDS[6], COMMANDS[7])  # of the sdist, whose files are the wheel's
+SMOKE = (COMMANDS[0], COMMANDS[1], COMMANDS[6], COMMANDS[7])  # for the sdist, which has the same files as the wheel
 INTERFACES = "eb.env(), eb.parallel_env(), eb.EthBrakeEnv(), eb.EthBrakeVectorEnv(4)"
 ABSENT = "assert not {'torch', 'stable_baselines3', 'tensorboard'} & set(sys.modules)"
 
 
 def readme_example() -> Call:
-    """The first Python program of the README."""
+    """Return the first Python program of the README as a call."""
     found = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.DOTALL)
     return Call(("python", "-c", found[1]))
 
 
 def calls() -> Iterator[Call]:
-    """Everything that is tried of the light core, in order."""
+    """Yield all commands that are tried with the light core, in order."""
     yield readme_example()
     yield Call(("python", "-W", "error", "-c", f"import sys, ethbrake_marl as eb; {INTERFACES}; {ABSENT}"))
     yield from COMMANDS
 
 
 def run(call: Call, environment: Path, folder: Path) -> Told:
-    """Run one command in an empty folder, and say how it ended."""
+    """Run one command in an empty folder, and check how it ends."""
     program, *arguments = call.arguments
     given = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_CACHE_DIR": str(folder / "cache")}
     given.pop("PYTHONPATH", None)
@@ -111,7 +111,7 @@ def run(call: Call, environment: Path, folder: Path) -> Told:
 
 
 def light(folder: Path) -> Cases:
-    """Install the wheel, weigh it, try everything; then the sdist."""
+    """Yield the cases: install the wheel, check its size, run all commands; then install the sdist."""
     there = folder / "environment"
     files: set[tuple[str, str]] = set()
 
@@ -135,7 +135,7 @@ def light(folder: Path) -> Cases:
 
 
 def install(environment: Path, file: Path) -> set[tuple[str, str]]:
-    """Install a wheel or sdist at the versions of constraints.txt; path and hash of each of its files."""
+    """Install a wheel or sdist at the versions of constraints.txt. Return path and hash of each of its files."""
     pip = [str(environment / "bin" / "python"), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
     constraints = ["-c", str(ROOT / "constraints.txt")]
     subprocess.run([*pip, *constraints, "--force-reinstall", "--no-deps", str(file)], check=True)
@@ -146,7 +146,7 @@ def install(environment: Path, file: Path) -> set[tuple[str, str]]:
 
 
 def installed_mb(environment: Path) -> float:
-    """Size of what was installed, 10^6 bytes: files of site-packages but those of an empty environment."""
+    """Return the size of the installed packages in MB (10^6 bytes), without those of an empty environment."""
     (packages,) = environment.glob("lib/python*/site-packages")
     parts = [part for part in packages.iterdir() if not part.name.startswith(NOT_OURS)]
     files = [file for part in parts for file in ([part] if part.is_file() else part.rglob("*"))]

@@ -236,7 +236,7 @@ def test_json_schema__a_number_is_in_range_exactly_where_the_reader_says_so(key:
         ("gaps_m: {uniform: [5, 10]}", "gaps_km: 0.007"),
         ("mass_t: [4.5, 5.5, 5.9]", "mass_t: [4.5, -5.5, 5.9]"),
         ("speeds_mps: {uniform: [18, 22]}", "speeds_mps: {uniform: [18, 45]}"),
-        ("\n# Every gap and every speed is drawn on its own.", "time_gaps_s: 1"),
+        ("\n# Every gap and every speed is drawn independently.", "time_gaps_s: 1"),
         ("speeds_mps: {uniform: [18, 22]}", "line_speed_mps: 39\nspeed_deviations_mps: {uniform: [-2, 2]}"),
     ],
 )

@@ -67,11 +67,11 @@ def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
 def test_clone__is_of_one_learner_of_a_dataset_and_says_which_drives(empty_folder: Path) -> None:
     Path("no.parquet").write_text("no")
     clone = load("../../train/clone")
-    with refused("no.parquet: is no dataset of `write_dataset`"):
+    with refused("no.parquet: must be a Parquet file from `write_dataset`"):
         clone.train(Path("no.parquet"), 0, Path("clone"))
     write_dataset("two.parquet", BRAKE, scenario=PAIR, episodes=1)
-    with refused("two.parquet: holds 2 learners, one is needed"):
+    with refused("two.parquet: has 2 learners; it must have one"):
         clone.train(Path("two.parquet"), 0, Path("clone"))
     Path("clone.py").write_text((DOCS.parent / "train" / "clone.py").read_text())
-    with refused("agent 'clone.py:make_agent': say which clone drives: train/clone.py:make_agent:runs/clone"):
+    with refused("agent 'clone.py:make_agent': give the clone's folder: train/clone.py:make_agent:runs/clone"):
         eb.make_agent("clone.py:make_agent", scenario=PAPER)
