@@ -287,7 +287,7 @@ def test_command__says_how_many_recordings_and_how_many_draws_were_refused(
     share = f"{rejected} of {200 + rejected} draws ({100 * rejected / (200 + rejected):.1f} %)"
     assert run_command(["scenario", "explain", "recorded.yaml"]) == 0
     told = in_one_line(capsys.readouterr().out)
-    assert f"is drawn again: {share}." in told
+    assert f"is rejected and drawn again: {share}." in told
     assert "one of 5 rows of a table of 5 recordings, by which intervals are: gap_1_m" in told
     assert run_command(["scenario", "validate", "recorded.yaml"]) == 0
     told = in_one_line(capsys.readouterr().out)

@@ -46,7 +46,7 @@ def front_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show how much harm each vehicle bears for many choices of whose harm counts.
+    """Show what each choice of whose harm counts costs each vehicle.
 
     For each choice of weights, the command searches every world for the least weighted harm. It compares the result
     with agents (one learner only), with full braking, and with maximin, which minimises the largest harm of a vehicle.

@@ -43,7 +43,7 @@ def reproduce_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Reproduce the paper's figures and tables, and compare them with the paper.
+    """Reproduce the paper's figures and tables, and compare them.
 
     An item is a figure or a table of the paper. The command prints how long the work takes, then makes each item. It
     writes one page (index.html), and for each item its figures, its data and a verdict: the results agree with the

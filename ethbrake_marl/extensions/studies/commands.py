@@ -36,7 +36,7 @@ ClusterOption = Annotated[
 study_group = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
-    help="Train and compare many policies; search for the worst worlds of an agent.",
+    help="Compare many policies; search for an agent's worst worlds.",
     epilog=example("study sweep sweep.yaml --output runs/sweep", "study ablate --quick --output runs/ablation-quick"),
 )
 
@@ -114,7 +114,7 @@ def tune_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search for the settings of a recipe whose trained policy does the least harm.
+    """Search for the best settings of a training recipe.
 
     The harm of a trial is measured on the list of worlds in the file. After an interruption, the same command
     continues: finished trials are not trained again, and unfinished trials continue. The exit status is 1 if no trial
@@ -227,7 +227,7 @@ def falsify_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search the ranges of a scenario for the worlds in which an agent does worst.
+    """Search a scenario for the worlds in which an agent does worst.
 
     --measure sets the score of a world. harm: the agent's harm. regret: the agent's harm minus the harm of --against,
     by default the best known profile. difference: the absolute difference between these two harms. bound: the agent's
@@ -255,7 +255,7 @@ def falsify_command(
             return
         agent, measure, scenario = agent or "universal", measure or "regret", scenario or "paper-random"
         budget, seed, keep = 4000 if budget is None else budget, seed or 0, keep or 20
-        out.check(output, ".yaml", ".yml", what="a file of worlds")
+        out.check(output, ".yaml", ".yml", what="worlds")
         task = read_task(scenario, settings)
         chosen = task.scenario
         measured_by = Measure.of(measure, agent, against, chosen, task.harm_count)
