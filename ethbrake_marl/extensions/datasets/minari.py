@@ -1,7 +1,8 @@
-"""Write the episodes of one learner as a Minari dataset.
+"""Write recorded episodes as a Minari dataset or a Parquet file.
 
-``dataset.recover_environment()`` makes the environment, and the recorded actions replay in it bit for bit. To restore
-the world of an episode: ``env.reset(seed=seed, options=options)`` with the episode's ``seed`` and ``options``.
+``dataset.recover_environment()`` of a Minari dataset makes the environment, in which the recorded actions repeat the
+episodes bit for bit. ``env.reset(seed=seed, options=options)`` starts the world of an episode, with the ``seed`` and
+``options`` in the metadata of the episode.
 """
 
 from __future__ import annotations
@@ -57,17 +58,17 @@ _DATASET_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_-]*-v\d+")
 def check_folder(path: Path, *, force: bool = False) -> None:
     """Check, before any work, that a Minari dataset can be written to the folder ``path``.
 
-    ``force``: a dataset that exists there may be replaced. Raises ``AlreadyExists`` if ``path`` exists and ``force`` is
-    off. Raises ``InvalidInput`` if the name is not ``NAME-vNUMBER``, if the parent is missing or cannot be written, or
-    if ``force`` would replace something other than a Minari dataset.
+    If ``force`` is true, an existing dataset may be replaced. Raises ``AlreadyExists`` if ``path`` exists and ``force``
+    is false. Raises ``InvalidInput`` if the name does not have the form ``NAME-vNUMBER``, if the parent folder is
+    missing or not writable, or if the existing folder is not a Minari dataset.
     """
     if _DATASET_NAME.fullmatch(path.name) is None:
-        raise InvalidInput(f"{path}: a dataset of Minari is a folder called NAME-vNUMBER, for instance brakes-v0")
+        raise InvalidInput(f"{path}: the folder of a Minari dataset must be named NAME-vNUMBER, for instance brakes-v0")
     if path.is_symlink() or path.exists():
         if not force:
             raise AlreadyExists(f"{path}: is there already; give another name or use force (--force)")
         if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
-            raise InvalidInput(f"{path}: is no dataset of Minari, and is not replaced; give another name")
+            raise InvalidInput(f"{path}: is not a Minari dataset, so force does not replace it; give another name")
     if not path.parent.is_dir():
         raise InvalidInput(f"{path}: there is no folder {path.parent}; make it first")
     try:
@@ -80,18 +81,17 @@ def check_folder(path: Path, *, force: bool = False) -> None:
 def minari_folder(
     path: Path, task: Task, told: Mapping[str, Any], *, force: bool
 ) -> Iterator[Callable[[Recording], None]]:
-    """Context manager: open a new Minari dataset, and yield the function that adds a recording to it.
+    """Context manager that opens a new Minari dataset, and yields a function that adds a recording to the dataset.
 
-    The folder appears at ``path`` only when the block ends without an exception.
+    The folder is created at ``path`` when the block ends without an exception. Raises ``MissingExtra`` if minari or
+    h5py is not installed.
 
     Args:
-        path: the folder, called ``NAME-vNUMBER``.
+        path: path of the folder, named ``NAME-vNUMBER``.
         task: scenario, seed, reward and observation of the recordings.
-        told: metadata (``tell``), stored as JSON under the key ``ethbrake_marl``. It is read when the block ends, so
-            entries may be added until then.
-        force: replace an existing dataset.
-
-    Raises ``MissingExtra`` without minari or h5py.
+        told: metadata (result of ``tell``), stored as JSON under the key ``ethbrake_marl`` at the end of the block.
+            Entries may be added in the block.
+        force: whether an existing dataset is replaced.
 
     """
     with naming_extras():
@@ -128,13 +128,16 @@ def minari_folder(
 
 
 def env_spec(task: Task) -> EnvSpec:
-    """Return the Gymnasium spec from which ``gymnasium.make`` makes the environment of a recording's task.
+    """Return the Gymnasium spec from which ``gymnasium.make`` makes the environment of a recording.
 
-    The spec holds plain data only, so it survives JSON. Raises ``InvalidInput`` unless exactly one vehicle learns.
+    The spec contains only plain data, so it can be stored as JSON. Raises ``InvalidInput`` unless the scenario has
+    exactly one learner.
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
     check_one_learner(
-        task.scenario.name, names, "a dataset of Minari is one learner's; give the others a script, or write Parquet"
+        task.scenario.name,
+        names,
+        "a Minari dataset has one learner; give the other learners a script, or write a Parquet file",
     )
     spec = copy.deepcopy(gymnasium.spec("EthBrake-v0"))
     spec.kwargs = {"scenario": task.scenario.declared(), "reward": task.reward.model_dump(mode="json")}
@@ -162,7 +165,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """Return the infos that the environment gives to ``vehicle`` (0 = front), by name, each [T + 1, n, ...]."""
+    """Return the infos of the environment for ``vehicle`` (0 = front): an array [T + 1, n, ...] for each name."""
     infos = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -187,16 +190,16 @@ _NEEDED_PACKAGES: dict[DatasetFormat, tuple[str, ...]] = {"parquet": ("pyarrow",
 
 @dataclass(frozen=True, slots=True)
 class DatasetSummary:
-    """What ``write_dataset`` wrote: the file, its format, and numbers of episodes and decisions."""
+    """Summary of a dataset that ``write_dataset`` has written."""
 
-    path: Path  # the file or folder
+    path: Path  # path of the file or folder
     format: DatasetFormat  # ``parquet`` or ``minari``
-    episodes: Mapping[str, int]  # agent's name -> number of recorded episodes
+    episodes: Mapping[str, int]  # number of recorded episodes, by name of the agent
     decisions: int  # number of decisions in all episodes of all agents
-    # Agent's name -> largest difference (m2/s2) in a world between the harm of the recorded episode, whose actions are
-    # rounded to float32, and the harm with the agent's exact commands.
+    # Largest difference, by name of the agent, between the harm of a recorded episode, whose actions are rounded to
+    # float32, and the harm with the agent's exact commands (m2/s2).
     off_by: Mapping[str, float]
-    left_out: tuple[LeftOut, ...]  # worlds that were not recorded, because the physics could not advance them
+    left_out: tuple[LeftOut, ...]  # worlds that were not recorded, because the physics could not simulate them
 
 
 def write_dataset(
@@ -212,26 +215,25 @@ def write_dataset(
     force: bool = False,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> DatasetSummary:
-    """Record agents in the same worlds of an evaluation list, as a Parquet file or a Minari dataset.
+    """Let agents drive the first worlds of a list, and write their episodes as a Parquet file or a Minari dataset.
 
-    An environment that takes the recorded actions repeats the episodes bit for bit.
-    docs/extensions/datasets.md describes the content.
+    An environment that receives the recorded actions repeats the episodes bit for bit. docs/extensions/datasets.md
+    describes the content. Before the work begins, the function raises ``InvalidInput`` for an invalid argument,
+    ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a library is not installed. It
+    raises ``PhysicsError`` if the physics can simulate no world of the list.
 
     Args:
-        path: the file (``.parquet``) or the folder (``NAME-v0``) to write.
-        agents: agent specs as on the command line, or a mapping from name to agent or team. They control the scenario's
-            learners. They are not changed.
-        scenario: the scenario, its name or its path.
-        episodes: number of worlds, from the first one of the list.
+        path: file (``.parquet``) or folder (``NAME-v0``) to write.
+        agents: agent specs as on the command line, or a mapping from names to agents or teams. The agents drive the
+            learners of the scenario. They are not changed.
+        scenario: scenario, or its name or path.
+        episodes: number of worlds, from the first world of the list on.
         seed: seed of the list of worlds.
-        format: ``parquet`` or ``minari``; None: chosen by the ending of ``path``.
-        reward: the reward to record.
-        observation: the observation to record; None: ``observation_for(scenario)``.
-        force: replace an existing dataset.
-        on_progress: called with the name of an agent and the number of its worlds done so far.
-
-    Raises ``InvalidInput``, ``AlreadyExists`` and ``MissingExtra`` before the work begins, and ``PhysicsError`` if no
-    world could be recorded.
+        format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
+        reward: reward to record.
+        observation: observation to record; None: ``observation_for(scenario)``.
+        force: whether an existing dataset is replaced.
+        on_progress: function that is called with the name of an agent and the number of worlds recorded so far.
 
     """
     check_whole_number("write_dataset: episodes", episodes, 1)
@@ -240,7 +242,7 @@ def write_dataset(
     if isinstance(agents, Sequence):
         agents = make_lineup(agents, scenario)
     if not agents:
-        raise InvalidInput("write_dataset: no agents given; at least one is needed, for instance full_brake")
+        raise InvalidInput("write_dataset: there are no agents; give at least one agent, for instance full_brake")
     chosen = check_dataset(path, scenario, format, force=force)
     spec = observation_for(scenario) if observation is None else choose_observation(observation)
     task = Task(scenario, int(seed), reward_params(reward), spec)
@@ -282,8 +284,14 @@ def check_dataset(
 ) -> DatasetFormat:
     """Check that a dataset of this scenario can be written to ``path``, and return its format.
 
-    ``format`` None: chosen by the ending of ``path``. ``force``: an existing dataset may be replaced. Raises the
-    exceptions that ``write_dataset`` raises before its work begins.
+    Raises the exceptions that ``write_dataset`` raises before its work begins.
+
+    Args:
+        path: file or folder to write.
+        scenario: scenario whose learners are recorded.
+        format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
+        force: whether an existing dataset may be replaced.
+
     """
     target = Path(path)
     is_file = target.suffix.lower() == ".parquet"
@@ -292,7 +300,7 @@ def check_dataset(
         raise unknown_name("format", chosen, get_args(DatasetFormat))
     if is_file != (chosen == "parquet"):
         right = "a file ending in .parquet" if chosen == "parquet" else "a folder called NAME-vNUMBER"
-        raise InvalidInput(f"{target}: the format {chosen} is written to {right}")
+        raise InvalidInput(f"{target}: a dataset in the format {chosen} is {right}; give such a name")
     for package in _NEEDED_PACKAGES[chosen]:
         need(package)
     if not scenario.learners:
@@ -312,7 +320,7 @@ def tell(task: Task, agents: Mapping[str, Driver], episodes: int) -> dict[str, A
 
     Args:
         task: scenario, seed, reward and observation of the recordings.
-        agents: recorded agents by name.
+        agents: recorded agents, by name.
         episodes: number of worlds that each agent drives.
 
     """

@@ -1,4 +1,4 @@
-"""Write episodes as a Parquet file: one row per agent, world and decision; one row group per batch of worlds."""
+"""Write episodes as a Parquet file, with one row per agent, world and decision."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ethbrake_marl.errors import naming_extras
 from ethbrake_marl.extensions.datasets.recording import Recording
 from ethbrake_marl.files.sheet import parquet_file
 
-KEY = "ethbrake_marl"  # key in the file's metadata whose value describes the recording, as JSON
+KEY = "ethbrake_marl"  # key in the metadata of the file; its value describes the recording as JSON
 
 Columns = dict[str, NDArray[Any]]
 
@@ -24,16 +24,15 @@ OF_STEPS = ("reward", "terminated", "truncated")
 
 @contextmanager
 def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[Recording], None]]:
-    """Context manager: open a new Parquet file, and yield the function that adds a recording to it.
+    """Context manager that opens a new Parquet file, and yields a function that adds a recording to the file.
 
-    The file appears at ``path`` only when the block ends without an exception.
+    The file is created at ``path`` when the block ends without an exception. Raises ``MissingExtra`` if pyarrow is not
+    installed.
 
     Args:
-        path: the file.
-        told: metadata (``tell``), stored as JSON under the key ``ethbrake_marl``. It is read when the block ends, so
-            entries may be added until then.
-
-    Raises ``MissingExtra`` without pyarrow.
+        path: path of the file.
+        told: metadata (result of ``tell``), stored as JSON under the key ``ethbrake_marl`` at the end of the block.
+            Entries may be added in the block.
 
     """
     with naming_extras():
@@ -49,19 +48,19 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 
 
 def decision_columns(recording: Recording) -> Columns:
-    """Return a recording as table columns by name, one row per decision, world by world.
+    """Return the columns of the table for a recording, by name. Each row is one decision, ordered by world.
 
-    docs/extensions/datasets.md lists the columns.
+    docs/extensions/datasets.md describes the columns.
     """
     running = recording.running
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Return values [T or T + 1, n, ...] as one row per decision that was made, world by world."""
+        """Return ``values`` [T or T + 1, n, ...] with one row per decision before the end of an episode."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """Return ``values`` [n], one per episode, repeated in every row (decision) of the episode."""
+        """Return ``values`` [n], which have one value per episode, repeated for every decision of the episode."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

@@ -1,11 +1,11 @@
-"""Record episodes as a learner of the environment would experience them, with an agent's actions.
+"""Record episodes in which an agent's commands are replaced by the actions of a learner in the environment.
 
-In an evaluation an agent's commands (float64, m/s2) are applied unchanged. A learner's action is a float32 in [-1, 1],
-and most commands have no exact float32 action. Recording therefore takes two episodes: the agent controls the first,
-its commands are rounded to actions, and the second plays these actions from the alert. The second episode is recorded,
-so its actions replay bit for bit. At the edge of an impact the last bit decides whether the impact happens. So if the
-nearest action changes a world's harm, rounding down and rounding up are tried too, and each world keeps the rounding
-whose harm is nearest to that of the commands.
+An agent's commands are float64 numbers in m/s2. A learner's action is a float32 number in [-1, 1], so most commands
+have no exact action. Recording therefore simulates each world twice. In the first episode, the agent drives, and its
+commands are rounded to actions. In the second episode, the learners take these actions. The second episode is recorded,
+so an environment repeats it bit for bit. If two vehicles almost miss each other, the last bit of an action can decide
+whether they have an impact. Therefore, if rounding to the nearest action changes the harm of a world, rounding down and
+rounding up are tried, too. Each world keeps the rounding that changes its harm least.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from ethbrake_marl.scenario.schema import Scenario
 
 Float32s = NDArray[np.float32]
 
-SLACK = 1e-6  # m2/s2; no other rounding is tried for a smaller difference of harm
+SLACK = 1e-6  # m2/s2; if rounding to the nearest action changes harm by less, no other rounding is tried
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What is recorded: scenario, seed of the worlds, reward and observation."""
+    """Settings of a recording: scenario, seed of the worlds, reward and observation."""
 
-    scenario: Scenario  # scenario of the worlds, whose learners are recorded
+    scenario: Scenario  # scenario of the worlds; its learners are recorded
     seed: int  # seed from which the worlds are drawn
     reward: RewardParams  # reward that the learners receive
     observation: ObservationSpec  # features that each learner observes
@@ -51,22 +51,22 @@ class Task:
 class Recording:
     """Recorded episodes of ``n`` worlds.
 
-    ``T`` is the number of decisions in the longest episode, ``L`` the number of learners, ``F`` the number of observed
-    features. Values after the end of an episode are meaningless.
+    In the shapes, ``T`` is the number of decisions in the longest episode, ``L`` the number of learners, and ``F`` the
+    number of observed features. Values after the end of an episode have no meaning.
     """
 
     agent: str  # name of the agent
     task: Task  # scenario, seed, reward and observation
     index: Ints  # [n] number of each world in the list of the seed
     decisions: Ints  # [n] number of decisions of each episode
-    observations: Float32s  # [T + 1, n, L, F] observations at each decision, then at the end of the episode
+    observations: Float32s  # [T + 1, n, L, F] observations at each decision and at the end of the episode
     actions: Float32s  # [T, n, L] actions in [-1, 1]
     steps: tuple[Step, ...]  # T results of ``Engine.step``, with rewards and ends of episodes
-    reports: tuple[Report, ...]  # T + 1 sets of infos; ``reports[t + 1]`` is after step t, ``reports[0]`` at the alert
+    reports: tuple[Report, ...]  # T + 1 reports of infos: ``reports[0]`` at the alert, ``reports[t + 1]`` after step t
     positions_m: Floats  # [T + 1, n, N] positions of the front bumpers; Vehicle 1 is at 0 at the alert
     speeds_mps: Floats  # [T + 1, n, N] speeds
     ledger: Ledger  # harm of all impacts of each episode
-    off_by: float  # largest change of a world's harm because commands were rounded to float32 actions (m2/s2)
+    off_by: float  # largest change of a world's harm by rounding the commands to float32 actions (m2/s2)
 
     @property
     def learners(self) -> tuple[int, ...]:
@@ -75,18 +75,18 @@ class Recording:
 
     @cached_property
     def running(self) -> Bools:
-        """Whether each decision was made before the end of its episode, [n, T] bool."""
+        """True for decisions before the end of the episode, [n, T]."""
         mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
         return mask
 
     def told(self, column: str) -> Floats:
-        """Return the column of the environment's infos with this name, such as ``time_s``, [T + 1, n, N]."""
+        """Return the values of the info with the name ``column``, such as ``time_s``, [T + 1, n, N]."""
         return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
-        """Return each term of the reward, without its weight, by name: [T + 1, n, L].
+        """Return the values of each term of the reward, without its weight: an array [T + 1, n, L] for each name.
 
-        Entry t + 1 belongs to step t; entry 0 is 0.
+        The values with index t + 1 belong to step t. The values with index 0 are 0.
         """
         shape = (len(self.index), self.task.scenario.vehicles)
         terms = {}
@@ -98,17 +98,16 @@ class Recording:
 
 
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
-    """Let an agent control the scenario's learners in these worlds, and record the episodes.
+    """Let an agent drive the learners of the scenario, and record the episodes with the rounded actions.
 
-    The agent's commands are rounded to float32 actions; the recorded episodes are those with the rounded actions.
+    The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. Raises
+    ``PhysicsError`` with the worlds that the physics cannot simulate, and the exceptions of ``episode_engine``.
 
     Args:
-        sample: the worlds at the alert.
-        driver: agent or team.
+        sample: worlds at the alert.
+        driver: agent or team that drives.
         name: name of the agent in the recording.
-        task: scenario, seed, reward and observation to record.
-
-    Raises ``PhysicsError`` with the worlds that could not be advanced, and whatever ``episode_engine`` raises.
+        task: scenario, seed, reward and observation of the recording.
 
     """
     scenario, learners = task.scenario, task.scenario.learners
@@ -146,15 +145,15 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 
 
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
-    """Round commands to float32 actions so that harm changes least.
+    """Round commands to float32 actions such that the harm changes least.
+
+    Returns the rounded actions, [T, n, L], and the change of the harm of each world, [n] m2/s2.
 
     Args:
-        commanded: [T, n, L] commands as exact actions in [-1, 1] (float64).
-        worlds: the worlds at the alert.
+        commanded: commands as exact actions in [-1, 1] (float64), [T, n, L].
+        worlds: worlds at the alert, [n].
         evaluated: harm of the episodes with the exact commands.
-        task: scenario, seed, reward and observation.
-
-    Returns the rounded actions [T, n, L], and how much they change the harm of each world, [n] m2/s2.
+        task: scenario, seed, reward and observation of the recording.
 
     """
     nearest = commanded.astype(np.float32)
@@ -171,9 +170,9 @@ def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -
 
 
 def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
-    """Return how much these actions [T, n, L] change the ``evaluated`` harm of each world, [n] m2/s2.
+    """Return the difference between the harm with ``actions`` [T, n, L] and the harm ``evaluated``, [n] m2/s2.
 
-    It is the larger change of first-impact and total harm.
+    The result is the larger one of the differences in first-impact harm and total harm.
     """
     engine = _learners_engine(worlds, task)
     step = 0
@@ -187,9 +186,9 @@ def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) ->
 
 
 def _learners_engine(worlds: Worlds, task: Task) -> Engine:
-    """Return an engine at the alert of ``worlds`` in which the learners take actions, as in an environment.
+    """Return an engine in which learners take actions, as in an environment. The engine is at the alert of ``worlds``.
 
-    Scenario, reward, observation and seed are those of ``task``.
+    ``task`` holds the scenario, reward, observation and seed of the engine.
     """
     engine = Engine(
         task.scenario,

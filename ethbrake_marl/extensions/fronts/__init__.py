@@ -1,1 +1,1 @@
-"""Fronts of harm: what each choice of whose harm counts costs whom; the command ``study front``."""
+"""The command ``study front``: harm of each vehicle for many choices of whose harm counts."""

@@ -1,4 +1,4 @@
-"""The command ``study front``: whose harm counts, over many sets of weights."""
+"""The command ``study front``: minimise the weighted harm of the vehicles for many choices of the weights."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.extensions.studies.commands import FolderOption
 from ethbrake_marl.registry import Part
 
-DEFAULT_AGENTS = "e_v2x_bm,universal"  # beside the front of one learner
+DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner
 
 
 def front_command(
@@ -25,29 +25,34 @@ def front_command(
         str | None,
         typer.Option(
             metavar="A,B,...",
-            help="Agents to show beside the front.",
-            show_default="of one learner e_v2x_bm, universal",
+            help="Agents to compare with the front.",
+            show_default="e_v2x_bm,universal with one learner, else none",
         ),
     ] = None,
     weights: Annotated[
         list[str] | None,
-        typer.Option(metavar="W1,W2,...", help="One weight per vehicle. Repeatable.", show_default="a grid"),
+        typer.Option(
+            metavar="W1,W2,...", help="One weight per vehicle. May be given several times.", show_default="a grid"
+        ),
     ] = None,
-    steps: Annotated[int, typer.Option(help="Steps along an edge of the grid of weights.", min=1, max=50)] = 5,
+    steps: Annotated[
+        int, typer.Option(help="Number of steps between the weights 0 and 1 in the grid.", min=1, max=50)
+    ] = 5,
     episodes: Annotated[int, typer.Option(help="Number of worlds.", min=2)] = 500,
     seed: Annotated[int, typer.Option(help="Seed of the evaluation list.", min=0)] = 7,
-    budget: Annotated[int, typer.Option(help="Candidates per world and set of weights.", min=1)] = 3000,
+    budget: Annotated[int, typer.Option(help="Number of candidates per world and choice of weights.", min=1)] = 3000,
     settings: SettingsOption = None,
     jobs: JobsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what each choice of whose harm counts costs whom.
+    """Show how much harm each vehicle bears for many choices of whose harm counts.
 
-    Searches every world for the least weighted harm, for each set of weights, and drives the agents beside it (one
-    learner only). Without --weights these are a grid, equal weights, and corners, in which one vehicle counts first and
-    the others only between equals. Beside the front stand full braking, and maximin: the least harm of whoever bears
-    most. Writes front.json, front.png and, for three vehicles, front-ternary.png.
+    For each choice of weights, the command searches every world for the least weighted harm. It compares the result
+    with agents (one learner only), with full braking, and with maximin, which minimises the largest harm of a vehicle.
+    The default weights are a grid, equal weights, and corners. In a corner, the harm of one vehicle counts first, and
+    the harm of the others decides between equal choices. Writes front.json, front.png and, for three vehicles,
+    front-ternary.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

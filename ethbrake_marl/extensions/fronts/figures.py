@@ -1,4 +1,4 @@
-"""Figures of a front: who bears the harm (a ternary plot), and the sum of harm against the largest share of it."""
+"""Figures of a front: a ternary plot of each vehicle's share of the harm, and the sum of harm against the largest."""
 
 from __future__ import annotations
 
@@ -25,13 +25,16 @@ from ethbrake_marl.physics.state import Floats
 
 WIDTH_IN = 5.6  # narrow enough for a phone
 
-_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])  # of the triangle: Vehicles 1, 2 and 3
+_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])  # corners of the triangle for Vehicles 1, 2 and 3
 
 Json = dict[str, Any]
 
 
 def front_figures(results: Json) -> dict[str, Figure]:
-    """Return the figures of the content of ``front.json``, by file name; the ternary one for three vehicles only."""
+    """Return the figures of ``results``, the content of ``front.json``, by file name.
+
+    The ternary plot is included only if there are three vehicles.
+    """
     figures = {"front.png": sum_figure(results)}
     if len(results["vehicles"]) == 3:
         figures["front-ternary.png"] = ternary_figure(results)
@@ -39,9 +42,9 @@ def front_figures(results: Json) -> dict[str, Figure]:
 
 
 def sum_figure(results: Json) -> Figure:
-    """Draw the mean harm of the line against that of the vehicle that bears most, a point for each set of weights.
+    """Draw the mean harm of the line against the mean harm of the vehicle that bears most.
 
-    No point minimises either of the two, except that of equal weights, and maximin world by world.
+    There is one point for each choice of weights. ``results`` is the content of ``front.json``.
     """
     figure, (axes,) = new_panels((WIDTH_IN, 4.6))
     for name, harm, style in _series(results):
@@ -59,7 +62,10 @@ def sum_figure(results: Json) -> Figure:
 
 
 def ternary_figure(results: Json) -> Figure:
-    """Draw which share of the harm each of three vehicles bears; the colour is the harm of the line."""
+    """Draw the share of the harm that each of three vehicles bears. The colour of a point is the harm of the line.
+
+    ``results`` is the content of ``front.json``.
+    """
     figure = new_figure(WIDTH_IN, 5.4)
     axes = figure.add_subplot()
     axes.set_axis_off()
@@ -99,13 +105,13 @@ def ternary_figure(results: Json) -> Figure:
 
 
 def _places(shares: Floats) -> Floats:
-    """Return x and y of points in the triangle, [2, k], from the shares of the three vehicles, [k, 3]."""
+    """Return the coordinates of points in the triangle, [2, k], given the shares of the three vehicles, [k, 3]."""
     places: Floats = (shares[:, :, np.newaxis] * _CORNERS).sum(axis=1).T
     return places
 
 
 def _series(results: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
-    """Return name, mean harm [W, N] m2/s2 and style of the front, of what is shown beside it and of each agent."""
+    """Return the name, mean harm [W, N] (m2/s2) and style of the front, of full braking, maximin, and of each agent."""
     count = results["harm_count"]
 
     def harm(points: Sequence[Mapping[str, Any]]) -> Floats:
@@ -123,4 +129,4 @@ def _series(results: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
 
 def _caption(results: Json) -> str:
     worlds = count_of(results["episodes"], "world")
-    return f"{results['scenario']}, {worlds}; a point for each of {len(results['points'])} choices of the weights."
+    return f"{results['scenario']}, {worlds}; one point for each of {len(results['points'])} choices of the weights."

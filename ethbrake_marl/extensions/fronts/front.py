@@ -1,7 +1,7 @@
-"""The front of a list of worlds: for each set of weights the least weighted harm, and who bears what then.
+"""The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
-For the mean harm over a list, weighted searches give the convex part of the Pareto front, world by world independently;
-it is exact as far as the searches are. No bound is proven for it.
+Each world is searched independently. The means over the list form the convex part of the Pareto front of mean harm. The
+points are results of a search, without proven bounds.
 """
 
 from __future__ import annotations
@@ -37,49 +37,59 @@ from ethbrake_marl.policies.shipped import shipped_policies
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.task import Task
 
-BUDGET = 3_000  # candidates per world and weight
+BUDGET = 3_000  # number of candidates per world and choice of weights
 
-CONSTANTS = 101  # constant commands of which the front is never worse
+CONSTANTS = 101  # number of constant commands that every search tries
 
-CHUNK = 1_000  # worlds that are searched together
+CHUNK = 1_000  # number of worlds that are searched together
 
-FIRST_SHARE = 0.6  # share of the budget for the first round; the second one starts from the best of all weights
+# fraction of the budget for the first round; the second round starts from the best results of all choices of weights
+FIRST_SHARE = 0.6
 
-Borne = Mapping[HarmCount, Floats]
+Borne = Mapping[HarmCount, Floats]  # harm that each vehicle bears, by harm count
 
-Progress = Callable[[int, int], None]  # called with the number of searches done and their total
+Progress = Callable[[int, int], None]  # called with the number of finished searches and the number of all searches
 
 
 class Front(NamedTuple):
-    """For each of W sets of weights a command profile of each of n worlds, and the harm that each vehicle bears."""
+    """Best command profiles of n worlds for W choices of weights, and the harm that each vehicle bears under them."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
-    harm_count: HarmCount  # harm that is weighted: of each pair's ``first`` impact, or ``total``
-    borne: Borne  # count of harm -> [W, n, N] harm of each vehicle, m2/s2
-    profiles: tuple[Profiles, ...]  # W times [n]: the commands of the controlled vehicles
-    agents: Mapping[str, Borne]  # agent -> harm of each vehicle where this agent drives for each set of weights
+    harm_count: HarmCount  # harm count that is weighted, ``first`` or ``total``
+    borne: Borne  # harm of each vehicle, [W, n, N] m2/s2, by harm count
+    profiles: tuple[Profiles, ...]  # commands of the controlled vehicles, [n] for each of the W choices of weights
+    agents: Mapping[str, Borne]  # harm of each vehicle if an agent drives, [W, n, N] m2/s2 by count, by agent
 
     @property
     def amounts(self) -> Floats:
-        """Weighted harm of each world, [W, n] m2/s2: ``N sum_i w_i h_i / sum_i w_i``, as ``weighted:...`` has it."""
+        """Weighted harm of each world, [W, n] m2/s2: ``N sum_i w_i h_i / sum_i w_i``, as in the objective ``weighted``.
+
+        Here ``w_i`` is the weight of vehicle i and ``h_i`` its harm.
+        """
         return np.stack(
             [amounts_of(each, row) for each, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
         )
 
     def mean(self, harm_count: HarmCount | None = None) -> Floats:
-        """Return the mean harm of each vehicle over the worlds, [W, N] m2/s2; None: in the count that is weighted."""
+        """Return the mean harm of each vehicle over the worlds, [W, N] m2/s2.
+
+        ``harm_count`` is ``first`` or ``total``; None: the count that is weighted.
+        """
         mean: Floats = self.borne[harm_count or self.harm_count].mean(axis=1)
         return mean
 
     def nondominated(self) -> Bools:
-        """Return which of the W profiles of each world no other one of this world beats, [W, n] bool."""
+        """Return True for profiles that no other profile of the same world dominates, [W, n].
+
+        A profile dominates another one if no vehicle bears more harm and at least one vehicle bears less.
+        """
         return nondominated(self.borne[self.harm_count].transpose(1, 0, 2)).T
 
 
 def amounts_of(borne: Floats, weights: Floats) -> Floats:
     """Return the weighted harm of n worlds, [n] m2/s2.
 
-    ``borne``: harm of each vehicle, [n, N] m2/s2; ``weights``: [N].
+    ``borne`` is the harm of each vehicle, [n, N] m2/s2. ``weights`` [N] are the weights of the vehicles.
     """
     return weighted_harm(borne, np.broadcast_to(weights, borne.shape))
 
@@ -96,11 +106,13 @@ def search_front(
     agents: Sequence[str] = (),
     on_progress: Progress | None = None,
 ) -> Front:
-    """Search the least weighted harm of every world under every set of weights.
+    """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    The result is in every world at least as good, under its weights, as ``CONSTANTS`` constant commands, as what was
-    found for any other weights, as the shipped profile of least harm, as ``agents``, and, with one learner, as every
-    shipped policy that can drive it. It does not depend on ``threads`` or on the other worlds.
+    In every world, the result for a choice of weights has at most the weighted harm of ``CONSTANTS`` constant commands,
+    of the results for other weights, of the shipped profile, and of ``agents``. With one learner, this also holds for
+    every shipped policy that can drive the learner. The result for a world does not depend on ``threads`` or on the
+    other worlds. Raises ``InvalidInput`` in the cases of ``checked_weights``, ``best_harm`` and ``make_agents``, and if
+    ``agents`` are given for several learners.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -110,26 +122,26 @@ def search_front(
     True
 
     Args:
-        scenario: the scenario of the worlds; its learners are controlled.
-        worlds: the worlds at t = 0, [n].
-        weights: [W, N] weights of the vehicles' harm.
-        harm_count: harm that is weighted, ``first`` or ``total``.
-        budget: candidates per world and set of weights.
+        scenario: scenario of the worlds; its learners are controlled.
+        worlds: worlds at t = 0, [n].
+        weights: weights of the vehicles' harm, [W, N].
+        harm_count: harm count that is weighted, ``first`` or ``total``.
+        budget: number of candidates per world and choice of weights.
         seed: seed of the random search.
         threads: number of threads.
-        agents: specs of agents of the one learner, such as ``universal``. Each drives every world once for each
-            set of weights, as the scenario's ``harm_weight`` and objective ``preference``.
-        on_progress: called with the number of searches done and their total, two for each world and set of weights.
-
-    Raises ``InvalidInput`` for weights that ``checked_weights`` refuses or agents beside several learners, and what
-    ``best_harm`` and ``make_agents`` raise.
+        agents: specs of agents for the one learner, such as ``universal``. For each choice of weights, the agent drives
+            every world in the scenario with this ``harm_weight`` and the objective ``preference``.
+        on_progress: function that is called with the number of finished searches and the number of all searches. There
+            are two searches for each world and choice of weights.
 
     """
     weights = checked_weights(weights, scenario.vehicles)
     task = Task(scenario, scenario.learners, harm_count)
     effort = {"budget": budget, "seed": seed, "threads": threads}
     if agents:
-        check_one_learner(scenario.name, [scenario.vehicle_names[i] for i in scenario.learners], "agents drive one")
+        check_one_learner(
+            scenario.name, [scenario.vehicle_names[i] for i in scenario.learners], "agents can drive only one learner"
+        )
     silent = [spec for spec in _shipped_specs(scenario) if spec not in agents] if len(scenario.learners) == 1 else []
     preferring = [Preferring.of(scenario, row, agents, silent, harm_count) for row in weights]
     parts, done = [], 0
@@ -152,15 +164,16 @@ def search_front(
 
 
 def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
-    """Return the harm of each vehicle where whoever bears most bears least: count of harm -> [n, N] m2/s2.
+    """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle.
 
-    It is searched like ``best_harm`` under the objective ``maximin``, and never worse by it than a point of the front.
+    The result is an array [n, N] in m2/s2 for each harm count. The search is ``best_harm`` with the objective
+    ``maximin``. In every world, the largest harm is at most the largest harm at any point of ``front``.
 
     Args:
-        scenario: the scenario of the worlds.
-        worlds: the worlds at t = 0, [n].
-        front: their front.
-        budget: candidates per world.
+        scenario: scenario of the worlds.
+        worlds: worlds at t = 0, [n].
+        front: front of the same worlds.
+        budget: number of candidates per world.
         threads: number of threads.
 
     """
@@ -181,23 +194,23 @@ def _joined_borne(parts: Sequence[Borne]) -> Borne:
 
 
 class Preferring(NamedTuple):
-    """A scenario in which the harm of the vehicles has given weights, and agents made for it."""
+    """Scenario with fixed weights of the vehicles' harm, and agents made for this scenario."""
 
-    scenario: Scenario  # with fixed ``harm_weight`` and the objective ``preference``
-    agents: Mapping[str, Driver]  # spec -> agent, to be shown
-    silent: Mapping[str, Driver]  # spec -> further agents, whose episodes count as candidates only
+    scenario: Scenario  # scenario with fixed ``harm_weight`` and the objective ``preference``
+    agents: Mapping[str, Driver]  # agents that are compared with the front, by spec
+    silent: Mapping[str, Driver]  # further agents, whose commands are only candidates of the search, by spec
 
     @classmethod
     def of(
         cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
     ) -> Preferring:
-        """Return the scenario with ``weights`` [N], and the agents with these specs for it."""
+        """Return the scenario with the weights ``weights`` [N], and the agents made from their specs."""
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
         made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
         return cls(fixed, *made)
 
     def weighted(self, worlds: Worlds) -> Worlds:
-        """Return the worlds with their ``harm_weight`` replaced by that of this scenario."""
+        """Return the worlds with their ``harm_weight`` replaced by the weights of this scenario."""
         weight = np.broadcast_to(np.array(self.scenario.harm_weight, np.float64), worlds.speeds_mps.shape).copy()
         return replace(worlds, vehicles=replace(worlds.vehicles, harm_weight=weight))
 
@@ -220,15 +233,15 @@ def _searched(
     preferring: Sequence[Preferring],
     tell: Callable[[int], None],
 ) -> Front:
-    """Return the front of a few worlds, from two rounds of searches, one per set of weights each.
+    """Return the front of some worlds. There are two rounds, with one search per choice of weights in each round.
 
     Args:
-        worlds: the worlds at t = 0, [n].
-        task: scenario, controlled vehicles and harm that is weighted.
-        weights: [W, N] weights.
-        effort: keywords ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        preferring: for each set of weights the agents whose episodes count too.
-        tell: called after each search with the number of worlds.
+        worlds: worlds at t = 0, [n].
+        task: scenario, controlled vehicles and harm count that is weighted.
+        weights: weights of the vehicles' harm, [W, N].
+        effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
+        preferring: scenario and agents for each choice of weights.
+        tell: function that is called after each search with the number of worlds.
 
     """
     problem, pool = task_problem(worlds, task), Pool()
@@ -263,20 +276,23 @@ def _searched(
 
 
 def observes_weights(agent: Driver) -> bool:
-    """Return whether an agent may heed the weights: all but trained policies that do not observe them."""
+    """Return whether the commands of an agent may depend on the weights.
+
+    The result is False only for trained policies that do not observe the weights.
+    """
     manifest = getattr(agent, "manifest", None)
     return manifest is None or any("harm_weight" in name for name in manifest.observation.features)
 
 
 class Pool:
-    """Profiles that are known in a few worlds, from which the best one of each world is chosen for any weights."""
+    """Collection of profiles of the same worlds, from which the best profile is chosen for any weights."""
 
     def __init__(self) -> None:
         self._profiles: list[Profiles] = []
         self._borne: dict[HarmCount, list[Floats]] = {count: [] for count in HARM_COUNTS}
 
     def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
-        """Add one profile for each world of ``problem``, and return the harm of each vehicle, [n, N] by count."""
+        """Add one profile for each world of ``problem``. Return the harm of each vehicle, [n, N] m2/s2, by count."""
         self._profiles.append(profiles)
         all_borne = problem.borne(profiles)
         for count, borne in all_borne.items():
@@ -284,9 +300,10 @@ class Pool:
         return all_borne
 
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
-        """Return the number of the profile of least weighted harm in each world, [n]; of equals, of least harm in all.
+        """Return the index of the profile with the least weighted harm in each world, [n].
 
-        ``weights`` [N] weigh the harm of each vehicle in the given count.
+        Among equal profiles, the profile with the least sum of harm is chosen. ``weights`` [N] are the weights of the
+        vehicles' harm under ``harm_count``.
         """
         borne = np.stack(self._borne[harm_count])
         amounts = amounts_of(borne.reshape(-1, len(weights)), weights).reshape(borne.shape[:2])
@@ -295,7 +312,7 @@ class Pool:
         return np.asarray(np.where(amounts == least, whole, np.inf).argmin(axis=0))
 
     def best(self, weights: Floats, harm_count: HarmCount) -> Profiles:
-        """Return the profile of least weighted harm of each world, [n]; arguments as of ``choice``."""
+        """Return the profile with the least weighted harm in each world, [n]; for the arguments see ``choice``."""
         chosen = self.choice(weights, harm_count)
         parts = [(k, np.flatnonzero(chosen == k)) for k in np.unique(chosen)]
         padded = Profiles.padded([self._profiles[k].take(rows) for k, rows in parts], 1)
@@ -303,7 +320,10 @@ class Pool:
         return Profiles(*(np.concatenate(each)[back] for each in zip(*padded, strict=True)))
 
     def least(self, weights: Floats, harm_count: HarmCount) -> tuple[Borne, tuple[Profiles, ...]]:
-        """Return harm and profiles of the best choice for each row of ``weights`` [W, N]: [W, n, N] and W times [n]."""
+        """Return the harm, [W, n, N] m2/s2, and the profiles, W times [n], with the least weighted harm.
+
+        ``weights`` [W, N] are W choices of weights of the vehicles' harm under ``harm_count``.
+        """
         chosen = [self.choice(row, harm_count) for row in weights]
         at = np.arange(len(chosen[0]))
         borne = {count: np.stack([np.stack(each)[k, at] for k in chosen]) for count, each in self._borne.items()}

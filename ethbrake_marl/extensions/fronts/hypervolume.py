@@ -1,4 +1,4 @@
-"""Points that no other point beats, and the volume that they dominate."""
+"""Nondominated points, and the volume that a set of points dominates."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of 
 
 
 def nondominated(points: Floats) -> Bools:
-    """Return which points no other point beats, [..., Q] bool; less is better.
+    """Return True for points that no other point dominates, [..., Q].
 
-    A point beats another one if it is at most as large in every coordinate and smaller in one. ``points`` is
-    [..., Q, N]: Q points of N coordinates.
+    Smaller coordinates are better. A point dominates another point if it is at most as large in every coordinate, and
+    smaller in at least one. ``points`` [..., Q, N] are Q points with N coordinates.
     """
     one, other = points[..., :, np.newaxis, :], points[..., np.newaxis, :, :]
     beaten = (other <= one).all(axis=-1) & (other < one).any(axis=-1)
@@ -22,29 +22,33 @@ def nondominated(points: Floats) -> Bools:
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Return the volume between the reference and the points: of all places that some point beats, none beyond it.
+    """Return the volume of the region that the points dominate, up to the reference point.
 
-    Less is better. A point that is not below the reference in every coordinate adds nothing. The result is exact: it
-    slices the volume along the last coordinate (Zitzler 1999; "hypervolume by slicing objectives").
+    Smaller coordinates are better. A point that is not below the reference in every coordinate adds no volume. The
+    result is exact: the volume is sliced along the last coordinate (Zitzler 1999, "hypervolume by slicing
+    objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.fronts.hypervolume import hypervolume
     >>> hypervolume(np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([3.0, 3.0]))
     3.0
 
-    Args:
-        points: [Q, N].
-        reference: [N].
+    Raises ``InvalidInput`` if there are more than ``MOST_DIMENSIONS`` coordinates, if the shapes are wrong, or if a
+    number is not finite.
 
-    Raises ``InvalidInput`` for more than ``MOST_DIMENSIONS`` coordinates, other shapes, or infinite numbers.
+    Args:
+        points: coordinates of Q points, [Q, N].
+        reference: coordinates of the reference point, [N].
 
     """
     if len(reference) > MOST_DIMENSIONS:
-        raise InvalidInput(f"hypervolume: {len(reference)} vehicles; it is computed for at most {MOST_DIMENSIONS}")
+        raise InvalidInput(
+            f"hypervolume: {len(reference)} coordinates; give points with at most {MOST_DIMENSIONS} coordinates"
+        )
     finite = np.isfinite(points).all() and np.isfinite(reference).all()
     if points.ndim != 2 or points.shape[1] != len(reference) or not finite:
         shapes = f"points {points.shape}, reference {reference.shape}"
-        raise InvalidInput(f"hypervolume: {shapes}: must be finite numbers, as [Q, N] and [N]")
+        raise InvalidInput(f"hypervolume: {shapes}: give finite numbers with the shapes [Q, N] and [N]")
     return _volume(points[(points < reference).all(axis=1)], reference)
 
 

@@ -1,4 +1,4 @@
-"""Results of a front: means with intervals, hypervolumes, and agents beside it."""
+"""Results of a front: means with intervals, hypervolumes, and comparison with agents."""
 
 from __future__ import annotations
 
@@ -30,18 +30,19 @@ Json = dict[str, Any]
 def front_results(
     front: Front, scenario: Scenario, sample: Sample, beside: Mapping[str, Borne], seed: int | None
 ) -> Json:
-    """Return the content of ``front.json``: the front, full braking, and the agents beside it.
+    """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
-    All means have 95 % intervals over worlds, or over recordings where the worlds come from these. An agent's
-    ``ratio`` is its mean weighted harm divided by the front's; null where the front's is 0. ``above`` is the mean
-    difference of the two.
+    All means have 95 % intervals over worlds, or over recordings if the worlds come from recordings. The ``ratio`` of
+    an agent is its mean weighted harm divided by the mean weighted harm of the front, or null if the latter is 0. The
+    entry ``above`` is the mean difference between the two.
 
     Args:
-        front: the searched front.
-        scenario: the scenario of its worlds.
-        sample: its worlds.
-        beside: name -> harm of each vehicle, [n, N] by count of harm: ``full_brake``, and further ones to show.
-        seed: seed of the list, or None.
+        front: front to describe.
+        scenario: scenario of the worlds.
+        sample: worlds of the front.
+        beside: harm of each vehicle, [n, N] m2/s2 by harm count, by name: ``full_brake``, and others such as
+            ``maximin``.
+        seed: seed of the list of worlds; None: unknown.
 
     """
     least, by = front.amounts, sample.clusters
@@ -89,16 +90,17 @@ def _vehicles(borne: Borne, by: Texts | None) -> Mapping[str, list[Json]]:
 
 
 def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None) -> list[Json]:
-    """Return hypervolumes of the mean harm of the front and of each agent, for two reference points.
+    """Return the hypervolumes of the mean harm of the front and of each agent, for two reference points.
 
-    The first one is the mean harm of full braking: points count that are better for every vehicle. The second one is
-    the largest mean harm of each vehicle under full braking or at any point of the front, so that points count that
-    take somebody's side. ``share`` is an agent's hypervolume divided by the front's. Intervals are percentiles over
-    ``RESAMPLES`` resamples of the worlds, or of their clusters.
+    The first reference point is the mean harm of full braking: only points that are better than full braking for every
+    vehicle contribute. The second reference point is the largest mean harm of each vehicle, under full braking or at
+    any point of the front: points that are worse than full braking for some vehicle contribute, too. ``share`` is an
+    agent's hypervolume divided by the front's hypervolume. Intervals are percentiles over ``RESAMPLES`` resamples of
+    the worlds, or of the clusters. Raises ``InvalidInput`` if an agent has the name ``front``.
 
     Args:
-        front: the front, and the agents' harm beside it.
-        full_brake: [n, N] harm of each vehicle if the learners brake fully.
+        front: front with the harm of the agents.
+        full_brake: harm of each vehicle if the learners brake fully, [n, N] m2/s2.
         clusters: name of each world's cluster, [n]; None: all worlds are independent.
 
     """
@@ -106,7 +108,7 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
         return []
     sets = {"front": front.borne[front.harm_count], **{k: each[front.harm_count] for k, each in front.agents.items()}}
     if "front" in front.agents:
-        raise InvalidInput("agent 'front': this name stands for the front itself; give the agent another name")
+        raise InvalidInput("agent 'front': this name is used for the front itself; give the agent another name")
     n = len(full_brake)
     names = np.arange(n) if clusters is None else np.unique(clusters, return_inverse=True)[1]
     members = [np.flatnonzero(names == k) for k in range(names.max() + 1)]  # rows of each cluster
@@ -133,7 +135,10 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
 
 
 def _interval(values: Floats) -> Json | None:
-    """Return the first value with percentiles of the others as JSON; None unless all are finite."""
+    """Return the first of ``values`` with the 2.5 % and 97.5 % percentiles of the other values, as plain data.
+
+    Returns None unless all values are finite.
+    """
     if not np.isfinite(values).all():
         return None
     low, high = np.percentile(values[1:], [2.5, 97.5])
@@ -141,7 +146,7 @@ def _interval(values: Floats) -> Json | None:
 
 
 def full_braking(scenario: Scenario, sample: Sample) -> Borne:
-    """Return the harm of each vehicle if all learners brake fully: count of harm -> [n, N] m2/s2."""
+    """Return the harm of each vehicle if all learners brake fully, [n, N] m2/s2, by harm count."""
     brakes = scenario.replace(
         roles={**scenario.roles, **{scenario.vehicle_names[i]: "full_brake" for i in scenario.learners}}
     )
@@ -151,7 +156,10 @@ def full_braking(scenario: Scenario, sample: Sample) -> Borne:
 
 
 def front_sheet(results: Json) -> Sheet:
-    """Return the table of the content of ``front.json``: who bears what for each set of weights, and agents' ratios."""
+    """Return a table of the harm of each vehicle for each choice of weights, and the ratios of the agents.
+
+    ``results`` is the content of ``front.json``.
+    """
     count = results["harm_count"]
     columns: list[Column | str] = [
         Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(results["vehicles"]))),
@@ -169,14 +177,15 @@ def front_sheet(results: Json) -> Sheet:
         rows.append((name, *(each["value"] for each in braking[count]), *sums))
     words = {"first": "first-impact", "total": "total"}[count]
     note = (
-        f"Mean {words} harm of each vehicle, and of the line by first and by all impacts, m2/s2. Agents: their weighted"
+        f"Mean {words} harm of each vehicle, and mean first-impact and total harm of the line, m2/s2. Agents:"
+        " weighted harm of the agent divided by the weighted harm of the front"
     )
-    note += f" harm divided by the front's{Conditions(recordings=results.get('recordings', 0)).by_recording}."
+    note += f"{Conditions(recordings=results.get('recordings', 0)).by_recording}."
     return Sheet(f"Front of {results['scenario']}, {results['episodes']:,} worlds", columns, rows, note, gap=2)
 
 
 def hypervolume_sheet(results: Json) -> Sheet:
-    """Return the table of hypervolumes of the content of ``front.json``."""
+    """Return a table of the hypervolumes in ``results``, the content of ``front.json``."""
     columns: list[Column | str] = [
         "Reference",
         "Of",

@@ -1,4 +1,4 @@
-"""Weights of the vehicles' harm: a grid of the simplex, and the check of weights that a user gives."""
+"""Weights of the vehicles' harm: a regular grid of weights, and the check of weights that a user gives."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.physics.state import LEAST_WEIGHT, Floats, checked_numbers
 
-MOST = 1_000  # most sets of weights
+MOST = 1_000  # largest number of choices of weights
 
-STEPS = 5  # default number of steps along an edge of the grid: 21 weights of three vehicles
+STEPS = 5  # default number of steps between the weights 0 and 1: 21 choices of weights for three vehicles
 
-SLIGHT = 1e-4  # weight of the others in a corner, so that their harm decides between equals
+SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides between equal choices
 
 
 def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
-    """Return evenly spaced weights of the vehicles' harm that sum to 1, [W, N].
+    """Return a grid of W evenly spaced choices of weights that sum to 1, [W, N].
 
-    Neighbours in the list differ by one step. Raises ``InvalidInput`` for less than one step, or more than ``MOST``
-    sets.
+    Two neighbouring rows differ by one step. Raises ``InvalidInput`` if ``steps`` is below 1, or if there are more than
+    ``MOST`` rows.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -37,8 +37,8 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     number = comb(steps + vehicles - 1, steps)
     if number > MOST:
         raise InvalidInput(
-            f"{steps} steps: {number:,} sets of weights of {vehicles} vehicles; at most {MOST:,}: take fewer steps, or"
-            " list the weights"
+            f"{steps} steps: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
+            f" {MOST:,} are allowed; give fewer steps, or list the weights"
         )
 
     def shares(number: int, left: int) -> Iterator[list[int]]:
@@ -54,15 +54,18 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
 
 
 def corners(vehicles: int) -> Floats:
-    """Return weights [N, N] in which one vehicle's harm counts first, and the others' only between equals."""
+    """Return N choices of weights, [N, N]: in row i, the harm of vehicle i counts first.
+
+    The harm of the other vehicles decides only between equal choices.
+    """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 
 
 def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) -> Floats:
     """Return weights of the vehicles' harm as an array [W, N].
 
-    Raises ``InvalidInput`` naming the first row that has another number of weights than ``vehicles``, a weight that is
-    neither 0 nor from 1e-6 to 1e6, or only zeros.
+    Raises ``InvalidInput`` if there are no rows, or if a row does not have one weight for each vehicle, has a weight
+    that is neither 0 nor from 1e-6 to 1e6, or has only zeros.
     """
     rows = [checked_numbers("weights", row) for row in weights]
     for k, row in enumerate(rows):
@@ -70,20 +73,23 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
         if row.shape != (vehicles,) or not (good.all() and row.any()):
             text = ",".join(f"{weight:g}" for weight in row.ravel())
             raise InvalidInput(
-                f"weights[{k}] = {text}: must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6 to 1e6 and"
-                " not all 0, as in 1,4,1"
+                f"weights[{k}] = {text}: the weights must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6"
+                " to 1e6 and not all 0, for instance 1,4,1"
             )
     if not rows:
-        raise InvalidInput("weights: there are none; give at least one row, as in 1,4,1")
+        raise InvalidInput("weights: there are no weights; give at least one row, for instance 1,4,1")
     return np.array(rows)
 
 
 def parsed_weights(texts: Sequence[str], vehicles: int) -> Floats:
-    """Return weights that are written as ``1,4,1``, one text per row, as an array [W, N]; see ``checked_weights``."""
+    """Return weights that are written as texts such as ``1,4,1``, as an array [W, N].
+
+    Raises ``InvalidInput`` for a text that is not a list of numbers, and in the cases of ``checked_weights``.
+    """
     rows = []
     for text in texts:
         numbers = [parse_numeral(part.strip()) for part in text.split(",")]
         if None in numbers:
-            raise InvalidInput(f"weights {text!r}: must be numbers with commas between them, as in 1,4,1")
+            raise InvalidInput(f"weights {text!r}: the weights must be numbers separated by commas, as in 1,4,1")
         rows.append([float(number) for number in numbers if number is not None])
     return checked_weights(rows, vehicles)

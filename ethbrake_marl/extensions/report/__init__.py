@@ -1,4 +1,4 @@
-"""HTML pages, figures and films."""
+"""HTML reports of evaluations, figures, and films of episodes."""
 
 from typing import TYPE_CHECKING
 

@@ -21,7 +21,7 @@ from ethbrake_marl.registry import Part
 
 
 def watch_command(
-    output: Annotated[Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.svg", help="The film to write.")],
+    output: Annotated[Path, typer.Option(metavar="FILE.gif|FILE.mp4|FILE.svg", help="File for the film.")],
     agents: AgentsOption = "e_v2x_bm",
     scenario: ScenarioOption = "paper-random",
     world: Annotated[int, typer.Option(help="Number of the world in the evaluation list.", min=0)] = 0,
@@ -29,9 +29,9 @@ def watch_command(
     settings: SettingsOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Write a film of agents in one world, in real time.
+    """Write a film of agents that drive one world, in real time.
 
-    The film shows the road to scale, commands, impacts and harm.
+    The film shows the road to scale, the commands, the impacts and the harm.
     """
     # imported here, because matplotlib takes a second to load and most commands do not draw
     from ethbrake_marl.extensions.report.film import check_film, film

@@ -1,4 +1,4 @@
-"""Harm against the constant deceleration of one vehicle in one world: predicted, simulated and best known."""
+"""Compute and draw the harm of one world at many constant decelerations of one vehicle, predicted and simulated."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ from ethbrake_marl.scenario.task import Task
 
 POINTS = 2001  # number of evenly spaced decelerations; the breakpoints of the closed form are added
 
-_LONG_S = 1e4  # long enough for every meeting to have happened
+_LONG_S = 1e4  # s; two vehicles that have not met until then never meet
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Constant deceleration that a method chooses in one world, and its minimal harm there."""
+    """Constant deceleration that a method chooses in one world, and the harm that the method computes for it."""
 
     deceleration_mps2: float  # chosen deceleration, m/s2
-    harm: float  # harm at that deceleration, m2/s2, predicted or simulated
+    harm: float  # predicted or simulated harm at the chosen deceleration, m2/s2
 
 
 @dataclass(frozen=True, slots=True)
 class DecelerationCurve:
-    """Harm in one world at K constant decelerations of one vehicle, in rising order."""
+    """Harm in one world at K constant decelerations of one vehicle, in increasing order."""
 
-    task: Task  # scenario, and the one vehicle that has the deceleration
-    world: Worlds  # the world, n = 1, at the alert
-    deceleration_mps2: Floats  # [K] from 0 to the braking capacity
+    task: Task  # scenario, and the one controlled vehicle
+    world: Worlds  # world at the alert, n = 1
+    deceleration_mps2: Floats  # [K] decelerations from 0 to the braking capacity, m/s2
     predicted: Floats  # [K] harm predicted by the pairwise closed form, m2/s2
     first_impact_harm: Floats  # [K] simulated first-impact harm, m2/s2
     total_harm: Floats  # [K] simulated total harm, m2/s2
-    # by pair ("front pair", "rear pair"): [K] how the pair first meets, a value of ``regimes_of``
+    # for "front pair" and "rear pair": [K] way in which the pair first meets, a value of ``regimes_of``
     regimes: dict[str, NDArray[np.str_]]
     closed_form: Choice  # deceleration that the pairwise closed form chooses, with its predicted harm
     coupled: Mapping[HarmCount, Choice]  # by harm count: deceleration with the least simulated harm
@@ -62,20 +62,23 @@ class DecelerationCurve:
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
     """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The decelerations are ``points`` evenly spaced ones and the breakpoints of the pairwise closed form. The prediction
-    assumes that all others brake fully; in the simulation they follow the scenario's scripts. Raises ``InvalidInput``
-    unless there is exactly one world, ``points`` is at least 2 and every script is fixed at the alert.
+    The decelerations are ``points`` evenly spaced values and the breakpoints of the pairwise closed form. The
+    prediction assumes that all other vehicles brake fully. In the simulation, the other vehicles follow the scripts of
+    the scenario. Raises ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2, and the command
+    of every script is fixed at the alert.
 
     Args:
-        world: the world at the alert, n = 1.
-        task: the scenario, and the one vehicle that has the deceleration.
+        world: world at the alert, n = 1.
+        task: scenario, and the one controlled vehicle.
         points: number of evenly spaced decelerations from 0 to the braking capacity.
 
     """
     if world.n != 1:
-        raise InvalidInput(f"deceleration curve: {world.n} worlds given; exactly one is drawn")
+        raise InvalidInput(
+            f"deceleration_curve: {world.n} worlds; give exactly one world, for instance worlds.take([0])"
+        )
     if not points >= 2:
-        raise InvalidInput(f"deceleration curve: points = {points}; at least 2 are needed")
+        raise InvalidInput(f"deceleration_curve: points = {points}: the number of points must be at least 2")
     scenario, vehicle = task.scenario, task.vehicle
     capacity = float(world.vehicles.braking_capacity_mps2[0, vehicle])
     pairwise = optimise_pairwise(world, vehicle)
@@ -104,16 +107,18 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
 
 
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
-    """Return how one pair, alone, first meets in each world, [n], if both vehicles brake constantly from t = 0 on.
+    """Return the way in which one pair of vehicles first meets in each world, [n].
 
-    Values: ``early`` (before the front vehicle of the pair brakes), ``A`` (the rear vehicle still coasts), ``A'`` (it
-    coasts and the front one stands), ``B`` (both brake), ``C`` (the rear one brakes and the front one stands), ``none``
-    (they never meet). docs/internals/proofs/constant-deceleration.md has the formulas.
+    Each vehicle of the pair coasts during its latency and then brakes with a constant deceleration. The other vehicles
+    have no effect. The values are ``early`` (the pair meets before the front vehicle brakes), ``A`` (the rear vehicle
+    still coasts), ``A'`` (the rear vehicle coasts and the front vehicle is at rest), ``B`` (both vehicles brake), ``C``
+    (the rear vehicle brakes and the front vehicle is at rest) and ``none`` (the pair never meets). The formulas are in
+    docs/internals/proofs/constant-deceleration.md.
 
     Args:
-        worlds: the worlds, [n].
-        pair: index of the pair: vehicles ``pair`` and ``pair + 1``.
-        deceleration_mps2: [n, N] constant deceleration of each vehicle, m/s2.
+        worlds: worlds at the alert, [n].
+        pair: index of the pair, which consists of the vehicles ``pair`` and ``pair + 1``.
+        deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2.
 
     """
     own = slice(pair, pair + 2)
@@ -145,18 +150,22 @@ _COUNTS: tuple[tuple[HarmCount, str, str, str], ...] = (
 _REGIMES = {  # colour and meaning of each regime
     "early": ("#d7c2e8", "before the front vehicle brakes"),
     "A": ("#8f8f8f", "A: rear vehicle still coasts"),
-    "A'": ("#5f5f5f", "A': rear vehicle coasts, front one stands"),
+    "A'": ("#5f5f5f", "A': rear vehicle coasts, front vehicle at rest"),
     "B": ("#9fd3ee", "B: both brake"),
-    "C": ("#f3c98b", "C: front vehicle stands"),
+    "C": ("#f3c98b", "C: front vehicle at rest"),
 }
 
 
 def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
-    Top: the three curves, the decelerations that E-V2X-BM chooses (by the closed form, and by simulation for both
-    counts), and level lines at the best known harm of any profile, if known. Bottom: how each pair alone first meets.
-    ``curve`` is the result of ``deceleration_curve``; ``title`` is written above, if empty the name of the scenario.
+    The upper panel shows the predicted harm, the simulated harm under both counts, and the decelerations that E-V2X-BM
+    chooses. Horizontal lines mark the best known harm. The lower panel shows the way in which each pair first meets.
+
+    Args:
+        curve: result of ``deceleration_curve``.
+        title: title of the figure; if empty, the name of the scenario.
+
     """
     scenario, vehicle = curve.task.scenario, curve.task.vehicle
     figure = new_figure(8.0, 5.4)
@@ -167,18 +176,18 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
         at, curve.predicted, color=_PREDICTED, linestyle="-.", linewidth=1.4, zorder=4, label="predicted (pairwise)"
     )
     for harm_count, name, colour, dashes in _COUNTS:
-        axes.plot(at, curve.harm(harm_count), color=colour, linestyle=dashes, linewidth=1.5, label=f"realised {name}")
+        axes.plot(at, curve.harm(harm_count), color=colour, linestyle=dashes, linewidth=1.5, label=f"simulated {name}")
     for changed in changes.values():
         for k in np.flatnonzero(changed):
             axes.axvline(float(at[k + 1]), color=GREY, linewidth=0.6, linestyle=(0, (1, 3)))
     largest = max(float(harm.max()) for harm in (curve.predicted, curve.first_impact_harm, curve.total_harm))
     axes.set_ylim(-0.02 * largest, 1.05 * largest + 1e-3)
     chosen, predicted = curve.closed_form.deceleration_mps2, curve.closed_form.harm
-    realised = float(curve.first_impact_harm[np.searchsorted(at, chosen)])
-    axes.vlines(chosen, predicted, realised, color=_PREDICTED, linewidth=1.0, linestyle=":")
+    simulated = float(curve.first_impact_harm[np.searchsorted(at, chosen)])
+    axes.vlines(chosen, predicted, simulated, color=_PREDICTED, linewidth=1.0, linestyle=":")
     axes.plot(
         [chosen], [predicted], color=_PREDICTED, marker="D", markersize=6, linestyle="none", clip_on=False, zorder=6,
-        label=f"a* = {chosen:.3f} m/s², closed form: predicts {predicted:.2f}, realises {realised:.2f}",
+        label=f"a* = {chosen:.3f} m/s², closed form: {predicted:.2f} predicted, {simulated:.2f} simulated",
     )  # fmt: skip
     for (harm_count, name, colour, _), marker, size in zip(_COUNTS, ("o", "s"), (6, 10), strict=True):
         best = curve.coupled[harm_count]
@@ -193,10 +202,10 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
         for (_, _, colour, dashes), harm in zip(_COUNTS, (first, total), strict=True):
             axes.axhline(harm, color=colour, linewidth=0.9, linestyle=dashes, alpha=0.7)
         proof = limits.proof
-        least = "" if proof.harm is None else f"; proven: no less than {proof.harm[0]:.2f}"
+        least = f"; proven lower bound {proof.harm[0]:.2f}"
         text = " (avoidable)" if proof.avoidable is not None and proof.avoidable[0] else least
         axes.annotate(
-            f"best known profile: {first:.2f} first-impact, {total:.2f} total{text}", (0.0, max(first, total)),
+            f"best known harm: {first:.2f} first-impact, {total:.2f} total{text}", (0.0, max(first, total)),
             xytext=(6, 3), textcoords="offset points", fontsize=8.5, color=GREY,
         )  # fmt: skip
     axes.set_xlim(0.0, float(at[-1]))
@@ -223,8 +232,8 @@ def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
         scripts = ", ".join(f"Vehicle {i + 1} {script}" for i, script in others.items())
     conditions = (
         f"{Conditions.of(curve.world).quantities}. Harm until {scenario.horizon_s:g} s."
-        " Predicted: each pair alone, all others braking fully."
-        " Realised: in the simulation, with velocity exchange and every later impact;"
-        f" other vehicles: {scripts}. Dotted: where the way changes in which a pair first meets."
+        " Predicted: closed form for each pair alone, if all other vehicles brake fully."
+        " Simulated: motion of the whole line, with all impacts;"
+        f" scripts of the other vehicles: {scripts}. Dotted lines: the way in which a pair first meets changes."
     )
     return finish(figure, conditions, axes, columns=2, fontsize=8.5)

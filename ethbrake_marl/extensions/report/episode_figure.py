@@ -1,4 +1,4 @@
-"""Figure of one episode: positions of the vehicles, their impacts, and the commands of the controlled vehicles."""
+"""Figure of episodes: positions of the vehicles, gaps, impacts, and commands of the controlled vehicles over time."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 
 
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
-    """Draw positions with impacts, gaps, and the commands of the controlled vehicles over time.
+    """Draw positions with impacts, gaps, and commands of the controlled vehicles over time.
 
-    There is one column for each record on common scales, to compare agents in the same world. Raises ``InvalidInput``
-    without records.
+    The figure has one column for each record, with common scales, so agents can be compared in the same world. Raises
+    ``InvalidInput`` if ``records`` is empty.
 
     Args:
         records: recorded episodes, by the title of their column.
-        caption: text below the figure; if empty, the conditions of the first record.
+        caption: text below the figure; if empty, the parameters of the first world.
 
     """
     if not records:
-        raise InvalidInput("trajectories: no records given")
+        raise InvalidInput("trajectories: there are no records; give at least one recorded episode")
     first = next(iter(records.values()))
     columns = len(records)
     figure, panels = new_panels(
@@ -56,7 +56,7 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
     motions = [(each, list(each.vehicles)) for each in records.values()]
     capacity = max(float(each.initial.vehicles.braking_capacity_mps2[0, some].max()) for each, some in motions)
     largest = max(float(each.command_mps2[:, some].max()) for each, some in motions)
-    commands.set_ylim(-1.1 * capacity, max(largest, 0.0) + 0.4 * capacity)  # with room for a line of text
+    commands.set_ylim(-1.1 * capacity, max(largest, 0.0) + 0.4 * capacity)  # leaves space for a line of text
     name_axes(positions, y="Position from Vehicle 1's\nat the alert (m)")
     name_axes(gaps, y="Gap ahead (m)")
     numbers = ", ".join(str(i + 1) for i in first.vehicles)
@@ -66,7 +66,7 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
     )
 
 
-_NOTE = "Figures at impacts: closing speed in m/s. Vehicles are drawn without length. Harm in m²/s²."
+_NOTE = "Numbers at impacts: closing speed in m/s. Vehicles are drawn without length. Harm in m²/s²."
 
 
 def _positions(axes: Axes, record: EpisodeRecord) -> None:
@@ -87,7 +87,7 @@ def _positions(axes: Axes, record: EpisodeRecord) -> None:
         )  # fmt: skip
     for k in np.flatnonzero(rows.first):
         speed_mps = rows.closing_speed_mps[k]
-        words = f"{speed_mps:.1f}" if speed_mps >= 0.05 else "< 0.1"  # so that no impact reads 0.0
+        words = f"{speed_mps:.1f}" if speed_mps >= 0.05 else "< 0.1"  # 0.0 would mean no impact
         axes.annotate(
             words, (rows.time_s[k], at[k]), xytext=(7, -7), textcoords="offset points",
             fontsize=8.5, va="top", zorder=6,
@@ -120,5 +120,5 @@ def _command(axes: Axes, record: EpisodeRecord) -> None:
 
 
 def _vehicle_style(i: int) -> dict[str, Any]:
-    """Return colour and dashes of Vehicle ``i + 1``, also used for the gap ahead of it."""
+    """Return the colour and dashes of the curves of Vehicle ``i + 1`` and of the gap ahead of this vehicle."""
     return {"color": vehicle_colour(i), "linestyle": DASHES[i % len(DASHES)], "linewidth": 1.6}

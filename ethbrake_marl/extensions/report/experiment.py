@@ -1,6 +1,6 @@
-"""The report of ``ethbrake run``: three figures, an HTML page, and the policy's results on the other two tests.
+"""The report of ``ethbrake run``: an HTML page, three figures, and the results of the policy on the other two tests.
 
-Other extensions add sections to the page (``register_run_section``).
+Other extensions can add sections to the page (``register_run_section``).
 """
 
 from __future__ import annotations
@@ -41,29 +41,28 @@ from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.training.experiment import SHIELDED, Experiment, RunReport, compared_agents, write_results
 from ethbrake_marl.training.progress import objective_in_words
 
-BESIDE = ("full_brake", "e_v2x_bm")  # agents shown with the policy in its figures and on the other two tests
+BESIDE = ("full_brake", "e_v2x_bm")  # agents shown together with the policy in the figures and the other two tests
 
-MOST_WORLDS = 2_000  # largest number of worlds of each of the other two tests
+MOST_WORLDS = 2_000  # largest number of worlds in each of the other two tests
 
 
 @dataclass(frozen=True, slots=True)
 class RunSection:
     """Section that an extension adds to the report of a run."""
 
-    title: str  # heading
-    body: tuple[str | Sheet, ...]  # sentences, which become paragraphs, and tables; all are printed, too
-    interrupted: str = ""  # what Ctrl-C stopped, as ``RunReport.interrupted``; "": nothing
+    title: str  # heading of the section
+    body: tuple[str | Sheet, ...]  # paragraphs and tables, which the command also prints
+    interrupted: str = ""  # work that Ctrl-C stopped, as in ``RunReport.interrupted``; "": no work was stopped
 
 
-MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: it has nothing to say about this run
+MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: no section for this run
 
 
 def register_run_section(name: str, make: MakeSection) -> None:
     """Register a function that adds a section to the report of every ``ethbrake run``, below the results.
 
-    ``name`` is the name of the section, which no other section may have; ``make`` returns it, or None.
-
-    An installed package does the same with an entry point of the group ``ethbrake_marl.run_sections``.
+    ``name`` is the unique name of the section. ``make`` is a function that returns the section, or None for no section.
+    An installed package can instead declare an entry point in the group ``ethbrake_marl.run_sections``.
     """
     RUN_SECTIONS.add(name, make, lambda other: other is make)
 
@@ -72,18 +71,18 @@ RUN_SECTIONS: Registry[MakeSection] = Registry("section of a run's report", "run
 
 
 def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
-    """Evaluate a policy on the other two tests, draw the figures, and write ``report.html``; return what to print.
+    """Evaluate a policy on the other two tests, draw the figures, write ``report.html``, and return the printed part.
 
     Args:
-        experiment: the finished run: its folder, policy and evaluation.
-        tell: called with a ``Progress`` object at each stage.
+        experiment: finished run, with its folder, policy and evaluation.
+        tell: function that is called with a ``Progress`` object at each stage.
 
     """
     evaluation, folder = experiment.evaluation, experiment.run.path
     others, done = other_tests(evaluation.scenario) if len(evaluation.vehicles) == 1 else (), count()
 
     def begin(stage: str) -> None:
-        """Report the progress: ``stage`` begins, or all stages have ended if it is empty."""
+        """Report that ``stage`` begins. An empty text means that all stages have ended."""
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
     is_papers = is_papers_test(evaluation.task, evaluation.seed)
@@ -108,7 +107,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
         learned=experiment.learned,
         harm_count=experiment.harm_count,
     )
-    begin("the page and its episodes")
+    begin("page and episodes")
     page = folder / "report.html"
     report = _page(experiment, rows, beside, figures, sections, config)
     report.driven(experiment.agents).write(page, force=True)
@@ -117,15 +116,13 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     with_rows = " and the paper's rows" if is_papers else ""
     return RunReport(
         (brief(rows, beside), *rows.tables()[1:], *printed),
-        f"report, with every measure{with_rows}: {page}",
+        f"report with all measures{with_rows}: {page}",
         ", ".join(section.interrupted for section in sections if section.interrupted),
     )
 
 
 def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
-    """Evaluate the trained policy, the policy behind its shield, and the baselines on another test; return the
-    table.
-    """
+    """Evaluate the trained policy, the same policy with a shield, and the baselines on ``test``; return the table."""
     evaluation = experiment.evaluation
     worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
     agents = compared_agents(experiment.trained.trained, test, experiment.harm_count, BESIDE)
@@ -145,18 +142,17 @@ def write_figures(
     learned: str = TRAINED_POLICY,
     harm_count: HarmCount = "first",
 ) -> list[Part]:
-    """Draw the three figures, write them as PNG files into ``folder``, and return them as parts (pieces of HTML) of the
-    report.
+    """Draw the three figures, write them as PNG files into ``folder``, and return them as pieces of HTML.
 
     Args:
         folder: folder of the run.
-        evaluation: evaluation of the trained policy or team, and the baselines.
-        rows: summary of that evaluation, one ``SummaryRow`` for each agent; baselines are drawn as level lines.
+        evaluation: evaluation of the trained policy or team and the baselines.
+        rows: summary of the evaluation, one row for each agent.
         course: evaluations during the training; each has ``steps``, both harms and ``collision_rate``.
         course_caption: caption of the learning curve.
-        agents: the evaluated agents, by name.
-        learned: name of the trained policy or team among them.
-        harm_count: harm that it minimises.
+        agents: evaluated agents, by name.
+        learned: name of the trained policy or team in ``agents``.
+        harm_count: harm count that the trained policy or team minimises.
 
     """
     references = [row for row in rows if row.agent in BESIDE]
@@ -166,7 +162,7 @@ def write_figures(
     drawn = {
         "learning_curve.png": (
             "Learning curve",
-            "Harm and collisions on a fixed list of worlds during the training; level lines: baselines.",
+            "Harm and collisions on a fixed list of worlds during the training. The horizontal lines are baselines.",
             learning_curve(course, learned=learned, references=references, caption=course_caption),
         ),
         "harm_against_gap.png": (
@@ -176,8 +172,8 @@ def write_figures(
         ),
         "trajectories.png": (
             "One episode",
-            f"World {world} of the list, driven by three agents: the world whose saving of harm by what was trained,"
-            " against full braking, is the median of all worlds in which full braking collides.",
+            f"World {world} of the list, driven by three agents. It is a typical world: among the worlds in which full"
+            f" braking collides, the harm that the {learned} avoids is the median here.",
             trajectories(records),
         ),
     }
@@ -187,12 +183,11 @@ def write_figures(
 
 
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first", learned: str = TRAINED_POLICY) -> int:
-    """Return the index of a typical world to draw: the one with the median reduction of harm by ``learned``.
+    """Return the index of a typical world: the world in which ``learned`` reduces harm by the median amount.
 
-    The reduction is the harm of full braking minus that of ``learned``, the trained policy or team. Only worlds in
-    which full braking does harm count.
-
-    Returns 0 if there are none. ``harm_count`` is ``first`` or ``total``.
+    The reduction is the harm of full braking minus the harm of ``learned``, the trained policy or team. Worlds in which
+    full braking does no harm are ignored. Returns 0 if full braking does no harm in any world. ``harm_count`` is
+    ``first`` or ``total``.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)
@@ -207,7 +202,7 @@ def _caption(experiment: Experiment, config: Mapping[str, Any]) -> str:
     plan, seed = config["recipe"]["evaluation"], config["seeds"]["training"]
     return (
         f"{experiment.evaluation.scenario.name}: worlds 0 to {plan['worlds'] - 1} of the list of seed {plan['seed']} at"
-        f" every point; training seed {seed}. Level lines: {experiment.rows[0].parameters.line}."
+        f" every point; training seed {seed}. Horizontal lines: {experiment.rows[0].parameters.line}."
     )
 
 
@@ -235,15 +230,15 @@ def _page(
     manifest, name = next(iter(trained.policies.values())).manifest, evaluation.scenario.name
     how = f"{manifest.algorithm}, scheme {trained.training.scheme}"
     which = (
-        f"The {experiment.learned} is by {manifest.algorithm if len(trained.policies) == 1 else how}, after"
-        f" {manifest.steps:,} steps (least harm on its own list)"
+        f"The {experiment.learned} was trained with {manifest.algorithm if len(trained.policies) == 1 else how}. It was"
+        f" saved after {manifest.steps:,} steps, when its harm on the list of the recipe was least"
     )
-    summary = f"{which}; {SHIELDED} is the same behind its shield."
+    summary = f"{which}. The agent “{SHIELDED}” is the same with a shield."
     if experiment.learned == TRAINED_TEAM:
-        summary += " In “all but” a vehicle, that vehicle brakes fully instead."
+        summary += " In the agent “all but” a vehicle, this vehicle brakes fully instead."
     if beside:
-        summary += f" {TESTS[name]} The other two tests stand below."
-    stopped = f"The training was interrupted: this is the {experiment.learned} after {manifest.steps:,} steps."
+        summary += f" {TESTS[name]} The results of the other two tests are further below."
+    stopped = f"The training was interrupted. This is the {experiment.learned} after {manifest.steps:,} steps."
     return Report(
         f"ethbrake run: {name}",
         rows,

@@ -1,4 +1,4 @@
-"""Films of episodes in real time: the environment's own pictures as GIF or MP4, or an animated drawing as SVG."""
+"""Films of episodes in real time: pictures of the environment as GIF or MP4, or an animated drawing as SVG."""
 
 from __future__ import annotations
 
@@ -22,27 +22,29 @@ Films = Mapping[str, Sequence[Scene]]  # scenes of each film of one world, by ti
 
 FILM_FPS = 25
 
-MOST_FILMS = 12  # most films in one file, one below the other
+MOST_FILMS = 12  # largest number of films in one file, one below the other
 
-MOST_PICTURES = 2_500  # most pictures of all films together, which need 1.8 GB of memory
+MOST_PICTURES = 2_500  # largest number of pictures of all films together; they need 1.8 GB of memory
 
 _COLOURS = 64
 
 
 def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
-    """Return the scenes of one world from the alert to the end of its episode, ``fps`` per second, and the final scene.
+    """Simulate one episode, and return its scenes: ``fps`` scenes per second from the alert on, and the final scene.
+
+    Raises ``InvalidInput`` unless there is exactly one world, and ``PhysicsError`` if the physics cannot simulate it.
 
     Args:
-        world: the world at the alert, n = 1.
+        world: world at the alert, n = 1.
         agent: agent of the learner, or a team of agents. It is not changed.
         scenario: scenario of the world; its scripts control the other vehicles.
         fps: scenes per second.
 
-    Raises ``InvalidInput`` for more than one world, ``PhysicsError`` for a world that could not be advanced.
-
     """
     if world.n != 1:
-        raise InvalidInput(f"film_scenes: {count_of(world.n, 'world')} given; exactly 1 is needed: worlds.take([0])")
+        raise InvalidInput(
+            f"film_scenes: {count_of(world.n, 'world')}; give exactly one world, for instance worlds.take([0])"
+        )
     engine = episode_engine(world, Team.of(agent, scenario.learners), scenario)
     trace = Trace(engine, whole=True, alert=world)
     while not engine.ended.all():
@@ -60,12 +62,14 @@ def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float 
 
 
 def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: Scenario) -> bytes:
-    """Let several agents control the same world, and return a film of their episodes as the bytes of a file.
+    """Let several agents drive the same world, and return a film of their episodes as the bytes of a file.
+
+    Raises the exceptions of ``film_scenes`` and ``film_bytes``.
 
     Args:
-        world: the world at the alert, n = 1.
-        agents: the agents, by the title above their film.
-        ending: ``.gif``, ``.mp4`` or ``.svg``. Other endings raise ``InvalidInput`` before any work.
+        world: world at the alert, n = 1.
+        agents: agents, by the title above their film.
+        ending: ending of the file name: ``.gif``, ``.mp4`` or ``.svg``.
         scenario: scenario of the world.
 
     """
@@ -75,30 +79,29 @@ def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: 
 
 
 def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
-    """Return films of one world, one below the other, in real time, as the bytes of a GIF, SVG (both endless) or MP4
-    file.
+    """Return the bytes of a GIF, MP4 or SVG file with several films of one world, one below the other, in real time.
 
-    A film that ends before the others keeps showing its end. Raises ``InvalidInput`` without films, for more than
-    ``MOST_FILMS`` films or ``MOST_PICTURES`` pictures, for an ``ending`` other than ``.gif``, ``.mp4`` and ``.svg``,
-    and for an ``fps`` that does not divide 100 (a GIF counts hundredths of a second). Raises ``MissingExtra`` for an
-    MP4 without the library that writes it.
+    A film that ends earlier shows its last scene until the end. GIF and SVG files repeat endlessly. Raises
+    ``InvalidInput`` if there are no films, more than ``MOST_FILMS`` films or more than ``MOST_PICTURES`` pictures, if
+    ``ending`` is unknown, or if ``fps`` does not divide 100 (a GIF counts hundredths of a second). Raises
+    ``MissingExtra`` for an MP4 file if the library imageio-ffmpeg is not installed.
 
     Args:
-        films: scenes of each film, by its title.
-        ending: ``.gif``, ``.mp4`` or ``.svg``.
+        films: scenes of each film, by title.
+        ending: ending of the file name: ``.gif``, ``.mp4`` or ``.svg``.
         fps: scenes per second.
 
     """
     check_film(ending, len(films))
     if not films or not all(films.values()):
-        raise InvalidInput("film_bytes: no films given")
+        raise InvalidInput("film_bytes: there are no scenes; give at least one film with at least one scene")
     if not fps > 0 or 100 % fps:
-        raise InvalidInput(f"film_bytes: fps = {fps}: must divide 100, for instance 10, 20, 25 or 50")
+        raise InvalidInput(f"film_bytes: fps = {fps}: fps must divide 100, for instance 10, 20, 25 or 50")
     pictures = len(films) * max(map(len, films.values()))
     if pictures > MOST_PICTURES:
         raise InvalidInput(
-            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: needs {pictures:,} pictures,"
-            f" and at most {MOST_PICTURES:,} are kept; give fewer agents, or a scenario with a shorter horizon_s"
+            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: the film has {pictures:,} pictures,"
+            f" but at most {MOST_PICTURES:,} fit; give fewer agents, or a scenario with a shorter horizon_s"
         )
     return _WRITERS[ending](films, fps)
 
@@ -106,18 +109,18 @@ def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
 def check_film(ending: str, films: int = 1) -> None:
     """Raise ``InvalidInput`` if ``film_bytes`` cannot write a file with this ``ending``, or this number of ``films``.
 
-    Raises ``MissingExtra`` for an MP4 without the library that writes it.
+    Raises ``MissingExtra`` for an MP4 file if the library imageio-ffmpeg is not installed.
     """
     if ending not in _WRITERS:
-        raise InvalidInput(f"a film that ends in {ending!r}: films are written as {', '.join(_WRITERS)}")
+        raise InvalidInput(f"film with the file ending {ending!r}: the ending must be one of {', '.join(_WRITERS)}")
     if ending == ".mp4":
         need("imageio_ffmpeg")
     if films > MOST_FILMS:
-        raise InvalidInput(f"film: {films} agents, one below the other; at most {MOST_FILMS} are shown")
+        raise InvalidInput(f"film: {films} agents; a film can show at most {MOST_FILMS} agents, so give fewer")
 
 
 def _stacked(films: Films) -> Iterator[Frame]:
-    """Yield the pictures of the film file: each shows the present frame of all films, one below the other."""
+    """Yield the pictures of the file. Each picture shows the current scenes of all films, one below the other."""
     for k in range(max(map(len, films.values()))):
         each = (shown[min(k, len(shown) - 1)]._replace(title=title) for title, shown in films.items())
         yield np.concatenate([scene.frame() for scene in each])

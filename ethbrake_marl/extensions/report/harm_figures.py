@@ -1,4 +1,4 @@
-"""Figures of harm: a bar for each agent, the distribution of regret, and the avoidable part of harm."""
+"""Figures of harm: mean harm of each agent, distribution of regret, and harm in avoidable and unavoidable contacts."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from ethbrake_marl.extensions.search.limit_measures import best_known_words
 from ethbrake_marl.extensions.search.regret import regrets_of
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
-_POINTS = 250  # points of a curve; more would not be visible
+_POINTS = 250  # number of points of a curve; more points would not be visible
 
 _PARTS = (
-    ("best known of these worlds", "#bbbbbb", ""),
-    ("above it, contact unavoidable", COLOURS[2], "//"),
-    ("above it, contact avoidable", COLOURS[1], ".."),
+    ("best known harm", "#bbbbbb", ""),
+    ("regret, contact unavoidable", COLOURS[2], "//"),
+    ("regret, contact avoidable", COLOURS[1], ".."),
 )
 
 
@@ -33,19 +33,19 @@ def harm_by_agent(
     harm_count: HarmCount = "first",
     elsewhere: Mapping[str, Sequence[SummaryRow]] | None = None,
 ) -> Figure:
-    """Draw the mean harm of each agent with its 95 % interval, a line at the best known harm, and marks for other
-    tests.
+    """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    The figure is narrow enough for the screen of a phone. Raises ``InvalidInput`` without rows.
+    A line marks the best known harm, and further marks show the harm on other tests. The figure is narrow enough for
+    the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
 
     Args:
-        rows: summary of each agent, one ``SummaryRow`` each.
-        harm_count: harm to draw, ``first`` or ``total``.
+        rows: summary of each agent.
+        harm_count: harm count to draw, ``first`` or ``total``.
         elsewhere: summaries of the agents on other tests, by the title of the test; None: no marks.
 
     """
     if not rows:
-        raise InvalidInput("harm_by_agent: no rows; evaluate at least one agent")
+        raise InvalidInput("harm_by_agent: there are no rows; give the summary of at least one agent")
     figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(rows)))
     name = {"first": "first_impact_harm", "total": "total_harm"}[harm_count]
     for k, row in enumerate(rows):
@@ -70,15 +70,18 @@ def harm_by_agent(
 
 
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
-    """Label one row of a figure for each agent, the first on top. Names are cut to ``most`` characters."""
+    """Label the rows of a figure with the names of the agents, the first one on top.
+
+    Names are shortened to ``most`` characters.
+    """
     axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()
 
 
 def regret_distribution(evaluation: Evaluation) -> Figure:
-    """Draw the share of worlds in which an agent's regret (harm minus best known harm) exceeds x, under both counts.
+    """Draw, for each agent, the fraction of worlds in which its regret exceeds x, under both harm counts.
 
-    There is one curve per agent. Without a best known harm, the harm itself is drawn.
+    *Regret* is harm minus best known harm. If no best known harm exists, the figure shows the harm instead of regret.
     """
     regrets = regrets_of(evaluation)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
@@ -97,24 +100,26 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
         axes.set_ylim(0.0, 1.0)
         what = "Harm" if regrets is None else "Regret"
         name_axes(axes, x=f"{what}, {TITLES[count][0].lower()}{TITLES[count][1:]}")
-    name_axes(panels[0], y="Worlds with more than that")
+    name_axes(panels[0], y="Worlds above this value")
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     caption = f"Linear up to 1 m²/s², logarithmic beyond. {evaluation.conditions.line}."
     return finish(figure, caption, panels[0], columns=5)
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Draw each agent's mean harm in three parts: best known harm, regret in worlds with unavoidable contact, and
-    regret in worlds with avoidable contact.
+    """Draw each agent's mean harm as a bar of three parts.
 
-    *Regret* is harm minus best known harm. Raises ``InvalidInput`` if nothing is proven about the worlds.
+    The parts are the best known harm, the regret in worlds with unavoidable contact, and the regret in worlds with
+    avoidable contact. *Regret* is harm minus best known harm. Raises ``InvalidInput`` if it is unknown in which worlds
+    contact is avoidable.
     """
     regrets = regrets_of(evaluation)
-    if regrets is None:
-        raise InvalidInput("harm_in_parts: nothing is proven of these worlds, so no part can be told from another")
-    avoidable = regrets.limits.proof.avoidable
-    if avoidable is None:
-        raise InvalidInput("harm_in_parts: where contact can be avoided is not decided for these vehicles")
+    avoidable = None if regrets is None else regrets.limits.proof.avoidable
+    if regrets is None or avoidable is None:
+        raise InvalidInput(
+            "harm_in_parts: it is not proven in which worlds contact is avoidable; give an evaluation that the proofs"
+            " cover"
+        )
     figure, panels = new_panels((10.0, 1.4 + 0.36 * len(evaluation.outcomes)), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):
         for k, outcome in enumerate(evaluation.outcomes.values()):
@@ -128,4 +133,4 @@ def harm_in_parts(evaluation: Evaluation) -> Figure:
                 left += part
         name_axes(axes, x=TITLES[count])
     _name_rows(panels[0], list(evaluation.outcomes))
-    return finish(figure, f"Mean per world. {evaluation.conditions.line}.", panels[0], columns=5)
+    return finish(figure, f"Mean over the worlds. {evaluation.conditions.line}.", panels[0], columns=5)

@@ -1,4 +1,4 @@
-"""Films of episodes as one animated SVG file, which any browser plays, light or dark, without a script inside."""
+"""Films of episodes as one animated SVG file without scripts. Any browser plays it, with light or dark colours."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from ethbrake_marl.errors import plain_text
 
 _FILM_WIDTH = 800
 
-_HOLD_S = 2.5  # time that the end is shown before the drawing starts again
+_HOLD_S = 2.5  # time for which the end is shown before the film starts again, s
 
-_STRIP = 132  # height of one agent's road
+_STRIP = 132  # height of the strip with one agent's road
 
 _FOOT = 34  # height of the clock below the last road
 
 _FILM_LANE, _HALF_ROAD, _HALF_BODY = 82, 24, 13  # distance of the lane from a strip's top; half heights
 
-_SHOWN_S = 1.0  # how long an impact is shown
+_SHOWN_S = 1.0  # time for which an impact is shown, s
 
 _MOST_TITLE = 60
 
@@ -37,10 +37,10 @@ text { font-family: system-ui, sans-serif; font-size: 14px; fill: var(--ink); }
 
 
 def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
-    """Return the text of an SVG that shows films of one world, one below the other, in real time and on one scale.
+    """Return the text of an SVG file that shows films of one world in real time, one below the other, on one scale.
 
     Args:
-        films: the scenes of each film by its title; none is empty.
+        films: scenes of each film, by title; every film has at least one scene.
         fps: scenes per second.
 
     """
@@ -65,9 +65,10 @@ def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
 
 
 class _Strip:
-    """Drawing of one agent's film on its own road, as a strip of the SVG picture.
+    """Strip of the SVG picture with the film of one agent on its road.
 
-    ``left_m`` and ``right_m`` are the positions at the edges of the picture, ``fps`` the scenes per second.
+    ``left_m`` and ``right_m`` are the positions at the edges of the picture. ``fps`` is the number of scenes per
+    second.
     """
 
     def __init__(self, film: Sequence[Scene], title: str, left_m: float, right_m: float, fps: int) -> None:
@@ -84,7 +85,7 @@ class _Strip:
         texts = [
             f"harm {scene.first_harm:.1f} by first impacts, {scene.total_harm:.1f} in total" for scene in self._film
         ]
-        for words in dict.fromkeys(texts):  # each text is visible while it is the harm so far
+        for words in dict.fromkeys(texts):  # a text is visible as long as it states the harm so far
             lit = [each == words for each in texts]
             yield (
                 f'<text x="{_FILM_WIDTH - 12}" y="22" text-anchor="end" opacity="{int(lit[0])}">{words}'
@@ -109,8 +110,8 @@ class _Strip:
             )
 
     def _vehicle(self, i: int) -> Iterator[str]:
-        """Yield the SVG elements of vehicle ``i``: a moving body with its number, the lights of its command, and its
-        impacts.
+        """Yield the SVG elements of vehicle ``i``: a moving body with its number, lights that show its command, and
+        stars that show its impacts.
         """
         places = [self._x(scene.front_m[i]) for scene in self._film]
         length, top = BODY_M * self._scale, _FILM_LANE - _HALF_BODY
@@ -145,9 +146,9 @@ class _Strip:
         )
 
     def _events(self) -> list[tuple[int, int, Struck]]:
-        """Return the impacts to show: first scene, scene after the last, and the impact.
+        """Return the impacts to show, each with the index of its first scene and of the scene after its last one.
 
-        One impact is shown at a time, for a short while; a weaker one is left out while a harder one is shown.
+        Only one impact is shown at a time. A weaker impact is omitted while a harder impact is shown.
         """
         known: set[tuple[int, float]] = set()
         events: list[tuple[int, int, Struck]] = []
@@ -163,7 +164,7 @@ class _Strip:
         return events
 
     def _switched(self, lit: Sequence[bool]) -> str:
-        """Return an SVG animation with opacity 1 in the scenes in which ``lit`` is True, and 0 in the others."""
+        """Return an SVG animation with opacity 1 in scenes in which ``lit`` is True, and opacity 0 in other scenes."""
         values, times, k = [], [], 0
         for on, run in groupby(lit):
             values.append("1" if on else "0")
@@ -179,12 +180,12 @@ class _Strip:
 
 
 def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
-    """Yield the SVG elements of the clock: the seconds since the alert, and a line that fills.
+    """Yield the SVG elements of the clock: a scale in seconds since the alert, and a bar that grows with time.
 
     Args:
-        y: height of the line in the picture.
-        last: number of the last scene of the longest film.
-        frames: number of scenes until the animation begins again.
+        y: vertical position of the bar in the picture.
+        last: index of the last scene of the longest film.
+        frames: number of scenes until the animation starts again.
         fps: scenes per second.
 
     """

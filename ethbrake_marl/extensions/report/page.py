@@ -1,8 +1,8 @@
-"""HTML pages. Each page is a single file that loads no other file and can be opened from disk.
+"""HTML pages that are a single file each, and load no other file.
 
-A page is a title, a short lead, and sections. A section holds strings, which become paragraphs, and parts: tables,
-figures, the episode player. Strings are never read as HTML: they are escaped, and control characters and characters
-that change the writing direction are shown as Python escapes.
+A page consists of a title, a short lead and sections. A section contains strings, which become paragraphs, and parts:
+tables, figures or the episode player. Strings are escaped, so they never act as HTML. Control characters, and
+characters that change the writing direction, are shown as Python escapes.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _STAY = "\u00a0"  # no-break space
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of a page: its HTML, and the style sheets and scripts that it needs.
+    """Part of an HTML page: its HTML text, and the names of the style sheets and scripts that it needs.
 
     Class methods make the usual parts, for instance ``Part.paragraph("Text")``.
     """
 
-    html: Markup  # markup of the piece
+    html: Markup  # HTML text of the part
     styles: tuple[str, ...] = ()  # names of style sheets in this folder
     scripts: tuple[str, ...] = ()  # names of scripts in this folder
 
@@ -58,13 +58,13 @@ class Part:
 
     @classmethod
     def facts(cls, facts: Mapping[str, object]) -> Part:
-        """Return a part that lists names with their values, one below the other; ``facts`` maps names to values."""
+        """Return a part with a list of names and values; ``facts`` maps each name to its value."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in facts.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
     @classmethod
     def remarks(cls, texts: Sequence[str]) -> Part:
-        """Return a part with ``texts`` as a list of important remarks, one line each; an empty part if none."""
+        """Return a part with a list of important remarks; an empty part if ``texts`` is empty."""
         lines = [Markup("<li>{}</li>").format(shown(text)) for text in texts]
         return cls(Markup('<ul class="remarks">\n{}\n</ul>\n').format(Markup("\n").join(lines)) if lines else Markup())
 
@@ -75,12 +75,12 @@ class Part:
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
-        """Return one part that shows ``parts`` side by side in equal widths; below each other on a narrow screen."""
+        """Return one part that shows ``parts`` side by side, or one below the other on a narrow screen."""
         return cls._around('<div class="beside">{}</div>\n', parts)
 
     @classmethod
     def opened(cls, title: str, parts: Sequence[Part]) -> Part:
-        """Return one part with ``parts`` under a title; they are hidden until the reader clicks on the title."""
+        """Return one part with ``parts`` under a title. The parts are hidden until the reader clicks on the title."""
         return cls._around("<details><summary>{}</summary>\n{}</details>\n", parts, shown(title))
 
     @classmethod
@@ -91,15 +91,15 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Return a part that holds ``content`` as JSON inside a script element, for a script of the page to read.
+        """Return a part with ``content`` as JSON in a script element, which the scripts of the page can read.
 
-        The text can neither end its element nor begin another one.
+        The characters < > and & are escaped, so the content cannot end the element or begin another one.
 
         Args:
             name: id of the element.
             content: plain data: mappings, lists, texts and numbers.
-            styles: style sheets that the reading script needs.
-            scripts: names of the scripts that read it.
+            styles: names of the style sheets that the scripts need.
+            scripts: names of the scripts that read the data.
 
         """
         text = json.dumps(content, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
@@ -110,18 +110,19 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """Return a part: the template ``file`` of this folder, filled with ``values``. Text is escaped, ``Markup`` is
-        not.
+        """Return a part made from the template ``file`` in this folder, filled with ``values``.
 
-        ``styles`` and ``scripts`` are names of files in this folder that it needs.
+        Values of the type ``Markup`` are inserted unchanged; other values are escaped. ``styles`` and ``scripts`` are
+        the names of the files in this folder that the part needs.
         """
         return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
 
     @classmethod
     def table(cls, sheet: Sheet) -> Part:
-        """Return a part that shows ``sheet`` as a table, which scrolls if it is wider than the page.
+        """Return a part that shows ``sheet`` as a table. A table that is wider than the page can be scrolled.
 
-        A cell may be a ``Shown`` whose value is ``Markup``, for instance a button; other texts are escaped.
+        A cell may be a ``Shown`` object with a value of the type ``Markup``, for instance a button. All other texts are
+        escaped.
         """
         return cls(Markup(sheet.html() + "\n"))
 
@@ -136,17 +137,19 @@ class Part:
         known: str = "",
         where: object = "",
     ) -> Part:
-        """Return a part that shows a figure, or the SVG of a figure of this package, with a title and a description.
+        """Return a part that shows a figure with a title and a description.
 
-        The caption is removed from the SVG and becomes text of the page below it, which a phone can show.
+        The caption of the figure becomes text of the page below the figure, because the text of a wide figure is too
+        small on a phone. Raises ``InvalidInput`` if ``figure`` is not the SVG of a figure of this package.
 
         Args:
-            figure: the figure, or the bytes of its SVG. It takes the colours of the page, light or dark.
-            title: title above it.
-            description: what it shows, in words.
-            alone: keep the colours, as a map needs them, on a white background.
-            known: part of the caption that stands elsewhere on the page; it is left out here.
-            where: file that the SVG was read from, for the error message about a foreign SVG.
+            figure: figure, or the bytes of the SVG of a figure of this package.
+            title: title above the figure.
+            description: description of what the figure shows.
+            alone: True: keep the colours of the figure, on a white background, as for a map. False: use the colours of
+                the page, light or dark.
+            known: text that is omitted from the caption, because it is elsewhere on the page.
+            where: file of the SVG, for error messages.
 
         """
         from ethbrake_marl.extensions.report.svg import inline_svg
@@ -175,16 +178,16 @@ class Part:
         shown_first: Sequence[int] = (),
         folded: bool = False,
     ) -> Part:
-        """Return a part with the player of episodes, in which a reader watches the same worlds under different agents.
+        """Return a part with the episode player, which shows the same worlds driven by different agents.
 
         Args:
-            worlds: at least one world, with its episode under each agent.
-            driven: indices (0 = front) of the controlled vehicles; a mapping by agent if agents control different
-                vehicles.
-            focus: name of an agent that is shown at first, besides the first and the last ones.
-            shown_first: positions (from 0) of the agents that are shown at first instead; empty: the first, the focus
-                and the last.
-            folded: hide the traces until their title is clicked.
+            worlds: worlds to show, at least one, with the episode of each agent.
+            driven: indices (0 = front) of the controlled vehicles; or a mapping from agents to indices if the agents
+                control different vehicles.
+            focus: name of an agent that is selected at the start, together with the first and the last agent.
+            shown_first: indices of the agents that are selected at the start; empty: the first agent, ``focus`` and
+                the last agent.
+            folded: whether the curves over time are hidden until the reader clicks on their title.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -234,7 +237,7 @@ class Section:
 
     @property
     def parts(self) -> list[Part]:
-        """The body of the section as parts; every string becomes a paragraph."""
+        """Body of the section as parts; every string becomes a paragraph."""
         return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
 
 
@@ -244,8 +247,8 @@ class Page:
 
     Args:
         title: title of the page.
-        sections: sections in order; each has an entry in the table of contents.
-        lead: one or two sentences below the title that say what the page is about.
+        sections: sections in order; each section has an entry in the table of contents.
+        lead: one or two sentences about the page, shown below the title.
         opening: parts between the lead and the table of contents.
 
     >>> from ethbrake_marl.extensions.report.page import Page, Part, Section
@@ -266,14 +269,14 @@ class Page:
 
     @cached_property
     def _code(self) -> tuple[str, str]:
-        """Text of all style sheets and of all scripts of the page; each file is included once."""
+        """Text of all style sheets, and text of all scripts of the page. Each file is included once."""
         styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
         scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
         return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
 
     @property
     def policy(self) -> str:
-        """Content security policy of the page: its own styles and scripts, embedded pictures, and nothing else."""
+        """Content security policy of the page: only its own styles and scripts, and embedded pictures, are allowed."""
         styles, script = (
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
             for text in self._code
@@ -285,7 +288,7 @@ class Page:
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
-        """Return a unique link name for each title, of letters, digits and hyphens, for instance "worst-ten-worlds"."""
+        """Return a unique link name for each title, made of letters, digits and hyphens ("worst-ten-worlds")."""
         anchors: list[str] = []
         for k, title in enumerate(titles):
             name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
@@ -294,7 +297,7 @@ class Page:
 
     @cached_property
     def html(self) -> str:
-        """The whole page as HTML text."""
+        """HTML text of the whole page."""
         styles, script = self._code
         names = self.anchors([section.title for section in self.sections])
         whole = Part.template(
@@ -311,7 +314,7 @@ class Page:
 
 
 def shown(value: object) -> str:
-    """Return ``value`` as text for a page, with control and direction characters escaped."""
+    """Return ``value`` as text, with control characters and characters that change the writing direction escaped."""
     return plain_text(str(value), keep=_STAY)
 
 

@@ -1,4 +1,4 @@
-"""Rows of the paper's two tables, and the check that an evaluation is about the same test."""
+"""Rows of the paper's two tables of results, and the check that an evaluation uses the same test as the paper."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ethbrake_marl.scenario.task import Task
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One row of a table of the paper, as printed. The paper reports a single harm and no intervals."""
+    """One row of a table of results as printed in the paper. The paper has one harm count and no intervals."""
 
     table: Literal["random test", "hybrid test"]  # title of the table
     agent: str  # name of the strategy in the paper
     episodes: int  # number of worlds
     collisions: int  # number of worlds with a collision
-    collision_rate: float  # share of worlds with a collision
+    collision_rate: float  # fraction of worlds with a collision
     average_harm: float  # mean harm, m2/s2
-    # decrease of harm against the strategy Non-E, as a share, as printed; None: not printed
+    # decrease of harm as a fraction of the harm of the strategy Non-E; None: the paper prints no value
     harm_decrease: float | None
 
 
@@ -50,38 +50,37 @@ PAPER_PARAMETERS = {
 }
 
 PAPER_NOTE = (
-    "The paper's rows cannot come from the parameters that it states: in 62.3 % of the worlds of its random test no"
-    " command of Vehicle 2 whatsoever avoids an impact (in 65.1 % none avoids contact), yet its hybrids collide in"
-    " 59 %; and in its 5,000-world test the hybrid avoids 2,005 collisions, although its two parts together avoid at"
-    " most 2,000. If Vehicle 2 could act at about 0.2 s instead of the stated 0.5 s, full braking would come close to"
-    " the paper's row (the scenario paper-random-early). The paper's E-V2X-BM harm is close to what the pairwise closed"
-    " form predicts at the alert, not to what those commands cause; for the 5,000-world table that holds only at the"
-    " speeds of the random test, since at those of the paper's figure of distances it predicts 3.07. Nothing here is"
-    " tuned to these rows. docs/internals/paper.md goes through the paper's equations, figures and tables one by one."
+    "The paper's rows contradict the parameters that the paper states. In 62.3 % of the worlds of its random test, no"
+    " command of Vehicle 2 avoids an impact (in 65.1 %, none avoids contact), but the paper's hybrids collide in only"
+    " 59 %. In the paper's test of 5,000 worlds, the hybrid avoids 2,005 collisions, although its two components"
+    " together avoid at most 2,000. If Vehicle 2 could act after about 0.2 s instead of the stated 0.5 s, full braking"
+    " would come close to the paper's row (scenario paper-random-early). The paper's harm of E-V2X-BM is close to the"
+    " harm that the pairwise closed form predicts, not to the simulated harm. For the table of 5,000 worlds, this is"
+    " true only at the speeds of the random test: at the speeds of the paper's figure of distances, the closed form"
+    " predicts 3.07. Nothing in this package is tuned to these rows. docs/internals/paper.md discusses the paper's"
+    " equations, figures and tables one by one."
 )
 
 _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant that PAPER_NOTE mentions
 
 
 def is_papers_test(task: Task, seed: int | None) -> bool:
-    """Return whether the paper's rows apply: Vehicle 2 is controlled in a list of the paper's random test, as shipped.
+    """Return whether an evaluation can be compared with the paper's rows.
 
-    ``task`` is the evaluated task, ``seed`` the seed of the list of worlds; None: unknown.
+    This is so if the scenario is the paper's random test as shipped, Vehicle 2 alone is controlled, and the seed is
+    known. ``task`` is the evaluated task. ``seed`` is the seed of the list of worlds; None: unknown.
     """
     scenario = task.scenario
     return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
 
 
 def check_papers_test(task: Task, seed: int | None) -> None:
-    """Raise ``InvalidInput`` unless the paper's rows apply: ``task`` controls Vehicle 2 in a list of the paper's random
-    test.
-
-    ``seed`` is the seed of the list; None: unknown, which raises.
-    """
+    """Raise ``InvalidInput`` if an evaluation cannot be compared with the paper's rows (see ``is_papers_test``)."""
     if not is_papers_test(task, seed):
         raise InvalidInput(
-            f"paper: the paper's rows are about Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, and these"
-            f" are {'worlds of no known seed' if seed is None else 'a list'} of {task.scenario.name!r};"
+            f"paper: the paper's rows apply to Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, but the"
+            f" evaluation has {'worlds without a seed' if seed is None else 'a list'} of {task.scenario.name!r} with"
+            f" the controlled vehicles {task.names};"
             f" {'give evaluate the seed of the list, or ' if seed is None else ''}leave paper out"
         )
 
@@ -89,8 +88,8 @@ def check_papers_test(task: Task, seed: int | None) -> None:
 def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
     """Return the summary of an evaluation, with the rows of the paper's tables below it.
 
-    Raises ``InvalidInput`` if the paper's rows are about other worlds. ``baseline`` is the agent with which others are
-    compared.
+    Raises ``InvalidInput`` if the paper's rows do not apply to the evaluation. ``baseline`` is the agent with which
+    the other agents are compared.
     """
     check_papers_test(evaluation.task, evaluation.seed)
     return with_paper_rows(summarise(evaluation, baseline=baseline))

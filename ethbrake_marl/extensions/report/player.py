@@ -1,4 +1,4 @@
-"""Data of the episode player: what a page holds of each episode, exact between events."""
+"""Data of the episode player: the motion of each episode, from which the player computes exact positions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLAYER_SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
 
 DATA = "episode_data"  # id of the data in a page; no section has it
 
-_BIN_S = 1e-3  # of several impacts of a pair within this time only the last is drawn; all are counted
+_BIN_S = 1e-3  # s; if a pair has several impacts within this time, only the last one is drawn, but all are counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,21 +26,20 @@ class Played:
     """One world of the episode player, with the motion of the vehicles under every agent."""
 
     number: int  # number of the world in its list
-    kind: str  # reason why the world is shown, as a heading
+    kind: str  # heading of the group of worlds, which says why the world is shown
     why: str  # special property of the world, in a few words
     motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # motion of the vehicles, by name of the agent
-    title: str = ""  # name of the world; empty: "World" and its number
+    title: str = ""  # title of the world; empty: "World" and its number
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent control the worlds of ``played``, and store the motion in the ``motions`` of each entry, under
-        the agent's name.
+        """Let one agent drive the worlds, and store the motion under the agent's name in the ``motions`` of each entry.
 
         Args:
-            played: one entry for each world.
-            worlds: the worlds at the alert, in the same order.
+            played: one entry for each world; their ``motions`` are changed.
+            worlds: worlds at the alert, in the same order.
             name: name of the agent on the page.
-            agent: the agent; it is not changed.
+            agent: agent that drives; it is not changed.
             scenario: scenario of the worlds; its learners are the controlled vehicles.
 
         """
@@ -49,7 +48,7 @@ class Played:
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
-        """Return the data of one episode for the player's script, as a mapping.
+        """Return the data of one episode for the script of the player, by name.
 
         Args:
             motion: motion of the vehicles.
@@ -73,13 +72,12 @@ class Played:
 
 
 def _impacts(motion: EpisodeMotion) -> list[list[float]]:
-    """Return the impacts of an episode as lists, in order of time.
+    """Return a list of seven numbers for each impact of an episode, in order of time.
 
-    Entries of a list: time (s), index of the pair, closing speed (m/s), 1 for the first impact of the pair (else 0),
-    number of the impact in the episode from 1, first-impact harm so far, total harm so far (m2/s2).
-
-    Of several impacts of a pair within ``_BIN_S`` only the last is kept. The harm after the last impact is exactly the
-    recorded harm of the episode.
+    The numbers are the time (s), the index of the pair, the closing speed (m/s), 1 for the first impact of the pair and
+    0 for a later one, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
+    harm so far (m2/s2). If a pair has several impacts within ``_BIN_S``, only the last one is returned. The harm after
+    the last impact is exactly the recorded harm of the episode.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

@@ -1,4 +1,4 @@
-"""The HTML report of an evaluation: results, episodes, worst worlds, avoidable harm, and the value of the shield."""
+"""The HTML report of an evaluation: results, episodes, worst worlds, avoidable harm, and the effect of the shield."""
 
 from __future__ import annotations
 
@@ -34,13 +34,14 @@ from ethbrake_marl.files.store import write_output
 from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 from ethbrake_marl.scenario.task import Task
 
-SHIELD_WORLDS = 200  # number of worlds in which a shield's replacements are simulated again
+SHIELD_WORLDS = 200  # number of worlds in which each replacement by a shield is simulated again
 
 
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
-    """Return the section on the ten worlds in which the agent ``focus`` did worst.
+    """Return the section with the ten worlds in which the agent ``focus`` did worst.
 
-    ``watched`` are the numbers of worlds that the page's player shows; they get a button that starts it.
+    ``watched`` are the numbers of the worlds that the player of the page can show. A button next to each of these
+    worlds starts the player.
     """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -52,36 +53,38 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
         "Contact": None if avoidable is None else np.where(avoidable, "avoidable", "unavoidable"),
         "Impacts": outcome.impacts,
     }
-    told = {name: column.tolist() for name, column in columns.items() if column is not None}
+    filled = {name: column.tolist() for name, column in columns.items() if column is not None}
     rows = []
     for k in worst_rows(evaluation, focus).tolist():
         number = int(evaluation.index[k])
         button = Markup('{} <button type="button" data-watch="{}">Watch</button>').format(number, number)
-        rows.append([Shown(button) if number in watched else number, *(column[k] for column in told.values())])
-    why = ", as nothing is proven of these worlds" if regrets is None else " above the best known"
-    body: list[str | Part] = [f"{focus} did no harm above the best known in any of these worlds."]
+        rows.append([Shown(button) if number in watched else number, *(column[k] for column in filled.values())])
+    by = "total harm" if regrets is None else "total harm minus best known total harm"
+    body: list[str | Part] = [f"In all worlds, {focus} did no more harm than the best known harm."]
     if rows:
-        table = Part.table(Sheet(f"Worlds of {focus}", list(map(Column, ("World", *told))), rows))
-        body = [f"Of {focus}, by total harm{why}. Harm in m²/s².", table]
+        table = Part.table(Sheet(f"Worlds of {focus}", list(map(Column, ("World", *filled))), rows))
+        body = [f"The worlds in which {focus} did worst, by {by}. Harm in m²/s².", table]
     return Section("Worst ten worlds", body)
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
-    """Return the section that shows collisions, harm and regret separately for avoidable and for unavoidable
-    contact.
-    """
+    """Return the section with collisions, harm and regret, separately for avoidable and unavoidable contact."""
     regrets, limits = regrets_of(evaluation), limits_of(evaluation)
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     if isinstance(limits, Unproven):
-        text = "Nothing is proven of these worlds, so what was avoidable is not told apart."
+        text = "The proofs do not cover these worlds, so avoidable and unavoidable contacts are not separated."
         body.append(f"{text} Reason: {limits.because}.")
     elif regrets is None or avoidable is None:
-        body.append("Where contact can be avoided is not decided for these vehicles, so that is not told apart.")
+        body.append(
+            "It is not proven in which worlds these vehicles can avoid contact, so avoidable and unavoidable contacts"
+            " are not separated."
+        )
     else:
         share = share_of(avoidable, evaluation.clusters).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
-            f"Contact can be avoided in {share} of these worlds (proven, world by world); in the others no command can."
+            f"Contact can be avoided in {share} of the worlds. In the other worlds, no command can avoid it (both"
+            " proven for each world)."
         )
         for where, among in (("Contact avoidable", avoidable), ("Contact unavoidable", ~avoidable)):
             if among.any():
@@ -98,12 +101,12 @@ def avoidable_section(evaluation: Evaluation) -> Section:
                     for agent, each in part.outcomes.items()
                 ]
                 body.append(Part.table(Sheet(caption, _SPLIT, rows)))
-        about = "Mean harm per world as the least that is known, and what each agent did above it."
-        body.append(Part.drawing(harm_in_parts(evaluation), "What the harm is made of", about))
-    title, words = "Harm world by world", "For each harm x, the share of the worlds in which an agent did more."
+        about = "Mean harm per world, divided into the best known harm and the regret of each agent."
+        body.append(Part.drawing(harm_in_parts(evaluation), "Avoidable and unavoidable harm", about))
+    title, words = "Harm world by world", "For each harm x: share of the worlds in which an agent did more harm than x."
     if regrets is not None:
         title = "Regret world by world"
-        words = "For each regret x, the share of the worlds in which an agent did more than x above the best known."
+        words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."
     body.append(Part.drawing(regret_distribution(evaluation), title, words))
     return Section("What was avoidable", body)
 
@@ -115,23 +118,25 @@ _SPLIT: tuple[Column | str, ...] = (
 
 
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
-    """Return the section that compares the shield's modes, and counts how many interventions of step mode were needed,
-    harmless or costly.
+    """Return the section that compares the modes of the shield.
 
-    ``rows`` are the results by agent and mode, ``conditions`` a line on the worlds. The section is empty without rows.
+    The section also counts how many interventions of the mode step were needed, harmless or costly. ``rows`` are the
+    results of each agent and mode. ``conditions`` is a sentence that describes the worlds. The section is empty if
+    there are no rows.
     """
     if not rows:
         return Section("Shield", ())
     text = (
-        "What is shielded, alone and behind every mode of the shield. step-alert rolls the policy out at the alert"
-        " alone; step-cap, of several vehicles, lets none bear more than under the plan with which the shield begins"
-        " (the baseline plan). Each decision that step mode replaced was simulated again without it: needed (harm would"
-        " have been higher), harmless (the same), costly (lower)."
+        "Each agent without its shield, and with every mode of the shield. The mode step-alert simulates the policy at"
+        " the alert only. With several vehicles, the mode step-cap lets no vehicle bear more harm than under the first"
+        " plan of the shield (the baseline plan). Each decision that the mode step replaced was simulated again without"
+        " the replacement. The replacement was needed if the harm is then higher, harmless if it is equal, and costly"
+        " if it is lower."
     )
     body: list[str | Part] = [text, *map(Part.table, rows.sheets()), Part.paragraph(conditions, "quiet")]
     if left_out := rows[0].left_out:
-        told_of = count_of(len(left_out), "world")
-        body.append(Part.paragraph(f"Left out: {told_of}, which the physics could not advance.", "note"))
+        count = count_of(len(left_out), "world")
+        body.append(Part.paragraph(f"{count} left out, because the physics could not simulate the motion.", "note"))
     return Section("Shield", body)
 
 
@@ -146,35 +151,35 @@ _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_
 class Report:
     """Content of the HTML report of an evaluation.
 
-    ``html`` is the page, ``write`` writes it to a file, and ``driven`` adds episodes to watch.
+    ``html`` is the text of the page, ``write`` writes the page to a file, and ``driven`` adds episodes to watch.
     """
 
     title: str  # title of the page
     rows: Sequence[SummaryRow]  # summary of each agent
     evaluation: Evaluation  # evaluation that the rows summarise
     played: Sequence[Played] = ()  # episodes to watch
-    shield: Section | None = None  # section on the shield; None: no shield was measured
-    focus: str = ""  # agent whose worst worlds are shown; empty: no such section
+    shield: Section | None = None  # section about shields; None: no shield was measured
+    focus: str = ""  # agent whose worst worlds are shown; empty: no section with worst worlds
     sections: Sequence[Section] = ()  # further sections, below the results
     figures: Sequence[Part] = ()  # figures to show, as parts of a page
     # other tests: title, how the test differs, summary of each agent
     tests: Sequence[tuple[str, str, Sequence[SummaryRow]]] = ()
     harm_count: HarmCount = "first"  # harm count that the agents minimised
     remarks: Sequence[str] = ()  # important remarks, below the first sentence
-    summary: str = ""  # one or two sentences on what was compared
-    # name -> value of command, seeds and training set-up, printed unchanged
+    summary: str = ""  # one or two sentences about the compared agents
+    # command, seeds and settings of the training, by name; printed unchanged
     settings: Mapping[str, object] = field(default_factory=dict)
-    versions: Mapping[str, str] = field(default_factory=dict)  # name -> version of software, printed unchanged
+    versions: Mapping[str, str] = field(default_factory=dict)  # versions of software, by name; printed unchanged
 
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
-        """Return the report with episodes to watch and with the section on shields.
+        """Return the report with episodes to watch and with the section about shields.
 
-        For the episodes every agent drives once more. Shields are measured in the first ``SHIELD_WORLDS`` worlds, in
-        every mode and without a shield.
+        Every agent drives the chosen worlds again. The modes of each shield are compared in the first ``SHIELD_WORLDS``
+        worlds.
 
         Args:
-            agents: the evaluated agents by name; they are not changed.
-            on_agent: called with the name of each agent that is done.
+            agents: evaluated agents, by name; they are not changed.
+            on_agent: function that is called with the name of each agent when it has driven the chosen worlds.
 
         """
         evaluation, focus, harm_count = self.evaluation, self.about, self.harm_count
@@ -193,29 +198,29 @@ class Report:
         changed = {"count": some.worlds.n, "recordings": some.recordings}
         line = Conditions({**evaluation.conditions, **changed}).line
         count = "First-impact" if harm_count == "first" else "Total"
-        shield = shield_section(modes, f"{count} harm, which the shield bounds, in m²/s². {line}.")
+        shield = shield_section(modes, f"{count} harm in m²/s²; the shield bounds this harm. {line}.")
         return replace(self, played=played, shield=shield, focus=focus)
 
     @property
     def about(self) -> str:
         """Name of the agent that the page is about.
 
-        It is ``focus``, else the last agent with a trained policy, else the last agent.
+        It is ``focus`` if given. Otherwise it is the last agent with a trained policy, or the last agent.
         """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
 
     @property
     def html(self) -> str:
-        """The whole page as HTML text. It loads no other file."""
+        """HTML text of the whole page. The page loads no other file."""
         sections: list[Section | None] = [self._results(), *self.sections, self._episodes()]
         if self.focus:
             sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
         sections += [avoidable_section(self.evaluation), self.shield, Section("Figures", self.figures)]
         all_rows = _table_of(self.rows)
         sheet, nowhere = all_rows.sheet(), set(_empty(all_rows))
-        for title, about, told_rows in self.tests:
-            rows = _table_of(told_rows)
+        for title, about, test_rows in self.tests:
+            rows = _table_of(test_rows)
             notes = [Part.paragraph(text, "note") for text in _remarks(rows)]
             parts = [_short_table(rows), *notes, *_measured(rows), Part.paragraph(identity_line(rows), "quiet")]
             sections.append(Section(title, [about, *parts]))
@@ -240,17 +245,17 @@ class Report:
     def write(self, path: str | Path, *, force: bool = False) -> None:
         """Write the page to the file ``path``.
 
-        Raises ``AlreadyExists`` for an existing file unless ``force``, ``InvalidInput`` if the folder does not exist.
+        Raises ``AlreadyExists`` if the file exists and ``force`` is false, and ``InvalidInput`` if the folder does not
+        exist.
         """
         write_output(path, self.html.encode("utf-8"), force=force)
 
     @property
     def first_sentence(self) -> str:
-        """Sentence at the top of the page: the agent's harm against full braking and the best known harm, and where it
-        fails.
+        """Sentence at the top of the page, which compares the agent's harm with full braking and the best known harm.
 
-        It fails in another test where it does no less harm than full braking. If it fails in none, the share of worlds
-        in which it does more harm is named.
+        The sentence names the other tests in which the agent does at least as much harm as full braking. If there are
+        no such tests, it states in how many worlds the agent does more harm than full braking.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -269,12 +274,14 @@ class Report:
         numbers = f"{impacts}: {_words(value)} m²/s² per emergency instead of {_words(before[harm])}{known}"
         fails = self._fails(harm)
         joined = ", but " if fails and change == "less" else ", and "
-        return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in none of these worlds more'}."
+        return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in no world more'}."
 
     def _fails(self, harm: str) -> str:
-        """Return a clause on where the agent does no less harm than full braking; empty if nowhere.
+        """Return a clause that names where the agent fails; an empty text if it fails nowhere.
 
-        ``harm`` is the measure to compare, for instance ``total_harm``.
+        The agent fails in another test if it does at least as much harm as full braking there. If it fails in no test,
+        the clause states the share of worlds in which it does more harm. ``harm`` is the measure to compare, for
+        instance ``total_harm``.
         """
         reasons = []
         for title, _, others in self.tests:
@@ -289,10 +296,10 @@ class Report:
         share = float((after > before + ROUNDING).mean())
         most = float((after - before).max())
         often, much = f"{100.0 * share:.1f}" if share >= 0.0005 else "less than 0.1", max(most, 0.01)
-        return f"more in {often} % of these worlds, by {much:.2f} at most" if share else ""
+        return f"more in {often} % of the worlds, by {much:.2f} at most" if share else ""
 
     def _opening(self, rows: SummaryTable) -> list[Part]:
-        """Return the parts at the top of the page: important remarks, one figure and one table."""
+        """Return the parts at the top of the page: important remarks, a figure and a table."""
         if not rows:
             return []
         which = "First-impact" if self.harm_count == "first" else "Total"
@@ -305,14 +312,12 @@ class Report:
 
     def _results(self) -> Section:
         rows, limits = _table_of(self.rows), limits_of(self.evaluation)
-        because = f" Nothing is proven of these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
+        because = f" The proofs do not cover these worlds: {limits.because}." if isinstance(limits, Unproven) else ""
         parts: list[str | Part] = [self.summary] if self.summary else []
         return Section("Results", [*parts, Part.box("Three words", WORDS), *_measured(rows, because)])
 
     def _episodes(self) -> Section:
-        """Return the section with episodes to watch. Notes name agents whose second drive differs from the
-        evaluation.
-        """
+        """Return the section with episodes to watch. Notes name the agents that drove differently the second time."""
         evaluation, played = self.evaluation, self.played
         if not played:
             return Section("Episodes", ())
@@ -324,17 +329,18 @@ class Report:
                 counted = (float(outcome.first_impact_harm[row]), float(outcome.total_harm[row]))
                 unrepeated[agent] = unrepeated.get(agent, 0) + (motion.harm != counted)
         notes = [
-            f"{agent} did not repeat itself in {count_of(count, 'world')} of these: what is played there is another"
-            " episode than the one that the tables count."
+            f"In {count_of(count, 'world')} of these, {agent} drove differently the second time: the player shows"
+            " another episode than the tables."
             for agent, count in unrepeated.items()
             if count
         ]
         moving = sum(not all(motion.at_rest for motion in world.motions.values()) for world in played)
         until = (
-            f"from the alert to rest, or to the horizon of {evaluation.scenario.horizon_s:g} s: in"
-            f" {count_of(moving, 'world')} the line of some agent was not at rest then, and the player says whose"
+            f"from the alert until all vehicles are at rest, or until the horizon of"
+            f" {evaluation.scenario.horizon_s:g} s. In {count_of(moving, 'world')}, vehicles still moved at the horizon"
+            " under some agent; the player names this agent"
         )
-        until = until if moving else "from the alert to rest"
+        until = until if moving else "from the alert until all vehicles are at rest"
         shown, every = len(played), evaluation.worlds.n
         how_many = f"{shown} of the {every:,} worlds" if shown < every else f"All {shown} worlds"
         player = Part.player(played, evaluation.vehicles, focus=self.focus)
@@ -348,10 +354,10 @@ def _words(estimate: Estimate | None) -> str:
 
 
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Compare an agent's harm with full braking in the same worlds: "less", "more" or "as much".
+    """Compare an agent's harm with full braking in the same worlds, and return "less", "more" or "as much".
 
-    It is "as much" if the interval of the difference contains 0, or is unknown for several worlds. ``harm`` is the
-    measure, for instance ``total_harm``.
+    The result is "as much" if the interval of the difference contains 0, or if the interval of several worlds is
+    unknown. ``harm`` is the measure to compare, for instance ``total_harm``.
     """
     difference = row[f"{harm}_difference"]
     unknown = difference is None or (difference.interval is None and row.episodes > 1)
@@ -360,7 +366,7 @@ def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
 
 
 def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
-    """Return ``rows`` as a summary table. A table is returned unchanged, with its rows of other sources."""
+    """Return ``rows`` as a summary table. A summary table is returned unchanged, including the paper's rows."""
     return rows if isinstance(rows, SummaryTable) else SummaryTable(rows)
 
 
@@ -371,23 +377,22 @@ def _short_table(rows: SummaryTable) -> Part:
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
-    """Return the texts of the important remarks about these rows."""
+    """Return the texts of the important remarks about ``rows``."""
     return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """Return parts with the conditions of these rows and, hidden until clicked, a table of all measures with the
-    paper's rows.
+    """Return parts with the conditions of ``rows``, and a table of all measures that is hidden until clicked.
 
-    ``because`` is a sentence with the reason for empty columns.
+    The table also contains the paper's rows. ``because`` is a sentence with the reason for empty columns.
     """
     ours = SummaryTable(rows)
     whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
     folded = [
-        _table(whole, "Every harm and what it is compared with", set(whole.names) - _OTHERS),
-        _table(ours.sheet(), "In the same worlds", _OTHERS),
+        _table(whole, "All measures of harm", set(whole.names) - _OTHERS),
+        _table(ours.sheet(), "Other measures in the same worlds", _OTHERS),
     ]
-    left_out = f"Columns without a value in any row are left out: {'; '.join(empty)}.{because}"
+    left_out = f"Columns without values are left out: {'; '.join(empty)}.{because}"
     lines = [*([("quiet", left_out)] if empty else []), *(note for note in rows.notes() if note not in notes)]
     folded += [Part.paragraph(text, kind) for kind, text in lines]
     quiet = [
@@ -399,15 +404,14 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
 
 
 def _empty(rows: SummaryTable) -> list[str]:
-    """Return the headings of the columns of a summary in which no row has a value."""
+    """Return the headings of the empty columns of a summary, in which no row has a value."""
     sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table of some columns of ``sheet``: its first column (the agent) and the columns in ``names`` that have
-    a value.
+    """Return a table with the first column of ``sheet`` (the agent) and the columns in ``names`` that are not empty.
 
     ``caption`` is the title of the table.
     """
@@ -434,13 +438,13 @@ def write_evaluation(
     Raises the exceptions of ``Report.write``.
 
     Args:
-        path: the HTML file.
-        evaluation: the evaluation of the agents.
-        rows: its summary.
-        agents: the evaluated agents by name, which drive some worlds again to be watched.
-        harm_count: harm that the agents minimise.
-        force: replace an existing file.
-        tell: called with the number of agents that are done and their total.
+        path: path of the HTML file.
+        evaluation: evaluation of the agents.
+        rows: summary of the evaluation.
+        agents: evaluated agents, by name; they drive some worlds again for the episode player.
+        harm_count: harm count that the agents minimise.
+        force: whether an existing file is replaced.
+        tell: function that is called with the number of agents that have driven, and the number of all agents.
 
     """
     done: list[str] = []

@@ -1,4 +1,4 @@
-"""Figures of a run: the learning curve, and harm against the total gap."""
+"""Figures of a run: the learning curve, and harm against the sum of the gaps at the alert."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _PANELS = (
     ("collision_rate", "Worlds with a collision"),
 )
 
-_POLICY_NUMBER = 3  # number of the series whose colour the learning policy has
+_POLICY_NUMBER = 3  # index of the colour of the trained policy
 
 _POLICY = COLOURS[_POLICY_NUMBER]
 
@@ -33,19 +33,19 @@ def learning_curve(
     references: Sequence[SummaryRow] = (),
     caption: str = "",
 ) -> Figure:
-    """Draw both harms and the collision rate of a policy or team on a fixed list of worlds while it learns.
+    """Draw first-impact harm, total harm and collision rate of a policy or team over its training.
 
-    Raises ``InvalidInput`` without points.
+    Raises ``InvalidInput`` if ``points`` is empty.
 
     Args:
         points: evaluations in order; each has ``steps``, ``first_impact_harm``, ``total_harm`` and ``collision_rate``.
         learned: name of the policy or team in the legend.
-        references: summaries of other agents, drawn as level lines.
+        references: summaries of other agents, drawn as horizontal lines.
         caption: text below the figure.
 
     """
     if not points:
-        raise InvalidInput("learning_curve: no points; evaluate the policy at least once during training")
+        raise InvalidInput("learning_curve: there are no points; give at least one evaluation during the training")
     figure, panels = new_panels((10.0, 3.9), columns=3)
     steps = [point["steps"] for point in points]
     for axes, (name, label) in zip(panels, _PANELS, strict=True):
@@ -64,18 +64,19 @@ def learning_curve(
 
 
 def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
-    """Draw the mean of both harms against the sum of the gaps at the alert, one line per agent, with 95 % bands.
+    """Draw mean first-impact harm and mean total harm against the sum of the gaps at the alert.
 
-    Raises ``InvalidInput`` for an unknown agent or ``bins < 1``.
+    The figure has one line per agent, with a band for the 95 % interval. Raises ``InvalidInput`` if an agent is unknown
+    or ``bins`` is below 1.
 
     Args:
-        evaluation: worlds, and the outcome of each agent in them.
-        agents: names of the agents to draw; None: all.
-        bins: number of groups of worlds, of equal width in the sum of gaps.
+        evaluation: evaluation of the agents.
+        agents: names of the agents to draw; None: all agents.
+        bins: number of intervals of equal width into which the range of the sum of gaps is divided.
 
     """
     if not bins >= 1:
-        raise InvalidInput(f"harm_against_total_gap: bins = {bins}; at least 1 is needed")
+        raise InvalidInput(f"harm_against_total_gap: bins = {bins}: the number of bins must be at least 1")
     by = evaluation.clusters
     gap, gaps = evaluation.worlds.gaps_m.sum(axis=1), [f"d{p}" for p in range(1, evaluation.worlds.N)]
     part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * bins).astype(np.int64), bins - 1)
@@ -94,6 +95,6 @@ def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | No
             else:
                 axes.vlines(at, ends[:, 0], ends[:, 1], color=str(style["color"]), linewidth=1.2)
         name_axes(axes, label, f"Total gap at the alert, {sum_of_gaps} (m)")
-    panels[0].set_ylim(bottom=0.0)  # of both, once everything is drawn
-    caption = f"Mean per group of worlds; bands: 95 % intervals. {evaluation.conditions.line}."
+    panels[0].set_ylim(bottom=0.0)  # sets the limit of both panels, after all curves are drawn
+    caption = f"Mean over worlds with similar gaps; bands: 95 % intervals. {evaluation.conditions.line}."
     return finish(figure, caption, panels[0])

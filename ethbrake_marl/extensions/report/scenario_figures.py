@@ -1,4 +1,4 @@
-"""Figure of a scenario's worlds: the distribution of each quantity, quantities in pairs, and three worlds to scale."""
+"""Figure of the worlds of a scenario: distributions of quantities, scatter plots, and three worlds to scale."""
 
 from __future__ import annotations
 
@@ -30,38 +30,38 @@ from ethbrake_marl.scenario.fields import QUANTITY
 from ethbrake_marl.scenario.sample import Sample
 from ethbrake_marl.scenario.schema import Scenario
 
-_ABREAST = 4  # distributions in a row
+_ABREAST = 4  # number of distributions in a row of the figure
 
-_MOST_APART = 4  # most outlines in a distribution that get a legend
+_MOST_APART = 4  # largest number of outlines in a distribution with a legend
 
-_MOST_PAIRED = 5  # most quantities that are drawn in pairs
+_MOST_PAIRED = 5  # largest number of quantities that are drawn in pairs
 
-_LABEL_CHARACTERS = 18  # characters in a line of a pair's label
+_LABEL_CHARACTERS = 18  # number of characters in a line of text of a label
 
-_MOST_NAMED = 8  # longest line of vehicles whose gaps and speeds are written
+_MOST_NAMED = 8  # largest number of vehicles for which gaps and speeds are written
 
 _SHOWN = {0.0: "shortest line", 0.5: "median line", 1.0: "longest line"}  # by relative rank of the sum of gaps
 
 
 def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, force: bool = False) -> None:
-    """Write the picture of ``ethbrake scenario sample`` to the file ``path``. Raises the exceptions of
-    ``write_picture``.
+    """Write the picture of ``ethbrake scenario sample`` to the file ``path``.
 
-    ``seed`` is the seed of the list from which ``sample`` comes; ``force`` replaces an existing file.
+    Raises the exceptions of ``write_picture``. ``seed`` is the seed of the list of worlds in ``sample``. If ``force``
+    is true, an existing file is replaced.
     """
     write_picture(path, worlds_figure(scenario, sample, seed=seed), force=force)
 
 
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
-    """Draw the distribution of each quantity that varies, the most important ones in pairs, and three worlds to scale.
+    """Draw distributions of the quantities that vary, scatter plots of some pairs of them, and three worlds to scale.
 
-    Pairs show quantities of the first learner, and of the pair ahead of it, before quantities of other vehicles.
-    Colours separate the scenarios of a mixture, or the types of the first learner.
+    For the scatter plots, quantities of the first learner and of the pair ahead of it are chosen before quantities of
+    other vehicles. Colours separate the scenarios of a mixture, or the types of the first learner.
 
     Args:
-        scenario: the scenario of the worlds.
-        sample: the worlds.
-        seed: seed of their list, for the caption.
+        scenario: scenario of the worlds.
+        sample: worlds to draw.
+        seed: seed of the list of worlds, for the caption.
 
     """
     worlds, panels = sample.worlds, drawn_alike(sample.worlds, scenario)
@@ -82,16 +82,16 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
         draw(part)
     return finish(
         figure,
-        f"{label_text(scenario.name, 80)}, {count_of(worlds.n, 'world')} of the list of seed {seed}. Lines to scale,"
-        f" vehicles {BODY_M:g} m long; above: gaps (m), below: speeds (m/s).",
+        f"{label_text(scenario.name, 80)}, {count_of(worlds.n, 'world')} of the list of seed {seed}. Worlds are drawn"
+        f" to scale, with vehicles {BODY_M:g} m long; above: gaps (m), below: speeds (m/s).",
     )
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return the quantities of ``worlds`` to draw in pairs: label -> values [n].
+    """Return the quantities to draw in scatter plots, as a dictionary from labels to values [n].
 
-    Only quantities that vary between the worlds are drawn. Of each, the value of the vehicle (or pair) nearest to
-    vehicle ``focus`` is chosen first, then values of others while there is room.
+    Only quantities that vary between the worlds are used. For each quantity, the vehicle or pair nearest to the vehicle
+    ``focus`` comes first. At most ``_MOST_PAIRED`` labels are returned.
     """
     pairs: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
@@ -108,9 +108,9 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
-    """Draw the distribution of each quantity, with one outline for all vehicles that are drawn alike.
+    """Draw the distribution of each quantity, with one outline for all vehicles that have the same distribution.
 
-    ``panels`` maps each quantity to the values [n, ...] of each group of vehicles; ``part`` is a sub-figure of
+    ``panels`` maps each quantity to the values [n, ...] of each group of vehicles. ``part`` is a sub-figure of
     matplotlib.
     """
     columns = min(len(panels), _ABREAST)
@@ -136,10 +136,10 @@ def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> Non
 
 
 def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
-    """Draw each pair of quantities as points, below the diagonal, with a colour for each kind of world.
+    """Draw a scatter plot of each pair of quantities, with a colour for each kind of world.
 
-    ``paired`` maps labels to values [n], ``kinds`` [n] names the kind of each world, ``part`` is a sub-figure of
-    matplotlib.
+    ``paired`` maps labels to values [n]. ``kinds`` [n] are the names of the kinds of the worlds. ``part`` is a
+    sub-figure of matplotlib.
     """
     labels, values, names = list(paired), list(paired.values()), np.unique(kinds)
     grid = part.subplots(len(paired) - 1, len(paired) - 1, squeeze=False, sharex="col", sharey="row")
@@ -164,7 +164,7 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
 def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
     """Draw some worlds at the alert, to scale.
 
-    ``shown`` maps rows of the sample to descriptions; ``part`` is a sub-figure of matplotlib.
+    ``shown`` maps indices of worlds in ``sample`` to descriptions. ``part`` is a sub-figure of matplotlib.
     """
     worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Curves of several trainings: harm over training steps, with the spread over seeds."""
+"""Figure of several trainings: mean of a quantity over the training steps, with the spread between seeds."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class SeedCurve:
-    """One quantity during several trainings of one recipe that differ in their seeds, at common steps."""
+    """Values of one quantity during several trainings that differ only in their seeds, at k common steps."""
 
     steps: Floats  # [k] training steps (or another quantity of the x axis)
-    values: Floats  # [seeds, k] value of the quantity
+    values: Floats  # [seeds, k] values of the quantity
 
     @classmethod
     def of(cls, trainings: Sequence[Mapping[int, float]]) -> Self:
-        """Return the curve of several trainings, at the steps that all of them have.
+        """Return the curve of several trainings at the steps that all trainings have in common.
 
-        Each training maps steps to values. Raises ``InvalidInput`` if there is no common step.
+        Each training is a dictionary from steps to values. Raises ``InvalidInput`` if there is no common step.
         """
         common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
         if not common:
-            raise InvalidInput("curves of several seeds: the trainings were never evaluated at the same step")
+            raise InvalidInput(
+                "SeedCurve.of: no step is common to all trainings; give trainings that were evaluated at the same steps"
+            )
         values = [[training[step] for step in common] for training in trainings]
         return cls(np.array(common, np.float64), np.array(values, np.float64))
 
@@ -45,19 +47,18 @@ def seed_curves(
 ) -> Figure:
     """Draw one panel per quantity and one line per recipe: the mean over seeds, with a band of one standard deviation.
 
-    Raises ``InvalidInput`` without panels or lines.
+    Raises ``InvalidInput`` if there are no panels, or if a panel has no curves.
 
     Args:
-        panels: label of a quantity -> name of a recipe -> its curve.
-        logarithmic: labels of panels with a logarithmic axis, on which small harm late in the training is still
-            visible. The axis stays linear if a value is not positive.
+        panels: curves by label of the quantity and by name of the recipe.
+        logarithmic: labels of the panels with a logarithmic axis. The axis stays linear if a value is not positive.
         caption: text below the figure.
         x_label: label of the x axis.
-        known: best known value by label, marked by a dashed line; None: no line.
+        known: best known value by label of the quantity, drawn as a dashed line; None: no line.
 
     """
     if not panels or not all(panels.values()):
-        raise InvalidInput("seed_curves: nothing to draw; at least one training with one evaluation is needed")
+        raise InvalidInput("seed_curves: a panel has no curves; give at least one curve for each quantity")
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels))
     for axes, (label, curves) in zip(every, panels.items(), strict=True):
         for number, (recipe, curve) in enumerate(curves.items()):

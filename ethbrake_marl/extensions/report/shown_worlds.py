@@ -1,4 +1,4 @@
-"""Choice of the worlds that a report shows: the worst, the typical, and some at random."""
+"""Choice of the worlds that a report shows: worst worlds, typical worlds, and random worlds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_WORLDS = 50
 
 WORST = 10
 
-_EACH = 5  # number of worlds of each other kind
+_EACH = 5  # number of worlds of every kind except the worst and the random ones
 
 _RANDOM_SEED = 0
 
@@ -34,12 +34,11 @@ WORDS = {
 
 
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Choose up to ``most`` worlds to show. Return a mapping: index of the world in the evaluation -> its entry for the
-    episode player.
+    """Choose at most ``most`` worlds, and return their entries for the episode player, by index in the evaluation.
 
-    The worlds come in this order: those in which the agent ``focus`` did worst, had an avoidable collision, saved most
-    harm against full braking, or did more harm than full braking; then worlds with typical harm, and worlds drawn at
-    random. The entries hold no motion yet.
+    The order is: worlds in which the agent ``focus`` did worst, worlds with an avoidable collision, worlds with the
+    largest reduction of harm compared with full braking, worlds with more harm than full braking, worlds with typical
+    harm, and random worlds. The entries contain no motion yet.
     """
     outcome = evaluation.outcome(focus)
     chosen: dict[int, Played] = {}
@@ -67,10 +66,10 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 
 
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
-    """Return the indices of at most ten worlds in which the agent ``focus`` did worst, the worst first.
+    """Return the indices of at most ten worlds in which the agent ``focus`` did worst, worst first.
 
-    These have the largest regret in total harm, or the largest total harm if no best harm is known. Worlds in which
-    that value is 0 are left out.
+    The worlds are ordered by regret in total harm, or by total harm if no best harm is known. Worlds in which this
+    value is 0 are omitted.
     """
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")

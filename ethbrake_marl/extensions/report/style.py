@@ -21,7 +21,7 @@ from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.physics.state import Floats
 
-# Series differ by marker and dashes as well as by colour.
+# Curves differ by marker and dashes as well as by colour.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 DASHES: tuple[str | tuple[int, tuple[int, ...]], ...] = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1)), "-", "--")
@@ -38,7 +38,7 @@ CAPTION_PT = 7.5
 
 _CHARACTERS_PER_INCH = 17.0  # characters per inch of a caption
 
-_NO_DATES: dict[str, dict[str, None]] = {  # metadata to leave out, because they would differ from file to file
+_NO_DATES: dict[str, dict[str, None]] = {  # metadata to omit, because they differ between files of the same figure
     ".png": {"Software": None},
     ".svg": {"Date": None, "Creator": None},
     ".pdf": {"CreationDate": None, "Creator": None, "Producer": None},
@@ -46,12 +46,12 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to leave out, because they
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook displays by itself, with or without pyplot."""
+    """Figure that a notebook displays as the value of a cell, without pyplot."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with matplotlib's ``renderer``.
 
-        Saving a file draws twice; the first pass only computes the layout, because its picture is not used.
+        Saving a file calls this method twice. The first call only computes the layout, because its picture is not used.
         """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
@@ -64,16 +64,16 @@ class ShownFigure(Figure):
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Return colour, marker, dashes and sizes of line number ``number`` (from 0), as keywords of matplotlib's ``plot``.
+    """Return the style of curve ``number`` (from 0), as keyword arguments of matplotlib's ``plot``.
 
-    Styles repeat after seven lines.
+    Styles repeat after seven curves.
     """
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """Return text that is safe in a figure: no formula, only characters that the font has, at most ``most`` of them."""
+    """Return ``text`` without formulas, with only characters of the font, shortened to ``most`` characters."""
     signs = font_signs()
     label = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
     return (label if len(label) <= most else f"{label[: most - 16]}…{label[-15:]}").replace("$", r"\$")
@@ -81,12 +81,12 @@ def label_text(text: str, most: int = 40) -> str:
 
 @cache
 def font_signs() -> frozenset[int]:
-    """Return the code points of all characters that the font of figures has."""
+    """Return the code points of all characters in the font of the figures."""
     return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure with automatic layout that belongs to no window; sizes are in inches."""
+    """Return an empty figure with automatic layout. Width and height are in inches."""
     return ShownFigure(figsize=(width_in, height_in), layout="constrained")
 
 
@@ -102,9 +102,9 @@ def style_axes(axes: Axes, labelsize: float = 9) -> None:
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """Return a styled figure with ``rows`` times ``columns`` panels, and its axes, row by row.
+    """Return a figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
 
-    ``size_in`` is width and height in inches; ``how`` are further arguments of matplotlib's ``subplots``.
+    ``size_in`` is the width and height in inches. ``how`` are further arguments of matplotlib's ``subplots``.
     """
     figure = new_figure(*size_in)
     panels = list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
@@ -114,7 +114,7 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
-    """Set the title of a panel and the labels ``x`` and ``y`` of its axes; empty texts are left out."""
+    """Set the title of a panel and the labels ``x`` and ``y`` of its axes. Empty texts set nothing."""
     in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
     for text, write, size in in_style:
         if text:
@@ -130,12 +130,12 @@ def finish(
     fontsize: float = 9,
     loc: Literal["outside upper left", "outside upper right"] = "outside upper left",
 ) -> Figure:
-    """Add the caption and a legend to a figure. Return the figure.
+    """Add a caption and a legend to a figure, and return the figure.
 
     Args:
-        figure: the figure, which is changed.
-        caption: text below it.
-        legend: axes whose lines the legend names, for all panels; None: no legend.
+        figure: figure to change.
+        caption: text below the figure.
+        legend: axes whose curves the legend names, for all panels; None: no legend.
         columns: number of columns of the legend.
         fontsize: font size of the legend.
         loc: place of the legend.
@@ -149,35 +149,34 @@ def finish(
 
 
 def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Mapping[str, Any]) -> None:
-    """Fill the band between ``low`` and ``high`` at the places ``x``, in the colour of ``style`` (from
-    ``series_style``).
-    """
+    """Fill the area between the curves ``low`` and ``high`` over ``x``, in the colour of ``style``."""
     axes.fill_between(x, low, high, color=str(style["color"]), alpha=0.18, linewidth=0.0)
 
 
 def add_caption(figure: Figure, text: str) -> None:
-    """Write ``text`` (the conditions of a figure) below the figure, in small type."""
+    """Write ``text`` below the figure, in small letters."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
     label = figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
     label.set_gid(CAPTION)
 
 
 def picture_ending(path: str | Path) -> str:
-    """Return the ending of a picture's file name: .png, .svg or .pdf. Raises ``InvalidInput`` for any other."""
+    """Return the ending of a picture's file name: .png, .svg or .pdf. Raises ``InvalidInput`` for other endings."""
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
-        raise InvalidInput(f"{path}: pictures are written as PNG, SVG or PDF; end the name in .png, .svg or .pdf")
+        raise InvalidInput(f"{path}: the name of a picture file must end in .png, .svg or .pdf")
     return ending
 
 
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
-    """Return the figure as the bytes of a PNG, SVG or PDF file, by the ending of ``path``. Nothing is written.
+    """Return the bytes of a PNG, SVG or PDF file with the figure. The ending of ``path`` selects the format.
 
-    The same figure always gives the same bytes. Raises ``InvalidInput`` for another ending.
+    The function writes no file. The same figure always gives the same bytes. Raises ``InvalidInput`` for another
+    ending.
     """
     ending = picture_ending(path)
     buffer = io.BytesIO()
-    # embed fonts: as outlines in SVG, as TrueType in PDF
+    # fonts are embedded, as outlines in SVG and as TrueType in PDF
     with matplotlib.rc_context(
         {"savefig.facecolor": "white", "svg.hashsalt": "ethbrake", "svg.fonttype": "path", "pdf.fonttype": 42}
     ):
@@ -186,9 +185,10 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 
 
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
-    """Write ``figure`` to a PNG, SVG or PDF file, by the ending of ``path``. The file is written whole or not at all.
+    """Write ``figure`` to a PNG, SVG or PDF file. The ending of ``path`` selects the format.
 
-    Raises ``InvalidInput`` for another ending or a file that cannot be written, and ``AlreadyExists`` unless ``force``.
+    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` for another ending or if the file cannot
+    be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 

@@ -15,7 +15,7 @@ _SVG, _LINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 
 _DROPPED = {f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"}
 
-_PALETTE = {  # names of a figure's colours in a page, which has other values for dark mode
+_PALETTE = {  # colour in a figure -> variable of the page, which has another value in dark mode
     "#000000": "var(--series-0)",
     "#d55e00": "var(--series-1)",
     "#0072b2": "var(--series-2)",
@@ -58,24 +58,24 @@ SLIM_IN = 3.8  # a figure of this width can be read on a phone without scrolling
 
 
 def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> tuple[str, str]:
-    """Return a figure as an SVG element without ``style`` (the page's policy allows none), and its caption as text.
+    """Return a figure as an SVG element, and its caption as text.
 
-    The caption is removed from the SVG. All ids get a prefix, so that they are unique in a page. Raises
-    ``InvalidInput`` for the bytes of an SVG with anything that our figures do not contain, because somebody may have
-    changed the file.
+    The SVG element contains no caption and no ``style`` attributes, because the security policy of the page forbids
+    them. All ids get a prefix that makes them unique in a page. Raises ``InvalidInput`` if an SVG contains elements or
+    attributes that the figures of this package do not have, because somebody may have changed the file.
 
     Args:
-        figure: the figure, or the bytes of its SVG.
-        label: description for readers who do not see it; it also makes the ids unique.
-        recolour: True: use the colours of the page, light or dark; False: keep the colours.
+        figure: figure, or the bytes of its SVG.
+        label: description for readers who cannot see the figure; it also makes the ids unique.
+        recolour: True: use the colours of the page, light or dark; False: keep the colours of the figure.
 
     """
     svg = figure if isinstance(figure, bytes) else picture_bytes(figure, "figure.svg")
     if svg is figure and not _is_ours(svg):
-        raise InvalidInput("is not a figure as it was drawn; make it again (--force)")
+        raise InvalidInput("the file is not the unchanged SVG of a figure; draw the figure again (--force)")
     root = ElementTree.fromstring(svg, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
     group, caption = root.find(f".//{{{_SVG}}}g[@id='{CAPTION}']"), ""
-    if group is not None:  # its text is in comments; the outlines of its letters stay, because later texts use them
+    if group is not None:  # the caption is in comments; later texts use the outlines of its letters, so these stay
         lines = [(each.text or "").strip() for each in group.iter(ElementTree.Comment)]  # type: ignore[arg-type]
         outlines = list(group.iter(f"{{{_SVG}}}defs"))
         for child in list(group):
@@ -94,7 +94,7 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
         _restyle(element, recolour)
         if "id" in element.attrib:
             element.attrib["id"] = prefix + element.attrib["id"]
-        for name, value in element.attrib.items():  # every id that it refers to
+        for name, value in element.attrib.items():  # ids that the element refers to
             if name == _HREF or (name in ("clip-path", "fill", "mask") and value.startswith("url(")):
                 element.attrib[name] = value if value.startswith("data:") else _ID.sub(rf"#{prefix}\1", value)
     for name in ("width", "height", "version"):
@@ -115,13 +115,13 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
 
 
 def _size_pt(root: ElementTree.Element) -> tuple[float, float]:
-    """Return width and height of an SVG figure in points; 0, 0 if its viewBox has another form than in our figures."""
+    """Return the width and height of an SVG figure in points; 0, 0 if its viewBox has an unknown form."""
     match = re.fullmatch(r"0 0 (\d+(?:\.\d+)?) (\d+(?:\.\d+)?)", root.attrib.get("viewBox", ""))
     return (float(match[1]), float(match[2])) if match else (0.0, 0.0)
 
 
 def _is_ours(svg: bytes) -> bool:
-    """Return whether the bytes of an SVG contain only elements and attributes that our figures have."""
+    """Return whether the bytes of an SVG contain only elements and attributes that figures of this package have."""
     try:
         level = [ElementTree.fromstring(svg)]
     except (ElementTree.ParseError, LookupError, ValueError):  # not XML, or an unknown encoding
@@ -132,7 +132,7 @@ def _is_ours(svg: bytes) -> bool:
             _restyle(element, recolour=False)
             if element.tag not in _TAGS:
                 return False
-            for name, value in element.attrib.items():  # may only draw, and refer to nothing outside
+            for name, value in element.attrib.items():  # attributes may only draw, and may not refer to other files
                 inside = name == "transform" or "(" not in value or _CLIP.fullmatch(value) is not None
                 if not (_ID.fullmatch(value) if name == _HREF else name in _ATTRIBUTES and inside):
                     return False
@@ -141,9 +141,9 @@ def _is_ours(svg: bytes) -> bool:
 
 
 def _restyle(element: ElementTree.Element, recolour: bool) -> None:
-    """Replace each declaration of the ``style`` attribute by an attribute of that name, in place.
+    """Replace each declaration in the ``style`` attribute by an attribute of the same name, in place.
 
-    ``recolour`` also replaces the colours by the page's colours.
+    If ``recolour`` is true, the colours are replaced by the colours of the page.
     """
     for declaration in element.attrib.pop("style", "").split(";"):
         name, colon, value = declaration.partition(":")

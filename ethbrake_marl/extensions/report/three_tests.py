@@ -1,4 +1,4 @@
-"""The three tests whose results are shown together, and a table of all three on one screen."""
+"""The three tests on which a policy is evaluated, and a table with the results of all three."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 
 TESTS = {
-    "paper-random": "Main test, the paper's rules: Vehicle 2 may drive, nothing stands ahead of Vehicle 1, and pushing"
-    " it on costs nothing in either count.",
-    "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast; it can"
-    " neither drive on nor push with its motor.",
-    "paper-random-obstacle": "Obstacle test: the same worlds with the obstacle that Vehicle 1 brakes for, 1.7 m beyond"
-    " where it stops by itself. Vehicle 1's impact with it is harm.",
+    "paper-random": "Main test, the paper's rules: Vehicle 2 may drive, there is no obstacle ahead of Vehicle 1, and"
+    " pushing Vehicle 1 does no harm in either count.",
+    "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast, so it cannot"
+    " push with its motor.",
+    "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
+    " stops by itself. An impact of Vehicle 1 with the obstacle is harm.",
 }
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Return whether the scenario equals the shipped one of the same name, apart from title, description and source."""
+    """Return whether the scenario equals the shipped scenario of the same name. Titles and descriptions may differ."""
     one, other = (
         each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
     )
@@ -30,9 +30,7 @@ def is_as_shipped(scenario: Scenario) -> bool:
 
 
 def other_tests(scenario: Scenario) -> tuple[Scenario, ...]:
-    """Return the other two of the three tests (``TESTS``) if ``scenario`` is one of them, as shipped; else an empty
-    tuple.
-    """
+    """Return the other two tests in ``TESTS`` if ``scenario`` is one of the three tests as shipped; else no tests."""
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return ()
     return tuple(load_scenario(name) for name in TESTS if name != scenario.name)
@@ -42,13 +40,12 @@ _KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the 
 
 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
-    """Return a table for one screen: each agent's collisions and both harms, and its harm in other tests, and notes
-    below.
+    """Return a short table with the collision rate and both harms of each agent, also on other tests.
 
-    Rows of other sources and other measures are left out.
+    Notes are below the table. The paper's rows and all other measures are omitted.
 
     Args:
-        table: summary of the agents on the main test.
+        table: summary of the agents on the scenario of the run.
         beside: summaries of the agents on other tests, by name of the test.
 
     """
@@ -56,7 +53,7 @@ def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
     sheet = ours.terminal()
     short = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in _KEPT)
     columns, rows = list(short.columns), [list(row) for row in short.rows]
-    note = f"{ours[0].parameters.line}. Harm: mean per world in m²/s², below it the 95 % interval."
+    note = f"{ours[0].parameters.line}. Harm: mean over the worlds in m²/s², with the 95 % interval below."
     notes = [note, *(text for _, text in ours.notes())]
     for test, other in beside.items():
         by_agent = {row.agent: row for row in other}

@@ -1,1 +1,1 @@
-"""Search over whole command profiles: best known harm, its tables, the planner, ``+search``."""
+"""Search for the best commands: best known harm and its tables, the agents ``planner`` and ``+search``."""

@@ -1,4 +1,4 @@
-"""The shield ``+search``: at the alert it searches around the policy's own episode and then drives the result."""
+"""The agent ``AGENT+search``: it searches around the commands of AGENT at the alert, and drives the best commands."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 class Searched(AgentAround):
-    """Agent that searches around another agent's episode at the alert and then plays the best commands it found.
+    """Agent that searches around the commands of another agent at the alert, and then drives the best commands found.
 
-    It knows the model of the line and the other vehicles' scripts, and does not react to anything unexpected.
-    ``predicted_harm`` [n] (m2/s2) is never above the policy's own harm, and equals the simulated harm exactly if the
-    others follow their scripts. Raises ``InvalidInput`` for an object that is not an agent, a number of candidates
-    outside 1 to 1,000,000 and, when an episode begins, another vehicle's script whose command is not fixed at the
-    alert.
+    The search uses the model of the line and the scripts of the other vehicles. The agent does not react to unexpected
+    motion. ``predicted_harm`` [n] (m2/s2) is never above the harm of the other agent. It equals the simulated harm
+    exactly if the other vehicles follow their scripts. Raises ``InvalidInput`` if ``policy`` is not an agent, or if
+    ``candidates`` is outside 1 to 1,000,000. ``begin`` raises ``InvalidInput`` if the command of another vehicle's
+    script is not fixed at the alert.
 
     Args:
-        policy: the agent around whose episode it searches.
-        scenario: the scenario in which it searches, whose objective it minimises.
+        policy: agent whose commands the search starts from.
+        scenario: scenario of the worlds; the search minimises its objective.
         candidates: number of candidates in each world.
-        harm_count: harm to minimise, ``first`` or ``total``.
+        harm_count: harm count to minimise, ``first`` or ``total``.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -58,7 +58,7 @@ class Searched(AgentAround):
         self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s, scenario.objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Simulate the policy's episode from the alert, search around it, and return the best commands as memory.
+        """Simulate the policy's episode from the alert, search around its commands, and return the best ones as memory.
 
         Args:
             alert: the worlds at the alert, [n].
@@ -80,7 +80,7 @@ class Searched(AgentAround):
         """Return the command of the present step, [n] m/s2, and the unchanged memory.
 
         Args:
-            worlds: the worlds now, [n]; only their time is read.
+            worlds: worlds in their present state, [n]; only the time is read.
             memory: result of ``begin``.
             vehicle: not used.
 
@@ -89,9 +89,9 @@ class Searched(AgentAround):
 
 
 def search_around(policy: Agent, argument: str | None, settings: AgentSettings) -> Agent:
-    """Return the agent ``+search``, which searches around the episode of ``policy``.
+    """Return the agent ``+search``, which searches around the commands of ``policy``.
 
-    ``argument`` must be None; ``settings`` hold the scenario and the harm to minimise.
+    ``argument`` is not used. ``settings`` hold the scenario and the harm count to minimise.
     """
     return Searched(policy, settings.needed_scenario(), harm_count=settings.harm_count)
 
@@ -99,7 +99,7 @@ def search_around(policy: Agent, argument: str | None, settings: AgentSettings) 
 SEARCH = Part(
     search_around,
     form="+search",
-    about="drives the best commands that a search around its own episode finds at the alert",
+    about="drives the best commands that a search around the agent's own commands finds at the alert",
     knows=Source.MODEL,
     inner=True,
 )

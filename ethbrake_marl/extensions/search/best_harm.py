@@ -1,6 +1,7 @@
-"""Best known harm of each world, from a search over whole command profiles.
+"""Compute the best known harm of each world by a search over command profiles.
 
-A *profile* holds the commands of the controlled vehicles over a whole episode, as phases of constant command.
+A *profile* holds the commands of the controlled vehicles over a whole episode. It consists of *phases*, intervals of
+time with constant commands.
 """
 
 from __future__ import annotations
@@ -55,29 +56,29 @@ def best_harm(
     known: BestHarmTable | None = None,
     objective: Declared = "total",
 ) -> BestHarmTable:
-    """Search every world for the command profiles of least harm, once per harm count; return them as a table.
+    """Search for the profile with the least harm in each world and under each count. Return the profiles as a table.
 
-    With both counts, the profile found for one also replaces the other's if it does less harm there. The result is
-    never worse than the best constant deceleration of one controlled vehicle while the others brake fully, than the
-    same search for one controlled vehicle alone, or than ``known``. It does not depend on ``threads`` or on the other
-    worlds. Raises ``InvalidInput`` for no vehicle, a script whose command is not fixed at the alert, no count, or a
-    budget below 1.
+    With two counts, there are two searches, and each count gets the better of the two profiles. The harm is never above
+    the harm of ``known``. It is never above the harm of the best constant deceleration of one controlled vehicle, or of
+    the same search for one controlled vehicle alone, while the other vehicles brake fully. The result for a world does
+    not depend on ``threads`` or on the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if
+    the command of a script is not fixed at the alert, or if ``budget`` is below 1.
 
     Args:
-        scenario: the scenario of the worlds.
-        worlds: the worlds at t = 0, [n].
+        scenario: scenario of the worlds.
+        worlds: worlds at t = 0, [n].
         counts: harm counts to minimise: ``first``, ``total``, or both.
-        vehicles: indices of the controlled vehicles; None: the scenario's learners. All others follow their scripts.
-        budget: candidates per world and count.
+        vehicles: indices of the controlled vehicles; None: the scenario's learners. All other vehicles follow scripts.
+        budget: number of candidates per world and count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: a table for these vehicles, whose profiles the search starts with; None: no table.
-        objective: whose harm the search minimises, as a scenario declares it. The table then holds the amounts of this
-            objective, not the harm of the line, and its header says so; no bound is known for them.
+        known: table of the same vehicles, whose profiles the search starts with; None: no table.
+        objective: objective to minimise, as a scenario declares it. With any objective but ``total``, the table holds
+            the amounts of this objective instead of the harm of the line, and its header names the objective.
 
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
-        raise InvalidInput(f"counts {tuple(counts)}: must be first, total, or both")
+        raise InvalidInput(f"counts = {tuple(counts)}: the counts must be first, total, or both, each once")
     task = Task(scenario, scenario.learners if vehicles is None else tuple(vehicles))
     others, problem = scripted_commands(worlds, task), task_problem(worlds, task)
     identity, aimed = problem.identity, partial(minimising, worlds=worlds, declared=objective, vehicles=task.vehicles)
@@ -129,25 +130,25 @@ def search_list(
     on_progress: Progress | None = None,
     objective: Declared = "total",
 ) -> BestHarmTable:
-    """Run ``best_harm`` on a long list, ``CHUNK`` worlds at a time; it can be interrupted and continued.
+    """Run ``best_harm`` on a long list of worlds, ``CHUNK`` worlds at a time. An interrupted run can be continued.
 
-    A world that the physics cannot advance (a defect) is left out: no table holds it, and the header lists it under
-    ``LEFT_OUT``. Raises ``InvalidInput`` as ``best_harm`` does, and if ``known`` holds no world of the list;
-    ``PhysicsError`` if no world is left.
+    The table does not contain worlds that the physics cannot advance because of a defect. Its header names them under
+    the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as ``best_harm``, and if ``known`` contains no world
+    of the list. Raises ``PhysicsError`` if the physics can advance no world of the list.
 
     Args:
-        scenario: the scenario of the list.
-        sample: the worlds of the list, with their numbers.
+        scenario: scenario of the worlds.
+        sample: worlds of the list, with their numbers.
         counts: harm counts to minimise: ``first``, ``total``, or both.
         vehicles: indices of the controlled vehicles; None: the scenario's learners.
-        budget: candidates per world and count.
+        budget: number of candidates per world and count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        known: a table whose profiles the search starts with; None: no table.
-        chunks: folder in which each finished chunk is stored as a file. A later call with the same arguments reads it;
-            a file of other arguments is computed again and replaced. None: nothing is stored.
-        on_progress: called with the number of worlds done and their total.
-        objective: whose harm the search minimises, see ``best_harm``.
+        known: table whose profiles the search starts with; None: no table.
+        chunks: folder in which the table of each finished chunk is stored as a file. A later call with the same
+            arguments reads these files. It replaces files that were made with other arguments. None: nothing is stored.
+        on_progress: function that is called with the number of finished worlds and the number of all worlds.
+        objective: objective to minimise, see ``best_harm``.
 
     """
     parts: list[BestHarmTable] = []
@@ -184,15 +185,13 @@ def search_list(
 def _kept_or_searched(
     task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
 ) -> BestHarmTable:
-    """Return the table of a chunk: from its file if that was made with the same options, else by a new search.
-
-    A new table is stored in the file.
+    """Return the table of a chunk. Read ``file`` if it was made with the same options; otherwise search and write it.
 
     Args:
         task: scenario and controlled vehicles.
         every: all worlds of the list.
-        file: file of the chunk; None: nothing is read or stored.
-        options: keywords of ``best_harm``.
+        file: file that stores the table of the chunk; None: nothing is read or written.
+        options: keyword arguments of ``best_harm``.
         rows: indices of the chunk's worlds in the list.
 
     """
@@ -214,12 +213,12 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Return how many worlds ``search_list`` would still search with both counts, and the damaged chunk files.
+    """Return the number of worlds that ``search_list`` has not searched yet under both counts, and the damaged files.
 
     Args:
-        scenario: the scenario of the list.
-        sample: the worlds of the list.
-        budget: candidates per world and count.
+        scenario: scenario of the worlds.
+        sample: worlds of the list.
+        budget: number of candidates per world and count.
         chunks: folder of the chunk files.
 
     """
@@ -238,19 +237,19 @@ def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path
 
 
 def chunk_file(chunks: Path, first: int) -> Path:
-    """Return the path of the chunk file in folder ``chunks`` that begins with world number ``first`` of the list."""
+    """Return the path of the file in the folder ``chunks`` for the chunk whose first world has the index ``first``."""
     return chunks / f"{first:07d}.npz"
 
 
 def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) -> BestHarmTable | None:
-    """Return the stored table of a chunk, or None if there is no file or it was made for other worlds or options.
+    """Return the stored table of a chunk. Return None if the file is missing or was made for other worlds or options.
 
-    Raises ``CorruptBundle`` for a damaged file.
+    Raises ``CorruptBundle`` if the file is damaged.
 
     Args:
-        file: the chunk file.
+        file: file that stores the table of the chunk.
         identity: hash of each world of the chunk.
-        question: options of the search (counts, budget, seed), which must equal those in the header of the file.
+        question: options of the search (counts, budget, seed). The header of the file must contain the same values.
 
     """
     if not file.is_file():
@@ -262,20 +261,20 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
 
 
 def scripted_commands(worlds: Worlds, task: Task) -> Floats:
-    """Return the commands [n, N] (m/s2) of all vehicles that follow scripts; controlled vehicles have full braking
-    instead.
+    """Return the commands of all vehicles while they follow their scripts, [n, N] m/s2.
 
-    Raises ``InvalidInput`` for a script whose command is not fixed at the alert. ``task`` names the controlled
-    vehicles.
+    The controlled vehicles, named by ``task``, get full braking. Raises ``InvalidInput`` if the command of a script is
+    not fixed at the alert.
     """
     others = {i: script for i, script in script_agents(task.scenario).items() if i not in task.vehicles}
     return fixed_commands(others, worlds, f"scenario {task.scenario.name!r}, search for the best profiles")
 
 
 def task_problem(worlds: Worlds, task: Task) -> ProfileProblem:
-    """Return the search problem for a task: choose the command profiles of its controlled vehicles in worlds at t = 0.
+    """Return the search problem of a task in worlds at t = 0: choose the profiles of the controlled vehicles.
 
-    Its ``identity`` [n] is a hash of everything that affects a world's harm; it does not depend on the harm count.
+    The field ``identity`` [n] of the problem is a hash of everything that affects the harm of a world. This hash does
+    not depend on the harm count.
     """
     return _problem(worlds, task, scripted_commands(worlds, task), task.vehicles)
 
@@ -292,16 +291,18 @@ def _searched(
     worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles], deciders: Sequence[int],
     effort: dict[str, int], aimed: Callable[[ProfileProblem], ProfileProblem],
 ) -> Found:  # fmt: skip
-    """Return the best profiles of a search in each world, and their harm under each count.
+    """Search each world, and return the best profiles and their harm under each count.
+
+    With several controlled vehicles, the search also starts from the best profile of each vehicle alone.
 
     Args:
-        worlds: the worlds at t = 0, [n].
-        task: scenario, controlled vehicles and harm to minimise.
-        others: [n, N] commands of the vehicles that follow scripts, m/s2.
-        given: profiles to start with, besides constants and each vehicle's own best.
-        deciders: indices of the vehicles whose latency decides when decisions fall.
-        effort: keywords ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        aimed: returns a problem in which a search minimises the objective of all controlled vehicles.
+        worlds: worlds at t = 0, [n].
+        task: scenario, controlled vehicles and harm count to minimise.
+        others: commands of the vehicles that follow scripts, [n, N] m/s2.
+        given: additional profiles from which the search starts.
+        deciders: indices of the vehicles whose latency fixes the times of the decisions.
+        effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
+        aimed: function from a problem to the same problem with the objective of all controlled vehicles.
 
     """
     problem = aimed(_problem(worlds, task, others, deciders))
@@ -319,14 +320,16 @@ def _searched(
 def starting_profiles(
     problem: ProfileProblem, worlds: Worlds, task: Task, others: Floats, given: Sequence[Profiles] = ()
 ) -> list[Profiles]:
-    """Return profiles to start a search with: constants, ``given`` ones, and for one vehicle its extreme ones.
+    """Return the profiles from which a search starts: constant commands and the profiles ``given``.
+
+    With one controlled vehicle, the list also contains coupled E-V2X-BM and the extreme profiles.
 
     Args:
-        problem: the problem of the worlds.
-        worlds: the worlds at t = 0, [n].
-        task: scenario, controlled vehicles and harm to minimise.
-        others: [n, N] commands of the vehicles that follow scripts, m/s2.
-        given: further profiles to start with.
+        problem: search problem of the worlds.
+        worlds: worlds at t = 0, [n].
+        task: scenario, controlled vehicles and harm count to minimise.
+        others: commands of the vehicles that follow scripts, [n, N] m/s2.
+        given: additional profiles from which the search starts.
 
     """
     starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
@@ -343,9 +346,9 @@ def starting_profiles(
 
 
 def startable(profiles: Profiles) -> Profiles:
-    """Return profiles that a search can start with.
+    """Return the profiles with at most ``MOST_PHASES`` phases, so that a search can start from them.
 
-    A profile with too many phases (times of constant command) is replaced by its first command, held to the end.
+    A profile with more phases (intervals of constant command) is replaced by its first command, held to the end.
     """
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
@@ -357,7 +360,10 @@ def startable(profiles: Profiles) -> Profiles:
 
 
 def joined(parts: list[Profiles], n: int) -> Profiles:
-    """Join several sets of profiles, [n * Q_j] each, into one set [n * Q]: all profiles of world 0 first, and so on."""
+    """Join several arrays of profiles, [n * Q_j] each, into one array [n * Q] with Q = sum of Q_j.
+
+    Each array lists the profiles of world 0 first, then the profiles of world 1, and so on.
+    """
     parts = Profiles.padded(parts, MOST_PHASES)
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in parts], axis=1)
     shape = (n, -1, MOST_PHASES, parts[0].commands_mps2.shape[2])
@@ -366,14 +372,15 @@ def joined(parts: list[Profiles], n: int) -> Profiles:
 
 
 def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) -> Profiles:
-    """Return the commands that ``agent`` gives in its episodes as profiles [n]; neighbouring steps with equal commands
-    become one phase (time of constant command).
+    """Let ``agent`` drive the worlds, and return its commands as profiles [n].
+
+    Neighbouring steps with equal commands become one phase (interval of constant command).
 
     Args:
-        agent: agent of the task's vehicle.
-        worlds: the worlds at t = 0, [n].
+        agent: agent that drives the controlled vehicle.
+        worlds: worlds at t = 0, [n].
         task: scenario and controlled vehicle.
-        last_step: [n] number of steps of each episode.
+        last_step: number of steps of each episode, [n].
 
     """
     commands = record_commands(agent, worlds, task.scenario, task.vehicle, int(last_step.max()))
@@ -389,26 +396,28 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Return the table, lowered to the harm of agents' episodes in all worlds where an agent does less harm than the
-    table says.
+    """Drive the worlds with agents, and return the table with every harm that an agent undercuts replaced.
 
-    The header counts these worlds. The harm is that of the recorded commands when played again. Where an agent cannot
-    control a world to its end, the table stays unchanged. Raises ``InvalidInput`` unless the scenario has exactly one
-    learner.
+    The recorded commands are simulated again, and the table stores the harm of this simulation. The header counts the
+    worlds with a replaced harm. A world that an agent cannot drive to the end keeps its harm. Raises ``InvalidInput``
+    unless the scenario has exactly one learner.
 
     Args:
-        table: the table to improve.
-        scenario: the scenario of the worlds.
-        worlds: the worlds at t = 0; worlds with known harm 0 are skipped.
+        table: table to improve.
+        scenario: scenario of the worlds.
+        worlds: worlds at t = 0; worlds with best known harm 0 are skipped.
         name: name of the agent, for the header.
-        agents: for each harm count, the agent made to minimise it. Every episode is compared with the table under both
-            counts.
+        agents: for each harm count, the agent that minimises this count. Every episode is compared with the table under
+            both counts.
 
     """
     if OBJECTIVE in table.header:
-        raise InvalidInput(f"table of the objective {table.header[OBJECTIVE]!r}: give one of the line's harm")
+        raise InvalidInput(
+            f"the table holds amounts of the objective {table.header[OBJECTIVE]!r}; give a table of the harm of the"
+            " line (objective total)"
+        )
     learners = [scenario.vehicle_names[i] for i in scenario.learners]
-    check_one_learner(scenario.name, learners, "agents whose episodes are kept drive exactly one")
+    check_one_learner(scenario.name, learners, "the commands of an agent can be stored for exactly one")
     task = Task(scenario, scenario.learners)
     identity = task_problem(worlds, task).identity
     known = np.max([table.harm(identity, harm_count) for harm_count in table.best], axis=0)

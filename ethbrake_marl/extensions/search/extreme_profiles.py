@@ -1,9 +1,9 @@
-"""Starting profiles of full drive and full braking for a search.
+"""Starting profiles for a search, made of full drive and full braking.
 
-They drive, brake until they meet the leader, and drive again; or the mirror image with the rear vehicle. The proof of
-the lower bound shows that the least harm has this form: the vehicle drives fully for a while, then brakes fully until
-it meets the leader; or it brakes, then drives until the rear vehicle meets it. After the meeting it does the opposite
-(docs/extensions/search.md). A random search seldom finds such a narrow optimum.
+The proof of the lower bound shows that profiles with the least harm have one of two forms. Either the vehicle drives
+fully for a while, brakes fully until it meets the vehicle ahead, and drives fully again. Or it brakes fully, drives
+fully until the vehicle behind meets it, and brakes fully again (docs/extensions/search.md). A random search seldom
+finds these profiles.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ _LATEST_S = 2.0  # latest first change of command in the first round
 
 _TIMES = 24  # times of the first change that are tried in each round
 
-_ROUNDS = 3  # rounds, each closer around the best time
+_ROUNDS = 3  # rounds; each one tries times closer to the best time so far
 
-_PHASES = 5  # before the first change, its step, until the second change, its step, after it
+_PHASES = 5  # before the first change, step of the first change, between, step of the second change, after it
 
 
 def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools) -> Profiles:
-    """Return the ``KEPT`` best extreme profiles of the one controlled vehicle, [n * KEPT], all of world 0 first, and so
-    on.
+    """Return the ``KEPT`` best extreme profiles of the controlled vehicle in each world, [n * KEPT].
 
-    An *extreme* profile changes between full drive and full braking. ``states`` is used only to find when two vehicles
-    would meet, as if neighbours braked fully. If they do not, the profiles are worse but still valid.
+    The profiles of world 0 come first, then the profiles of world 1, and so on. An *extreme* profile changes between
+    full drive and full braking. The times at which two vehicles meet are computed from ``states``, as if the neighbours
+    braked fully. If they brake less, the profiles are valid but do more harm.
 
     Args:
-        problem: the worlds, with the commands of the other vehicles and the harm to minimise.
-        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
-        has_front: [n] True if a vehicle is ahead.
-        has_rear: [n] True if a vehicle is behind.
+        problem: worlds, with the commands of the other vehicles and the harm to minimise.
+        states: state of each world at the first decision, [n, WIDTH], with the columns of ``proofs.line.LINE``.
+        has_front: True if there is a vehicle ahead of the controlled one, [n].
+        has_rear: True if there is a vehicle behind the controlled one, [n].
 
     """
     n, last = problem.n, problem.last_step
@@ -64,15 +64,15 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 def _fill_extremes(
     problem: ProfileProblem, states: Floats, has_front: Bools, has_rear: Bools, ends: Ints, commands: Floats
 ) -> None:
-    """Compute the best extreme profiles (full drive and full braking) of each world.
+    """Write the best extreme profiles of each world to ``ends`` and ``commands``.
 
     Args:
-        problem: the worlds, with the commands of the other vehicles and the harm to minimise.
-        states: [n, WIDTH] one row for each world at the first decision, with the columns of ``proofs.line.LINE``.
-        has_front: [n] True if a vehicle is ahead.
-        has_rear: [n] True if a vehicle is behind.
-        ends: output array [n, KEPT, K]: the steps at which the phases end.
-        commands: output array [n, KEPT, K, 1]: the commands of the phases, m/s2.
+        problem: worlds, with the commands of the other vehicles and the harm to minimise.
+        states: state of each world at the first decision, [n, WIDTH], with the columns of ``proofs.line.LINE``.
+        has_front: True if there is a vehicle ahead of the controlled one, [n].
+        has_rear: True if there is a vehicle behind the controlled one, [n].
+        ends: output: number of the step at which each phase ends, [n, KEPT, K].
+        commands: output: command of each phase, [n, KEPT, K, 1] m/s2.
 
     """
     no_random = np.zeros(states.shape[0], np.uint64)
@@ -92,20 +92,20 @@ def try_changes(
     world: SearchWorld, kind: int, at: Floats, start: Floats, low: float, high: float, ends: Ints, commands: Floats,
     values: Floats,
 ) -> float:  # fmt: skip
-    """Simulate profiles whose first change of command lies between ``low`` and ``high`` (s), and keep the best ones.
+    """Simulate profiles whose first change of command is between ``low`` and ``high``; keep the best profiles.
 
-    Returns the time of the first change with the least harm (s).
+    Returns the time of the first change in the profile with the least harm (s).
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        kind: ``FRONT_FIRST`` or ``REAR_FIRST``: the neighbour to meet.
-        at: the world at the first decision, an array with the columns of ``proofs.line.LINE``.
-        start: [S] state of the simulation at the first decision.
-        low: earliest first change, s.
-        high: latest first change, s.
-        ends: [KEPT, K] ends of the best profiles so far, in steps; changed in place.
-        commands: [KEPT, K, 1] their commands, m/s2; changed in place.
-        values: [KEPT] their harm, m2/s2; changed in place.
+        world: world to simulate, with its bounds and random stream.
+        kind: neighbour to meet: ``FRONT_FIRST`` for the vehicle ahead, ``REAR_FIRST`` for the vehicle behind.
+        at: state of the world at the first decision, with the columns of ``proofs.line.LINE``, [WIDTH].
+        start: state of the simulation at the first decision, [S].
+        low: earliest time of the first change, s.
+        high: latest time of the first change, s.
+        ends: number of the step at which each phase of the best profiles ends, [KEPT, K]; changed in place.
+        commands: commands of the best profiles, [KEPT, K, 1] m/s2; changed in place.
+        values: harm of the best profiles, [KEPT] m2/s2; changed in place.
 
     """
     plan, other = empty_plan(), empty_plan()
@@ -136,20 +136,20 @@ def try_changes(
 def fill_extreme(
     world: SearchWorld, kind: int, change: float, meeting: float, early: int, share: float, ends: Ints, commands: Floats
 ) -> None:
-    """Write one profile: a first command, the opposite one from ``change`` to ``meeting``, then the first one again.
+    """Write one profile: a first command, the opposite command from ``change`` to ``meeting``, the first command again.
 
-    Commands can change only between steps. If ``change`` lies within a step, that step gets the mean command, so that
-    the speed after it is the same.
+    Commands can change only between steps. If ``change`` is within a step, this step gets the mean of the two commands,
+    weighted with their durations. The speed at the end of the step is then exact.
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        kind: ``FRONT_FIRST``: drive first; ``REAR_FIRST``: brake first.
+        world: world of the profile, with its bounds and its time step.
+        kind: ``FRONT_FIRST`` to drive first; ``REAR_FIRST`` to brake first.
         change: time of the first change, s.
         meeting: time of the second change, s.
-        early: number of steps by which the second change comes earlier.
+        early: number of steps by which the second change comes before ``meeting``.
         share: weight of the first command in the step of the second change, 0 to 1.
-        ends: output array [5]: the steps at which the phases end.
-        commands: output array [5, 1]: the commands of the phases, m/s2.
+        ends: output: number of the step at which each phase ends, [5].
+        commands: output: command of each phase, [5, 1] m/s2.
 
     """
     low, high, step = world.bounds[0, 0], world.bounds[0, 1], world.episode.clock[CLOCK.TIME_STEP]

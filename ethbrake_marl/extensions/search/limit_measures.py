@@ -1,4 +1,4 @@
-"""Measures of the distance to the best: proven bounds, best known harm, and the regret of each agent."""
+"""Measures that compare an agent with what is possible: proven bounds, best known harm, and regret."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ KNOWN, BELOW = "known", "below_best_known"
 
 
 class LimitMeasures(MeasureSet):
-    """Measures of unavoidable contact, best known harm, and each agent's distance from it.
+    """Measures of unavoidable contact, of the best known harm, and of each agent's harm above it.
 
-    Their context is a ``Regrets`` object: the best known harm of every world.
+    The functions of the measures receive the outcome of an agent and a ``Regrets`` object, which holds the best known
+    harm of every world.
     """
 
     measures = (
@@ -38,57 +39,57 @@ class LimitMeasures(MeasureSet):
         ),
         Measure(
             "avoidable_collision_rate", lambda o, r: None if r.avoidable is None else o.collided & r.avoidable,
-            about="Share of worlds with a collision, though contact is proven avoidable.",
+            about="Share of worlds in which the agent has a collision although contact is proven avoidable.",
         ),
         Measure(
             "best_known_first_impact_harm", lambda _, r: r.first_impact_harm,
-            about="The least first-impact harm known of the same worlds.",
+            about="Best known first-impact harm, mean over the worlds.",
         ),
         Measure(
             "best_known_total_harm", lambda _, r: r.total_harm,
-            about="The same of total harm.",
+            about="Best known total harm, mean over the worlds.",
         ),
         Measure(
             "proven_harm", lambda _, r: r.limits.proof.harm,
-            about="Proven: nobody can do less.",
+            about="Lower bound, mean over the worlds: no commands do less harm (proven).",
         ),
         Measure(
             "best_known_minus_proven_first", lambda _, r: r.first_impact_harm - r.limits.proof.harm,
-            about="What is left between the best known and the proof.",
+            about="Best known first-impact harm minus the proven lower bound, mean over the worlds.",
         ),
         Measure(
             "best_known_minus_proven_total", lambda _, r: r.total_harm - r.limits.proof.harm,
-            about="The same of total harm.",
+            about="Best known total harm minus the proven lower bound, mean over the worlds.",
         ),
         Measure(
             "mean_regret", "mean_regret_first",
-            about="The same as mean_regret_first.",
+            about="Another name of mean_regret_first.",
         ),
         Measure(
             "mean_regret_first", lambda o, r: r.regret(o, "first"), "Regret, first-impact", "Regret\nfirst",
-            "First-impact harm minus the best known first-impact harm of the same world; mean per world. The best known"
-            " is 0 where contact is proven avoidable, else the result of an earlier search over whole profiles of the"
-            " controlled vehicles, or of an agent in this table that did better. With ≥: the best of some world is"
-            " known from these agents alone.",
+            "First-impact harm minus the best known first-impact harm of the same world; mean over the worlds. The best"
+            " known harm is 0 where contact is proven avoidable. Elsewhere it comes from an earlier search over the"
+            " commands of the controlled vehicles, or from an agent in this table that does less harm. The sign ≥ means"
+            " that some worlds were not searched earlier.",
         ),
         Measure(
             "mean_regret_total", lambda o, r: r.regret(o, "total"),
-            about="The same of total harm.",
+            about="Total harm minus the best known total harm of the same world; mean over the worlds.",
         ),
         Measure(
             "share_of_possible_reduction", "mean_regret_first", against="decrease",
-            about="The same as share_of_possible_reduction_first.",
+            about="Another name of share_of_possible_reduction_first.",
         ),
         Measure(
             "share_of_possible_reduction_first", "mean_regret_first", "Share of the possible reduction, first-impact",
             "Share of\npossible",
-            "(Full braking − agent) / (full braking − best known), first-impact harm: how much of the reduction of harm"
-            " that is known to be possible the agent brings.",
+            "(Full braking − agent) / (full braking − best known harm), computed from the means of first-impact harm:"
+            " 0 % is full braking, 100 % the best known harm.",
             percent=True, against="decrease",
         ),
         Measure(
             "share_of_possible_reduction_total", "mean_regret_total", against="decrease",
-            about="The same of total harm.",
+            about="(Full braking − agent) / (full braking − best known harm), computed from the means of total harm.",
         ),
     )  # fmt: skip
     counted = (Measure(KNOWN, lambda _, r: r.limits.known), Measure(BELOW, lambda o, r: r.below(o)))
@@ -102,16 +103,16 @@ class LimitMeasures(MeasureSet):
             short="Share of\npossible", interval="hidden",
         ),
         {"first": "share_of_possible_reduction_first", "total": "share_of_possible_reduction_total"},
-        "Share of the possible reduction of {harm} harm: 0 % for full braking, 100 % for the best known harm; none"
-        " where that is not known of every world.",
+        "Share of the possible reduction of {harm} harm: 0 % for full braking, 100 % for the best known harm. The cell"
+        " is empty if the best known harm of some world is missing.",
     )  # fmt: skip
     per_world = KNOWN_OF_WORLDS
     texts = frozenset({"unavoidable_reason", "best_known_source"})
     because_key = "no_limits_because"
-    not_in_long_lists = f"a list of more than {HELD:,} worlds is driven without proofs"
+    not_in_long_lists = f"proofs and regrets are computed for lists of at most {HELD:,} worlds"
 
     def prepare(self, evaluation: Evaluation) -> Regrets | Silent:
-        """Return the best known harm of every world, or ``Silent`` with the reason if nothing is proven."""
+        """Return the best known harm of every world. Return ``Silent`` with the reason if the proofs do not apply."""
         limits, regrets = limits_of(evaluation), regrets_of(evaluation)
         if isinstance(limits, Unproven):
             return Silent(limits.because)
@@ -119,11 +120,12 @@ class LimitMeasures(MeasureSet):
         return regrets
 
     def row(self, tally: AgentTally, worlds: int, context: Regrets | Silent) -> dict[str, Any]:
-        """Return further values of one agent's row, by name.
+        """Return additional values for one agent's row of the summary, by name.
 
-        ``known_best_share`` is the share of worlds with a best known harm, ``below_best_known`` the number of worlds
-        where the agent is below it, ``best_known_warning`` a warning or None, and ``impact_unproven`` the summary of
-        worlds with proven contact but no proven impact (``Between``).
+        ``known_best_share`` is the share of worlds whose best harm was known before the evaluation.
+        ``below_best_known`` is the number of worlds in which the agent does less harm. ``best_known_warning`` is a
+        warning text or None. ``impact_unproven`` is the summary of worlds with proven contact but no proven impact
+        (``Between``).
 
         Args:
             tally: counts and means of the agent.
@@ -140,16 +142,15 @@ class LimitMeasures(MeasureSet):
         }
 
     def warnings(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return the warning that a table of best known harm covers only some of the worlds, as a list; empty if there
-        is none.
+        """Return a list with the warning that a table of best known harm covers only some of the worlds.
 
-        ``rows`` are the summaries of the agents.
+        The list is empty if there is no such warning. ``rows`` are the summaries of the agents.
         """
         warning = rows[0].more[NAME]["best_known_warning"]
         return [warning] if warning else []
 
     def notes(self, rows: Sequence[SummaryRow]) -> Sequence[str]:
-        """Return a note on unavoidable harm and the best known harm, as a list; empty if nothing is proven.
+        """Return a list with one note about unavoidable harm and the best known harm; empty if nothing is proven.
 
         ``rows`` are the summaries of the agents.
         """
@@ -160,39 +161,42 @@ class LimitMeasures(MeasureSet):
         known = row.more[NAME]["known_best_share"]
         if known is not None and known < 1.0:
             lines.append(
-                f"Found beforehand in {100.0 * known:.1f} % of the worlds; in the others it is the best of the agents"
-                " above, so that regrets are lower bounds and no share of the possible reduction is stated."
+                f"The best known harm of {100.0 * known:.1f} % of the worlds comes from an earlier search. In the other"
+                " worlds it is the least harm of the agents above, so regrets are lower bounds, and the share of the"
+                " possible reduction is omitted."
             )
         counts = {each.agent: each.more[NAME]["below_best_known"] for each in rows}
         below = [f"{agent} in {count_of(count, 'world')}" for agent, count in counts.items() if count]
-        lines += [f"Less harm than the best known before: {', '.join(below)}."] if below else []
+        lines += [f"Less harm than the earlier best known harm: {', '.join(below)}."] if below else []
         return [" ".join(lines)]
 
 
 def best_known_words(row: SummaryRow) -> str:
-    """Return the name of the best known harm: another one where some world was not searched beforehand."""
+    """Return the label of the best known harm in ``row``: "best known", or "best of these agents".
+
+    The second label is used if some worlds were not searched before the evaluation.
+    """
     share = row.more[NAME]["known_best_share"]
     return "best known" if share is None or share == 1.0 else "best of these agents"
 
 
 def _unavoidable(row: SummaryRow) -> str:
-    """Return a sentence on the shares of worlds with proven contact and proven impact, and on the worlds between the
-    two.
-    """
+    """Return sentences about the shares of worlds with proven contact, with proven impact, and with only contact."""
     vehicle = row.parameters.get("controlled_vehicle")
     command = f"command of {str(vehicle).replace('vehicle_', 'Vehicle ')}" if vehicle else "joint command"
     share = Column("", digits=1, scale=100.0, unit=" %")
     contact, impact = (share.show(row[name]).in_words for name in ("unavoidable_rate", "impact_proven_rate"))
     if row["unavoidable_rate"] is None:
-        return f"In {impact} of these worlds no {command} avoids an impact (proven)."
+        return f"In {impact} of the worlds, no {command} avoids an impact (proven)."
     between = row.more[NAME]["impact_unproven"]
-    text = f"In {contact} of these worlds no {command} avoids contact, in {impact} none avoids an impact (both proven)."
+    text = f"In {contact} of the worlds, no {command} avoids contact; in {impact}, none avoids an impact (both proven)."
     return text + ("" if between is None else Between(**between).text)
 
 
 def _best(row: SummaryRow, first: float, total: float) -> str:
-    """Return a sentence on the best known harm (``first`` and ``total``, mean in m2/s2), the proven bound, and their
-    gap.
+    """Return a sentence with the best known harm, the proven bound, and the difference between them.
+
+    ``first`` and ``total`` are the means of the best known harm under the two counts, m2/s2.
     """
     least = 0.0 if row["proven_harm"] is None else row["proven_harm"].value
     gaps = [
@@ -200,8 +204,8 @@ def _best(row: SummaryRow, first: float, total: float) -> str:
         for best in (first, total)
     ]
     return (
-        f"Best known harm: {first:.2f} first-impact, {total:.2f} total; proven: no less than {least:.2f};"
-        f" gap: {' and '.join(gaps)}."
+        f"Mean best known harm: {first:.2f} first-impact, {total:.2f} total. Proven lower bound: {least:.2f}."
+        f" Gap: {' and '.join(gaps)}."
     )
 
 

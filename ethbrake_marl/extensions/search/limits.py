@@ -1,4 +1,4 @@
-"""Limits of each world for any agent: whether contact is avoidable, the proven bound, and the best known harm."""
+"""Facts about each world that hold for any agent: avoidable contact, a lower bound on harm, and the best known harm."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.proofs.team_bound import team_bound
@@ -18,7 +19,7 @@ from ethbrake_marl.scenario.task import Task
 
 _VEHICLES, _DRIVEN = 3, 1
 
-_DECIDED = ({1}, {1, 2})  # controlled vehicles, of three, for which avoidability is decided
+_DECIDED = ({1}, {1, 2})  # indices of the controlled vehicles, of three, for which ``avoidability`` is proven
 
 
 class IncompleteTable(UserWarning):
@@ -27,27 +28,27 @@ class IncompleteTable(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Unproven:
-    """Result in place of a proof if nothing is proven for a task in these worlds."""
+    """Returned instead of a proof if the proofs do not cover a task in some worlds."""
 
-    because: str  # the reason, as a clause such as "brakes build up; nothing is proven then"
+    because: str  # the reason, such as "brakes build up; the proofs assume instant brakes"
 
 
 @dataclass(frozen=True, slots=True)
 class Proof:
     """Proven facts about each world, [n] each."""
 
-    avoidable: Bools | None  # True if some command avoids all contact; None if not decided
+    avoidable: Bools | None  # True if some command avoids all contact; None if that is not known
     reason: NDArray[np.str_] | None  # reason if unavoidable: "early", "front" or "rear"; "" if avoidable
     harm: Floats  # lower bound on the harm of any command, under either count (m2/s2)
 
     @property
     def impact(self) -> Bools:
-        """True where no sequence of commands avoids an impact (contact with a closing speed above 0), [n]."""
+        """True for worlds in which no commands avoid an impact (contact with a closing speed above 0), [n]."""
         return np.asarray(self.harm > 0.0, np.bool_)
 
     @property
     def contact(self) -> Bools | None:
-        """True for worlds in which every command leads to contact, [n]; None if not decided."""
+        """True for worlds in which all commands lead to contact, [n]; None if that is not known."""
         return None if self.avoidable is None else ~self.avoidable
 
 
@@ -62,32 +63,29 @@ class Limits:
 
     @property
     def known(self) -> Bools:
-        """True for worlds whose best harm is known for both counts without any agent, [n]."""
+        """True for worlds whose best harm was known under both counts before the evaluation, [n]."""
         return np.isfinite(self.first_impact_harm) & np.isfinite(self.total_harm)
 
     @property
     def warning(self) -> str:
-        """Warning text if a table covers only some of the worlds; empty if it covers all or none of them."""
+        """Warning that a table of best known harm covers only some worlds; empty if it covers all or none."""
         known, avoidable = self.known, self.proof.avoidable
         listed = known if avoidable is None else known & ~avoidable
         missing = int((~known).sum())
         if not (missing and listed.any()):
             return ""
         return (
-            f"the table of best known harm holds {listed.sum():,} of these {len(known):,} worlds, and not"
-            f" the other {missing:,} ({100.0 * missing / len(known):.1f} %), whose best is not proven either. There the"
-            " best agent of this evaluation stands in: regrets are lower bounds, and no share of the possible"
-            " reduction is stated. A"
-            " table is made for one list; a longer list, or one of another version, has other worlds"
-            " (search_list makes one)"
+            f"the table of best known harm contains {listed.sum():,} of the {len(known):,} worlds. The best known harm"
+            f" of {count_of(missing, 'world')} ({100.0 * missing / len(known):.1f} %) is missing; the least harm of the"
+            " agents of this evaluation replaces it. Regrets are therefore lower bounds, and the share of the possible"
+            " reduction is omitted. A table is made for one list: to make a table for this list, call search_list"
         )
 
 
 def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
-    """Return the proven facts and the best known harm of worlds at the alert; ``Unproven`` if the proofs do not cover
-    the task.
+    """Return the proven facts and the best known harm of worlds at the alert.
 
-    ``task`` names the scenario and the controlled vehicles.
+    Returns ``Unproven`` if the proofs do not cover the task. ``task`` names the scenario and the controlled vehicles.
     """
     proof = prove(worlds, task)
     if isinstance(proof, Unproven):
@@ -99,7 +97,7 @@ def known_limits(worlds: Worlds, task: Task) -> Limits | Unproven:
 
 
 def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
-    """Return the proofs for worlds at the alert; ``Unproven`` if they do not cover the task.
+    """Return the proven facts about worlds at the alert. Return ``Unproven`` if the proofs do not cover the task.
 
     ``task`` names the scenario and the controlled vehicles.
     """
@@ -120,7 +118,7 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why nothing is proven for the task in these worlds, as a clause; None if something is proven.
+    """Return the reason why the proofs do not cover the task in these worlds, as a clause. Return None if they do.
 
     ``task`` names the scenario and the controlled vehicles.
     """
@@ -132,24 +130,25 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why it is not decided whether contact can be avoided, as a clause; None if it is decided.
+    """Return the reason why it is unknown whether contact is avoidable, as a clause. Return None if it is known.
 
-    ``worlds`` are at the alert; ``task`` names the scenario and the controlled vehicles.
+    ``worlds`` are at the alert. ``task`` names the scenario and the controlled vehicles.
     """
     return _uneven_because(worlds) if worlds.vehicles.build_up.any() else _uncovered_because(worlds, task)
 
 
 def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why ``avoidability`` does not cover the task, as a clause; None if it does. Ignores brake
-    build-up.
+    """Return the reason why ``avoidability`` does not cover the task, as a clause; None if it covers the task.
+
+    The function ignores whether brakes build up.
     """
     scenario, names = task.scenario, task.scenario.vehicle_names
     if not task.vehicles or (len(task.vehicles) > 1 and set(task.vehicles) not in _DECIDED):
-        return f"controlled are: {task.names}; avoidability is proven for one vehicle"
+        return f"the controlled vehicles are {task.names}; avoidability is proven for one controlled vehicle"
     if scenario.vehicles != _VEHICLES:
-        return f"{scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES}"
+        return f"the line has {scenario.vehicles} vehicles; avoidability is proven for {_VEHICLES} vehicles"
     if set(task.vehicles) not in _DECIDED:
-        return f"{task.names} is controlled; avoidability is proven for {names[_DRIVEN]}"
+        return f"the controlled vehicle is {task.names}; avoidability is proven for {names[_DRIVEN]}"
     because = _script_because(task, "avoidability is proven")
     if because is not None:
         return because
@@ -157,34 +156,32 @@ def _uncovered_because(worlds: Worlds, task: Task) -> str | None:
     first = (each[:, 0] for each in (worlds.vehicles.braking_capacity_mps2, worlds.vehicles.brake_rate_mps3))
     way_m = stopping_distances(worlds.speeds_mps[:, 0], latency_s[:, 0], *first)
     if not (way_m < worlds.obstacle_gap_m).all():
-        return "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"
+        return "vehicle_1 reaches the obstacle although it brakes; avoidability is proven where it stops in time"
     if (latency_s[:, 0] > latency_s[:, _DRIVEN]).any():
-        return f"{names[0]} may brake later than {names[_DRIVEN]}; nothing is proven then"
+        return f"{names[0]} may brake later than {names[_DRIVEN]}; avoidability is proven where it brakes first"
     return None
 
 
 def _uneven_because(worlds: Worlds) -> str:
-    why = "a vehicle brakes in pieces (profile)" if worlds.vehicles.in_pieces.any() else "brakes build up"
-    return f"{why}; nothing is proven then"
+    if worlds.vehicles.in_pieces.any():
+        return "a vehicle brakes with a profile of several decelerations; the proofs assume one"
+    return "brakes build up; the proofs assume instant brakes"
 
 
 def _is_team(task: Task) -> bool:
-    """Return whether the task needs the bound for teams, ``team_bound``.
-
-    That is so for several controlled vehicles, and for more vehicles than ``lower_bound`` covers.
-    """
+    """Return whether the task needs ``team_bound``, the bound for several controlled vehicles or a long line."""
     return len(task.vehicles) > 1 or (len(task.vehicles) == 1 and task.scenario.vehicles > _VEHICLES)
 
 
 def _script_because(task: Task, proven: str) -> str | None:
-    """Return a clause that names a vehicle which follows another script than full_brake; None if there is none.
+    """Return a clause that names a vehicle with a script other than full_brake; None if there is no such vehicle.
 
-    ``task`` names the scenario and the controlled vehicles; ``proven`` is the subject of the clause, for instance
+    ``task`` names the scenario and the controlled vehicles. ``proven`` is part of the clause, for instance
     "avoidability is proven".
     """
     scenario = task.scenario
     for i in range(scenario.vehicles):
         script = scenario.scripts.get(i, "full_brake")
         if i not in task.vehicles and script != "full_brake":
-            return f"{scenario.vehicle_names[i]} follows {script}; {proven} where it follows full_brake"
+            return f"{scenario.vehicle_names[i]} follows the script {script}; {proven} where it follows full_brake"
     return None

@@ -1,4 +1,4 @@
-"""``planner``: an agent that searches whole command profiles at every decision."""
+"""``planner``: an agent that searches for the best command profile at every decision."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """Settings of an agent that looks ahead, and the methods with which it decides when to plan and what to command."""
+    """Settings of an agent that searches, and methods that find the worlds to search and the present command."""
 
-    harm_count: HarmCount  # harm to minimise: ``first`` or ``total``
-    horizon_s: float  # time up to which it looks ahead, s
+    harm_count: HarmCount  # harm count to minimise: ``first`` or ``total``
+    horizon_s: float  # end of the simulated episode, s
     time_step_s: float  # time between two decisions, s
-    objective: Declared = "total"  # whose harm it minimises, as a scenario declares it
+    objective: Declared = "total"  # objective to minimise, as a scenario declares it
 
     @property
     def decisions(self) -> int:
@@ -40,7 +40,7 @@ class Outlook(NamedTuple):
         return int(np.ceil(self.horizon_s / self.time_step_s)) + 1
 
     def problem(self, worlds: Worlds, vehicle: int, others_mps2: Floats) -> ProfileProblem:
-        """Return the search problem: choose the command profile of ``vehicle`` from the present time of ``worlds`` on.
+        """Return the search problem for ``vehicle``, from the present time of ``worlds`` until the horizon.
 
         ``others_mps2`` [n, N] are the commands of the other vehicles.
         """
@@ -51,9 +51,9 @@ class Outlook(NamedTuple):
         return minimising(problem, worlds, self.objective, [vehicle])
 
     def due(self, worlds: Worlds, planned_s: Floats) -> Ints:
-        """Return the indices of worlds that need a new plan: something moves, and a decision was due since the last
-        plan.
+        """Return the indices of worlds that need a new plan.
 
+        In these worlds a vehicle moves, the horizon is not reached, and time has passed since the last plan.
         ``planned_s`` [n] is the time of the last plan, s.
         """
         moving = (worlds.speeds_mps != 0.0).any(axis=1)
@@ -63,9 +63,9 @@ class Outlook(NamedTuple):
         """Return the present command in each world, [n] m/s2.
 
         Args:
-            worlds: the worlds now, [n]; only their time is read.
-            memory: holds ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n], the time
-                of the first one.
+            worlds: worlds in their present state, [n]; only the time is read.
+            memory: memory with ``commands_mps2`` [n, decisions], one command for each decision, and ``start_s`` [n],
+                the time of the first decision, s.
 
         """
         step = Decisions(memory["start_s"], self.time_step_s).latest(worlds.time_s)
@@ -74,7 +74,7 @@ class Outlook(NamedTuple):
 
 
 def budget_of(argument: str) -> int | None:
-    """Return ``argument`` as a number of candidates (1 to ``MOST_CANDIDATES``), or None if it is not such a number."""
+    """Return ``argument`` as a number of candidates; None if it is no whole number from 1 to ``MOST_CANDIDATES``."""
     number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     return number if 1 <= number <= MOST_CANDIDATES else None
 
@@ -83,20 +83,22 @@ CANDIDATES = 256  # default number of candidates per world and decision
 
 
 class Planner:
-    """Receding-horizon planner: at each decision it searches its own profile, while the others follow their scripts.
+    """Receding-horizon planner: at each decision it searches for the best commands until the horizon.
 
-    Each search starts from the previous plan, from constants and, at the first decision, from the pairwise optimum.
-    ``predicted_harm`` [n] is the harm of the first plan (m2/s2); the simulated harm is no larger if the others behave
-    as expected. Vehicles without a script (learners) are assumed to brake fully. Raises ``InvalidInput`` for an invalid
-    argument or count and, when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    Each search starts from the previous plan and from constant commands. The first search starts from the pairwise
+    optimum instead of a previous plan. The planner expects that the other vehicles follow their scripts, and that other
+    learners brake fully. ``predicted_harm`` [n] is the harm of the first plan, m2/s2. If the other vehicles do what the
+    planner expects, the simulated harm is at most ``predicted_harm``. Raises ``InvalidInput`` if ``argument`` or
+    ``harm_count`` is invalid. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed
+    at the alert.
 
     Args:
         argument: number of candidates per world and decision, as text; None: ``CANDIDATES``.
-        harm_count: harm to minimise, ``first`` or ``total``.
-        horizon_s: time up to which it looks ahead, s.
-        most_candidates: upper limit of the number of candidates, whatever ``argument`` says; None: no limit.
+        harm_count: harm count to minimise, ``first`` or ``total``.
+        horizon_s: end of the simulated episode, s.
+        most_candidates: upper limit of the number of candidates in ``argument``; None: no limit.
         time_step_s: time between two decisions, s.
-        objective: whose harm it minimises; ``predicted_harm`` is then the amount of this objective.
+        objective: objective to minimise; ``predicted_harm`` is the amount of this objective.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -123,15 +125,15 @@ class Planner:
         budget = CANDIDATES if argument is None else budget_of(argument)
         if budget is None:
             raise InvalidInput(
-                f"agent 'planner:{argument}': the argument must be a number of candidates per decision, for instance"
-                f" {CANDIDATES}, at most {MOST_CANDIDATES:,}"
+                f"agent 'planner:{argument}': the text after the colon must be a number of candidates per decision from"
+                f" 1 to {MOST_CANDIDATES:,}, for instance planner:{CANDIDATES}"
             )
         self.name = "planner" if argument is None else f"planner:{argument}"
         self._candidates = budget if most_candidates is None else min(budget, most_candidates)
         self._outlook = Outlook(harm_count, horizon_s, time_step_s, objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Make the first plan of these episodes, and return the memory.
+        """Search for the first plan of each world, and return it as memory.
 
         Args:
             alert: the worlds at the alert, [n].
@@ -147,11 +149,12 @@ class Planner:
         return {"plan": plan, "planned_s": start_s, "others_mps2": others, "predicted_harm": harm}
 
     def act(self, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
-        """Return the first command of each world's plan, [n] m/s2, and the new memory. A new plan is searched where a
-        decision is due.
+        """Return the first command of each world's plan, [n] m/s2, and the new memory.
+
+        In worlds in which a decision is due, the plan is the result of a new search.
 
         Args:
-            worlds: the worlds now, [n].
+            worlds: worlds in their present state, [n].
             memory: memory from ``begin`` or the previous ``act``.
             vehicle: index of the controlled vehicle.
 
@@ -165,12 +168,12 @@ class Planner:
         return Profiles(*memory["plan"]).commands_mps2[:, 0, 0], memory
 
     def _rest(self, held: Memory, time_s: Floats, problem: ProfileProblem) -> Profiles:
-        """Return the part of each stored plan that is still ahead, as profiles [m] for the new problem.
+        """Return the part of each stored plan after the present time, as profiles [m] of the new problem.
 
         Args:
-            held: memory of the worlds that plan again.
-            time_s: [m] present time, s.
-            problem: the search problem from that time on.
+            held: memory of the m worlds that need a new plan.
+            time_s: present time, [m] s.
+            problem: search problem from the present time on.
 
         """
         plan = Profiles(*held["plan"])
@@ -180,9 +183,7 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Return the best plan of each world, and its harm [n] (m2/s2), from a search that starts with ``plan`` and
-        constants.
-        """
+        """Search from ``plan`` and constant commands. Return the best plan of each world, and its harm, [n] m2/s2."""
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)
@@ -194,7 +195,7 @@ class Planner:
 
 
 def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of candidates, or None."""
+    """Return the agent ``planner`` or ``planner:CANDIDATES``. ``argument`` is the number of candidates, or None."""
     return Planner(
         argument, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
         most_candidates=settings.most_candidates, time_step_s=settings.time_step_s,
@@ -203,7 +204,7 @@ def make_planner(argument: str | None, settings: AgentSettings) -> Agent:
 
 
 def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches in the estimated world.
+    """Return the agent ``planner:estimated`` or ``planner:CANDIDATES:estimated``, which searches the estimated world.
 
     ``argument`` is the number of candidates, or None.
     """
@@ -213,8 +214,8 @@ def make_estimating_planner(argument: str | None, settings: AgentSettings) -> Ag
 PLANNER = Part(
     make_planner,
     form="planner[:CANDIDATES]",
-    about="a search in the simulation at every decision, with so many candidates each",
+    about="searches by simulation at every decision, with CANDIDATES candidates",
     knows=Source.MODEL,
 )
 
-ESTIMATED_PLANNER = Part(make_estimating_planner, about="as above")
+ESTIMATED_PLANNER = Part(make_estimating_planner, about="the same search in the estimated world")

@@ -1,4 +1,4 @@
-"""Search for the best command profiles of a problem, one world per task."""
+"""Search for the best command profile in each world of a problem, on several threads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MIX = 0xD1342543DE82EF95  # odd multiplier that spreads seeds over 64 bits
 
 
 def seeded(identity: UInt64s, seed: int) -> UInt64s:
-    """Return the initial random state of each world, [n], from its hash ``identity`` [n] and the seed alone."""
+    """Return the initial state of each world's random stream, [n], from its hash ``identity`` [n] and ``seed``."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * _MIX) % 2**64)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -27,16 +27,16 @@ def seeded(identity: UInt64s, seed: int) -> UInt64s:
 
 
 def minimising(problem: ProfileProblem, worlds: Worlds, declared: Declared, vehicles: Sequence[int]) -> ProfileProblem:
-    """Return the problem in which a search minimises the objective of the controlled vehicles.
+    """Return ``problem`` with the objective of the controlled vehicles instead of the harm of the line.
+
+    Raises ``InvalidInput`` if the objective is neither a weighted sum of the vehicles' harm nor ``maximin``, or if the
+    controlled vehicles have different objectives.
 
     Args:
-        problem: n worlds, in which a search minimises the harm of the line.
-        worlds: the worlds of the problem, [n].
-        declared: one objective for all vehicles, or one per vehicle, as a scenario declares it.
+        problem: search problem of n worlds, in which a search minimises the harm of the line.
+        worlds: worlds of the problem, [n].
+        declared: one objective for all vehicles, or one for each vehicle, as a scenario declares it.
         vehicles: indices of the controlled vehicles, from 0.
-
-    Raises ``InvalidInput`` for an objective that is neither a weighted sum of the vehicles' harm nor ``maximin``, or if
-    the controlled vehicles do not minimise the same amount.
 
     """
     objectives = objectives_of(declared, worlds.N)
@@ -46,8 +46,8 @@ def minimising(problem: ProfileProblem, worlds: Worlds, declared: Declared, vehi
     weights, largest = aims[0]
     if any(also != largest or not np.array_equal(other, weights) for other, also in aims[1:]):
         raise InvalidInput(
-            f"search under the objective {declared!r}: its {len(vehicles)} vehicles minimise different amounts; give"
-            " an objective that they share, for instance weighted:1,4,1"
+            f"objective {declared!r}: the {len(vehicles)} controlled vehicles minimise different amounts, but a search"
+            " can minimise only one; give all of them the same objective, for instance weighted:1,4,1"
         )
     return problem.minimising(weights, largest=largest)
 
@@ -56,16 +56,15 @@ Found = tuple[Profiles, dict[HarmCount, Floats]]
 
 
 def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1) -> Found:
-    """Return the best command profile of each world that the search finds, and its harm [n] (m2/s2) under each count,
-    as the problem weighs it.
+    """Search each world, and return the best profiles found and their harm [n] (m2/s2) under each count.
 
     A profile has at most ``MOST_PHASES`` phases of constant command. The result is never worse than any profile of
-    ``given``. Raises ``InvalidInput`` for a budget below 1, and ``PhysicsError`` with the worlds in which no profile
-    could be followed.
+    ``given``. The harm is the amount that the problem minimises. Raises ``InvalidInput`` for ``budget`` or ``threads``
+    below 1 or a negative seed, and ``PhysicsError`` with the worlds in which the physics could simulate no profile.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        given: [n * Q] starting profiles: the Q profiles of world 0 first, then those of world 1, and so on.
+        given: starting profiles, [n * Q]: first the Q profiles of world 0, then the Q profiles of world 1, and so on.
         budget: approximate number of candidates per world.
         seed: seed of the random search.
         threads: number of threads.
@@ -89,5 +88,5 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
         with ThreadPoolExecutor(threads) as pool:
             used = list(pool.map(work, range(n)))
     if 0 in used:
-        raise PhysicsError({k: "no profile could be followed" for k in range(n) if used[k] == 0})
+        raise PhysicsError({k: "no command profile could be simulated" for k in range(n) if used[k] == 0})
     return best, problem.values(best)

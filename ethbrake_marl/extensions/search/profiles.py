@@ -1,8 +1,8 @@
-"""Random search for the best profile of one world, compiled, with one small random stream per world.
+"""Compiled random search for the best profile of one world. Each world has its own random stream.
 
-A *profile* has at most K phases of constant command: ``ends`` [K] are the steps at which they end, ``commands`` [K, C]
-the commands of the C controlled vehicles (m/s2). ``bounds`` [C, 2] are the least and the largest command of each
-vehicle (m/s2). S is the length of a state.
+A *profile* has at most K phases of constant command: ``ends`` [K] are the steps at which the phases end, ``commands``
+[K, C] the commands of the C controlled vehicles (m/s2). ``bounds`` [C, 2] are the least and the largest command of each
+vehicle (m/s2). S is the length of a state array.
 """
 
 from __future__ import annotations
@@ -46,22 +46,23 @@ def draw(random: UInt64s) -> float:
 
 @compiled
 def draw_below(random: UInt64s, n: int) -> int:
-    """Return a random whole number from 0 to n - 1. ``random`` [1] is the state of the random stream."""
+    """Return a random whole number from 0 to ``n`` - 1. ``random`` [1] is the state of the random stream."""
     return min(int(draw(random) * n), n - 1)
 
 
 @compiled
 def allowed(command: float, low: float, high: float) -> float:
-    """Return ``command`` cut to ``low`` and ``high`` (m/s2), rounded toward 0 to a multiple of 1 / 2^20."""
+    """Return ``command`` limited to ``low`` and ``high``, and rounded toward 0 to a multiple of 1 / 2^20, m/s2."""
     command = min(max(command, low), high)
     return int(command * RESOLUTION) / RESOLUTION
 
 
 @compiled
 def draw_command(random: UInt64s, low: float, high: float) -> float:
-    """Return a random command (m/s2): often ``low``, ``high`` or 0, else a uniform value between them.
+    """Return a random command, m/s2.
 
-    ``random`` [1] is the state of the random stream.
+    It is ``low`` with probability 0.35, ``high`` with 0.15, 0 with 0.1, and otherwise uniform between ``low`` and
+    ``high``. ``random`` [1] is the state of the random stream.
     """
     u = draw(random)
     if u < 0.35:
@@ -75,17 +76,17 @@ def draw_command(random: UInt64s, low: float, high: float) -> float:
 
 @compiled
 def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -> bool:
-    """Apply one change to a profile, in place. Return False if it had no effect.
+    """Apply one change to a profile, in place. Return False if the change has no effect.
 
-    Kinds of change: COMMAND_CHANGE adds to one command. TRADE also changes the next command, so that the speed after
-    both phases stays and only the position changes. SET_COMMAND replaces a command. MOVE_END moves the border between
-    two phases by whole steps.
+    There are four kinds of change. COMMAND_CHANGE adds an amount to one command. TRADE adds an amount to one command
+    and changes the next command by the opposite impulse: the vehicle has the same speed after the two phases, but
+    another position. SET_COMMAND replaces one command. MOVE_END moves the border between two phases by whole steps.
 
     Args:
-        change: [CHANGE_WIDTH] columns KIND, VEHICLE, PHASE and AMOUNT (m/s2, or steps).
-        bounds: [C, 2] least and largest command of each vehicle, m/s2.
-        ends: [K] steps at which the phases end; changed in place.
-        commands: [K, C] commands of the phases, m/s2; changed in place.
+        change: the change, [CHANGE_WIDTH], with the columns KIND, VEHICLE, PHASE and AMOUNT (m/s2, or steps).
+        bounds: least and largest command of each vehicle, [C, 2] m/s2.
+        ends: steps at which the phases end, [K]; changed in place.
+        commands: commands of the phases, [K, C] m/s2; changed in place.
 
     """
     kind, c, k, amount = int(change[KIND]), int(change[VEHICLE]), int(change[PHASE]), change[AMOUNT]
@@ -114,13 +115,12 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
 
 @compiled
 def compact(ends: Ints, commands: Floats, phases: int) -> int:
-    """Remove empty phases (times of constant command) of a profile and join neighbouring ones with equal commands, in
-    place; return how many are left.
+    """Remove the empty phases of a profile, join neighbouring phases with equal commands, and return the number left.
 
     Args:
-        ends: [K] steps at which the phases end.
-        commands: [K, C] commands of the phases, m/s2.
-        phases: number of phases in use before.
+        ends: steps at which the phases end, [K]; changed in place.
+        commands: commands of the phases, [K, C] m/s2; changed in place.
+        phases: number of phases in use before the call.
 
     """
     last, count = ends[ends.shape[0] - 1], 0
@@ -144,23 +144,23 @@ def compact(ends: Ints, commands: Floats, phases: int) -> int:
 
 DRAWN_PHASES = 6  # number of phases of a random profile
 
-DRAWN_SHARE = 0.35  # share of the budget for given and random profiles
+DRAWN_SHARE = 0.35  # fraction of the budget for starting profiles and random profiles
 
-ROUNDS_SHARE = 0.50  # share of the budget for the rounds of improvement, each of which halves the field
+ROUNDS_SHARE = 0.50  # fraction of the budget for the rounds of improvement, each of which halves the field
 
-STEPWISE_SHARE = 0.02  # share for the last improvement, decision by decision; its candidates cost several times more
+STEPWISE_SHARE = 0.02  # fraction of the budget for the last improvement, whose candidates take several times longer
 
-PER_PROFILE = 400  # candidates of the budget per profile of the first field, which sets the size of that field
+PER_PROFILE = 400  # the first field has one profile for this number of candidates in the budget, within the limits:
 
 SMALLEST_FIELD, LARGEST_FIELD = 4, 128  # limits of the number of profiles in the first field
 
-SAME = 1e-6  # profiles with values (m2/s2) closer than this count as equal
+SAME = 1e-6  # m2/s2; two profiles whose harm differs by less are treated as the same profile
 
-ATTENTION_STEPS = 30  # number of first steps in which phases are divided
+ATTENTION_STEPS = 30  # phases are divided within this number of steps from the first decision
 
 
 class Population(NamedTuple):
-    """Profiles that are improved together (the *field*). A profile has up to K phases of constant command."""
+    """The M profiles that are improved together (the *field*). A profile has up to K phases of constant command."""
 
     ends: Ints  # [M, K] steps at which the phases end
     commands: Floats  # [M, K, C] commands of the C controlled vehicles in each phase, m/s2
@@ -172,18 +172,19 @@ class Population(NamedTuple):
 def search_world(
     world: SearchWorld, start: Floats, seed_ends: Ints, seed_commands: Floats, budget: int, ends: Ints, commands: Floats
 ) -> int:
-    """Search for the best profile of one world and write it to ``ends`` and ``commands``; return its number of phases.
+    """Search for the best profile of one world, and write the profile to ``ends`` and ``commands``.
 
-    The result is never worse than any starting profile. Returns 0 if no profile could be followed.
+    Returns the number of phases of the profile; 0 if the physics could simulate no profile. The result is never worse
+    than any starting profile.
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        start: [S] state at the first decision.
-        seed_ends: [Q, K] steps at which the phases of the Q starting profiles end.
-        seed_commands: [Q, K, C] their commands, m/s2.
+        world: world to simulate, with its bounds and random stream.
+        start: state of the world at the first decision, [S].
+        seed_ends: steps at which the phases of the Q starting profiles end, [Q, K].
+        seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
         budget: number of candidates to simulate.
-        ends: [K] receives the steps at which the phases end.
-        commands: [K, C] receives the commands, m/s2.
+        ends: output: steps at which the phases end, [K].
+        commands: output: commands of the phases, [K, C] m/s2.
 
     """
     K, C = commands.shape
@@ -225,9 +226,7 @@ def search_world(
 
 @compiled
 def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
-    """Copy one profile (``ends``, ``commands``) over the first phases (times of constant command) of another one
-    (``to_ends``, ``to_commands``).
-    """
+    """Copy the phases of one profile over the first phases of a second profile, ``to_ends`` and ``to_commands``."""
     for k in range(ends.shape[0]):
         to_ends[k] = ends[k]
     copy_rows(commands, to_commands, commands.shape[0])
@@ -235,15 +234,15 @@ def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Float
 
 @compiled(apart=True)
 def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, budget: int) -> float:
-    """Improve a profile in place by random changes until ``budget`` candidates have run; return its harm, m2/s2.
+    """Improve a profile in place by ``budget`` random candidates, and return its harm, m2/s2.
 
-    The result is infinite if the profile could not be followed.
+    Returns infinity if the physics could not simulate the profile.
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        ends: [K] steps at which the phases end; changed in place.
-        commands: [K, C] commands of the phases, m/s2; changed in place.
-        states: [K + 1, S] state at the start of each phase; row 0 is given.
+        world: world to simulate, with its bounds and random stream.
+        ends: steps at which the phases end, [K]; changed in place.
+        commands: commands of the phases, [K, C] m/s2; changed in place.
+        states: working memory, [K + 1, S]: state at the start of each phase; row 0 contains the first decision.
         budget: number of candidates to simulate.
 
     """
@@ -288,7 +287,7 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
         change[AMOUNT] *= 2.0
         again = spent > 0 and change[KIND] != SET_COMMAND
     for k in range(active - 1, ends.shape[0]):
-        ends[k] = int(world.episode.clock[CLOCK.LAST_STEP])  # the episode is over by then
+        ends[k] = int(world.episode.clock[CLOCK.LAST_STEP])  # the episode ends before the later phases begin
     return value
 
 
@@ -296,15 +295,17 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
 def gather(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Population
 ) -> None:
-    """Fill the field with the best of the starting profiles and of ``drawn`` random ones, all with different harm.
+    """Fill the field with the best profiles among the starting profiles and ``drawn`` random profiles.
+
+    No two profiles of the field have the same harm.
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        seed_ends: [Q, K] steps at which the phases of the Q starting profiles end.
-        seed_commands: [Q, K, C] their commands, m/s2.
-        states: [K + 1, S] working memory: the state at the start of each phase; row 0 is the first decision.
+        world: world to simulate, with its bounds and random stream.
+        seed_ends: steps at which the phases of the Q starting profiles end, [Q, K].
+        seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
+        states: working memory, [K + 1, S]: state at the start of each phase; row 0 contains the first decision.
         drawn: number of random profiles.
-        field: receives the profiles.
+        field: output: the profiles.
 
     """
     Q, K = seed_ends.shape
@@ -358,7 +359,7 @@ def sort(field: Population, left: int) -> None:
 
 @compiled
 def is_among(value: float, values: Floats) -> bool:
-    """Return whether ``value`` equals one of ``values`` up to ``SAME``, so that both belong to the same profile."""
+    """Return whether ``value`` differs from one of ``values`` by less than ``SAME``."""
     for other in values:  # noqa: SIM110  # any() is not compiled
         if abs(other - value) < SAME:
             return True
@@ -367,7 +368,7 @@ def is_among(value: float, values: Floats) -> bool:
 
 @compiled
 def largest(values: Floats) -> int:
-    """Return the index of the largest of ``values``; of several equal ones, the first."""
+    """Return the index of the largest value. If several values are equally large, return the first index."""
     place = 0
     for k in range(values.shape[0]):
         if values[k] > values[place]:
@@ -377,15 +378,10 @@ def largest(values: Floats) -> int:
 
 @compiled(apart=True)
 def divide(world: SearchWorld, field: Population) -> None:
-    """Divide phases (times of constant command) of the best profile of the field, in place, until it has the largest
-    number of phases.
+    """Halve phases of the best profile of the field, in place, until the profile has K phases.
 
-    The longest phase is halved first. Only the first ``ATTENTION_STEPS`` steps of the episode count towards its length.
-
-    Args:
-        world: the world, with its commands, bounds and random stream.
-        field: the profiles that are improved together.
-
+    The longest phase is halved first. The length of a phase counts only its steps among the first ``ATTENTION_STEPS``
+    steps of the episode. ``world`` holds the number of steps.
     """
     used = field.phases[0]
     if used > 0 and field.values[0] > 0.0:
@@ -414,18 +410,17 @@ def divide(world: SearchWorld, field: Population) -> None:
 def select_stepwise(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, field: Population
 ) -> None:
-    """Switch to stepwise simulation, and put the best of the field and the starting profiles in the first place of the
-    field.
+    """Switch to stepwise simulation, and write the best profile to the first place of the field.
 
-    Stepwise simulation (decision by decision) rounds as the engine does. Where harm jumps, rounding may decide how much
-    harm a profile does.
+    The candidates are the profiles of the field and the starting profiles. Stepwise simulation goes from decision to
+    decision and rounds as the engine does. Where harm jumps, rounding may decide how much harm a profile does.
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        seed_ends: [Q, K] steps at which the phases of the Q starting profiles end.
-        seed_commands: [Q, K, C] their commands, m/s2.
-        states: [K + 1, S] working memory: the state at the start of each phase; row 0 is the first decision.
-        field: the profiles that are improved together.
+        world: world to simulate, with its bounds and random stream.
+        seed_ends: steps at which the phases of the Q starting profiles end, [Q, K].
+        seed_commands: commands of the starting profiles, [Q, K, C] m/s2.
+        states: working memory, [K + 1, S]: state at the start of each phase; row 0 contains the first decision.
+        field: profiles that are improved together; changed in place.
 
     """
     world.episode.clock[CLOCK.STEPWISE] = 1.0

@@ -1,4 +1,4 @@
-"""``best_harm``: an agent that drives the best known profile, from a table if there is one, else from a search."""
+"""``best_harm``: an agent that drives the best known profile of a world, from a table or from a search at the alert."""
 
 from __future__ import annotations
 
@@ -28,24 +28,26 @@ PROFILE_BUDGET = 20_000  # candidates in a world that is in no table
 START = "universal"  # policy whose episode a search also starts from
 
 Recall = Callable[[ProfileProblem, HarmCount], tuple[Profiles, Bools]]
-"""Kept profiles [n] of a problem, and where there is one [n]; the others are ignored."""
+"""Function that returns the stored profiles [n] of a problem and a mask [n] of the worlds that have one."""
 
 
 class BestHarm:
-    """Agent that plays the command profile of least known harm.
+    """Agent that drives the command profile with the least known harm.
 
-    A world without a stored profile is searched at the alert. If the ``scenario`` has no other learner, a second search
-    with as many candidates starts from the better of that result and the episode of ``universal`` (a trained policy in
-    the package), so the harm is never above that policy's. ``predicted_harm`` [n] (m2/s2) equals the engine's harm
-    exactly if the engine has the same time step. Raises ``InvalidInput`` for a budget below 1 or an unknown count and,
-    when an episode begins, for another vehicle's script whose command is not fixed at the alert.
+    In a world without a stored profile, the agent searches at the alert. If the scenario has no other learner, a second
+    search with the same number of candidates follows. It starts from the better one of two profiles: the result of the
+    first search, and the commands of ``universal``, a trained policy of the package. The harm is therefore never above
+    the harm of ``universal``. ``predicted_harm`` [n] (m2/s2) equals the harm in the engine exactly if the engine has
+    the same time step. Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is unknown. ``begin`` raises
+    ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
-        recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
-        scenario: scenario of the worlds, whose objective it minimises; None: unknown, without the second search.
-        harm_count: harm to minimise, ``first`` or ``total``.
+        recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
+        scenario: scenario of the worlds, whose objective the agent minimises. None: the agent minimises the harm of
+            the line, without the second search.
+        harm_count: harm count to minimise, ``first`` or ``total``.
         horizon_s: end of the episode, s.
-        budget: candidates in a world without a stored profile.
+        budget: number of candidates in a world without a stored profile.
         time_step_s: time between two decisions, s.
 
     """
@@ -64,26 +66,28 @@ class BestHarm:
         time_step_s: float = TIME_STEP_S,
     ) -> None:
         if not budget >= 1:
-            raise InvalidInput(f"best_harm: budget = {budget}; at least 1 candidate is needed")
+            raise InvalidInput(f"best_harm: budget = {budget}: the number of candidates must be at least 1")
         check_harm_count(harm_count)
         self._recall, self._budget, self._scenario = recall, budget, scenario
         self._outlook = Outlook(harm_count, horizon_s, time_step_s, "total" if scenario is None else scenario.objective)
 
     @classmethod
     def make(cls, argument: str | None, settings: AgentSettings, recall: Recall) -> BestHarm:
-        """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``.
+        """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``.
+
+        Raises ``InvalidInput`` if ``argument`` is not a number of candidates.
 
         Args:
-            argument: number of candidates, or None for the default; ``InvalidInput`` if it is not such a number.
-            settings: scenario, harm to minimise and other settings of agents.
-            recall: returns the stored profile of each world of a problem, and a mask of the worlds that have one.
+            argument: number of candidates, as text; None: ``PROFILE_BUDGET``.
+            settings: scenario, harm count to minimise and other settings of agents.
+            recall: function that returns the stored profile of each world, and a mask of the worlds that have one.
 
         """
         budget = PROFILE_BUDGET if argument is None else budget_of(argument)
         if budget is None:
             raise InvalidInput(
-                f"agent 'best_harm:{argument}': the argument must be a number of candidates, for instance"
-                f" {PROFILE_BUDGET}, at most {MOST_CANDIDATES:,}"
+                f"agent 'best_harm:{argument}': the text after the colon must be a number of candidates from 1 to"
+                f" {MOST_CANDIDATES:,}, for instance best_harm:{PROFILE_BUDGET}"
             )
         return cls(
             recall, scenario=settings.scenario, harm_count=settings.harm_count, horizon_s=settings.horizon_s,
@@ -92,7 +96,7 @@ class BestHarm:
         )  # fmt: skip
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Look up the stored profiles of these worlds, search worlds without one, and return the commands as memory.
+        """Read the stored profiles, search the worlds without a stored profile, and return the commands as memory.
 
         Args:
             alert: the worlds at the alert, [n].
@@ -103,7 +107,7 @@ class BestHarm:
         others = fixed_commands(scripts, alert, f"agent {self.name!r}", vehicle=vehicle)
         problem, outlook = self._outlook.problem(alert, vehicle, others), self._outlook
         profiles, known = self._recall(problem, outlook.harm_count)
-        if outlook.objective != "total":  # profiles are kept for the harm of the line alone
+        if outlook.objective != "total":  # the stored profiles minimise the harm of the line
             known = np.zeros(alert.n, np.bool_)
         harm, commands = problem.values(profiles)[outlook.harm_count], self._stepwise(profiles)
         unknown = np.flatnonzero(~known)
@@ -121,7 +125,7 @@ class BestHarm:
         """Return the command of the present step, [n] m/s2, and the unchanged memory.
 
         Args:
-            worlds: the worlds now, [n]; only their time is read.
+            worlds: worlds in their present state, [n]; only the time is read.
             memory: result of ``begin``.
             vehicle: not used.
 
@@ -129,7 +133,7 @@ class BestHarm:
         return self._outlook.command(worlds, memory), memory
 
     def _search(self, worlds: Worlds, vehicle: int, others: Floats) -> tuple[Floats, Floats]:
-        """Return the best commands from a search in these worlds, [n, decisions] m/s2, and their harm [n] m2/s2.
+        """Search the worlds, and return the best commands, [n, decisions] m/s2, and their harm, [n] m2/s2.
 
         ``others`` [n, N] are the commands of the other vehicles, m/s2.
         """

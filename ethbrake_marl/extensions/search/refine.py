@@ -1,8 +1,9 @@
-"""Refine an episode: a compiled random search around the commands of its steps.
+"""Compiled random search around the commands of an episode.
 
-It climbs twice, by random changes of a few neighbouring steps: from the given commands, and from the best of some
-random templates, because the best may lie in a valley of its own. A *template* is one command, another one for a short
-while, then full braking. Everything advances decision by decision as in the engine, so the result is exact.
+The search improves two episodes by random changes of a few neighbouring steps. The first one has the given commands.
+The second one is the best of some random templates, because changes of the given commands may miss the best episode. A
+*template* is one command, another command for a short while, then full braking. The simulation goes from decision to
+decision as the engine does, and therefore gives exactly the harm of the engine.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.engine.profiles import ProfileProblem, SearchWorld, copy_rows, make_search_world
-from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number, count_of
 from ethbrake_marl.extensions.search.problem import seeded
 from ethbrake_marl.extensions.search.profiles import allowed, draw, draw_below, draw_command
 from ethbrake_marl.physics.elementary import exp
@@ -22,47 +23,46 @@ from ethbrake_marl.physics.jit import compiled
 from ethbrake_marl.physics.rows import ROW
 from ethbrake_marl.physics.state import Bools, Floats, UInt64s
 
-TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3  # shares of the budget; the rest is for the climb from the given commands
+# fractions of the budget for drawing templates and for improving the best one; the rest improves the given commands
+TEMPLATE_SHARE, THEIR_CLIMB_SHARE = 0.3, 0.3
 
-ATTENTION_S = 3.0  # changes start within this time from the first decision
+ATTENTION_S = 3.0  # a change begins at most this time after the first decision
 
-LONGEST_CHANGE_S = 0.6  # longest change
+LONGEST_CHANGE_S = 0.6  # largest duration of a change
 
-LONGEST_WHILE_S = 0.8  # longest second command of a template
+LONGEST_WHILE_S = 0.8  # largest duration of the second command of a template
 
-SET_SHARE = 0.1  # share of changes that replace commands; the others add to them
+SET_SHARE = 0.1  # fraction of changes that replace commands; the other changes add an amount to commands
 
-FULL_BRAKE_SHARE = 0.8  # share of templates that begin with full braking
+FULL_BRAKE_SHARE = 0.8  # probability that a template begins with full braking
 
-LN_SMALLEST_CHANGE = (
-    -6.907755278982138
-)  # ln of the smallest added amount, relative to the whole range of commands: three decades
+# ln of the smallest added amount, relative to the whole range of commands: three decades
+LN_SMALLEST_CHANGE = -6.907755278982138
 
-WORSE = 5.0  # m2/s2; a climb starts from a template only if it is worse by at most this
+WORSE = 5.0  # m2/s2; a template is improved only if its harm exceeds the best harm so far by less than this
 
-NO_HARM = 1e-9  # m2/s2; less harm than this counts as none
+NO_HARM = 1e-9  # m2/s2; less harm than this is treated as 0
 
 
 class Plan(NamedTuple):
-    """Commands of one world in every step, and the states that they lead to."""
+    """Commands of one world in every step, and the states that these commands lead to."""
 
     commands: Floats  # [T] command of the controlled vehicle in each step, m/s2
     states: Floats  # [T + 1, S] state of the simulation at the start of each step
 
 
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Search around given commands of the one controlled vehicle. Return the best commands [n, T] (m/s2) and their harm
-    [n].
+    """Search around given commands, and return the best commands, [n, T] m/s2, and their harm, [n] m2/s2.
 
-    The result is never worse than the given commands. Harm (m2/s2) is counted as the engine counts it, and weighed
-    as the problem says. Worlds are
-    independent of each other. Raises ``InvalidInput`` for several vehicles, commands of another shape or beyond a
-    capacity, or a budget below 1, and ``PhysicsError`` with the worlds in which the given commands cannot be played.
+    The result is never worse than the given commands. The harm is the amount that the problem minimises, computed as in
+    the engine. The result for a world does not depend on the other worlds. Raises ``InvalidInput`` if several vehicles
+    are controlled, if the commands have a wrong shape or exceed a capacity, or if ``budget`` is below 1. Raises
+    ``PhysicsError`` with the worlds in which the physics cannot simulate the given commands.
 
     Args:
-        problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        commands_mps2: [n, T] command of each step to start from.
-        budget: candidates per world.
+        problem: n worlds with one controlled vehicle, the commands of the other vehicles, and the harm to minimise.
+        commands_mps2: command of each step, from which the search starts, [n, T].
+        budget: number of candidates per world.
         seed: seed of the random search.
 
     """
@@ -70,13 +70,19 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     n, steps = problem.n, int(problem.last_step.max(initial=0))
     low, high = problem.bounds[:, :1, 0], problem.bounds[:, :1, 1]
     if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
-        raise InvalidInput(f"refine: commands of shape {commands_mps2.shape}; ({n}, {steps}) of one vehicle are needed")
+        raise InvalidInput(
+            f"refine: {count_of(len(problem.vehicles), 'controlled vehicle')}, and commands of shape"
+            f" {commands_mps2.shape}: give one vehicle and commands of shape ({n}, {steps})"
+        )
     if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
-        raise InvalidInput("refine: a command is beyond the vehicle's capacity")
+        raise InvalidInput(
+            "refine: a command exceeds the capacity of the vehicle; give commands between minus the braking capacity"
+            " and the driving capacity"
+        )
     best, value, failed = commands_mps2.copy(), np.zeros(n), np.zeros(n, np.bool_)
     _refine_worlds(problem, seeded(problem.identity, seed), budget, best, value, failed)
     if failed.any():
-        raise PhysicsError({k: "its commands could not be played" for k in np.flatnonzero(failed).tolist()})
+        raise PhysicsError({k: "the given commands cannot be simulated" for k in np.flatnonzero(failed).tolist()})
     return best, value
 
 
@@ -88,11 +94,11 @@ def _refine_worlds(
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        random: [n] initial state of each world's random stream.
-        budget: candidates per world.
-        commands: [n, T] commands of each step, m/s2; changed in place.
-        value: [n] receives the harm as the problem weighs it, m2/s2.
-        failed: [n] receives True for worlds in which the commands cannot be played.
+        random: initial state of each world's random stream, [n].
+        budget: number of candidates per world.
+        commands: command of each step, [n, T] m/s2; changed in place.
+        value: output: harm that the problem minimises, [n] m2/s2.
+        failed: output: True for worlds in which the physics cannot simulate the commands, [n].
 
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
@@ -113,15 +119,9 @@ def _refine_worlds(
 
 @compiled(apart=True)
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
-    """Improve the commands ``mine`` of one world in place. Return False if they cannot be played.
+    """Improve the commands ``mine`` of one world in place. Return False if the physics cannot simulate them.
 
-    Args:
-        world: the world, with its commands, bounds and random stream.
-        mine: commands to improve.
-        other: working memory.
-        room: working memory.
-        budget: number of candidates.
-
+    ``other`` and ``room`` are working memory. ``budget`` is the number of candidates.
     """
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_CLIMB_SHARE * budget)
     value, reached = follow_steps(world.episode, mine, 0, math.inf)
@@ -140,16 +140,16 @@ def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budge
 
 @compiled(apart=True)
 def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[float, int]:
-    """Play the commands of ``plan`` from a step on, and write its states. Return the harm (m2/s2) and the number of
-    steps.
+    """Simulate the commands of ``plan`` from step ``begin`` on, and write its later states.
 
-    The number of steps is -1 if the physics failed.
+    Returns the harm (m2/s2) and the number of steps until the end of the episode. This number is -1 if the physics
+    fails.
 
     Args:
-        world: the world, with the commands of the other vehicles.
-        plan: commands to play, with the state at step ``begin``; the later states are written.
-        begin: first step to play.
-        bound: harm at which to stop, m2/s2, because harm never falls.
+        world: world to simulate, with the commands of the other vehicles.
+        plan: commands to simulate, with the state at step ``begin``.
+        begin: first step to simulate.
+        bound: harm at which the simulation stops, m2/s2.
 
     """
     table, clock = world.table, world.clock
@@ -171,16 +171,16 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 
 @compiled(apart=True)
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
-    """Improve ``plan`` in place by random changes; return its harm (m2/s2) and its number of steps.
+    """Improve ``plan`` in place by random changes, and return its harm (m2/s2) and its number of steps.
 
-    If adding an amount to the commands of some steps lowers the harm, twice the amount is tried next.
+    If adding an amount to the commands of some steps lowers the harm, the next candidate adds twice the amount.
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        plan: commands and states, already simulated.
+        world: world to simulate, with its bounds and random stream.
+        plan: commands with their simulated states.
         room: working memory.
-        value: harm of the plan, m2/s2.
-        reached: number of its steps until the end of the episode.
+        value: harm of ``plan``, m2/s2.
+        reached: number of steps of ``plan`` until the end of the episode.
         budget: number of candidates.
 
     """
@@ -223,16 +223,16 @@ def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int
 
 @compiled(apart=True)
 def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, number: int) -> tuple[float, int]:
-    """Simulate random templates and write the best one to ``best``; return its harm (m2/s2) and its number of steps.
+    """Simulate random templates, and write the best template to ``best``. Return its harm (m2/s2) and number of steps.
 
-    A *template* is one command, another one for a short while, then full braking. The number of steps is 0 if no
-    template is below ``bound``.
+    A *template* is one command, another command for a short while, then full braking. The number of steps is 0 if no
+    template does less harm than ``bound``.
 
     Args:
-        world: the world, with its commands, bounds and random stream.
-        best: receives the best template.
+        world: world to simulate, with its bounds and random stream.
+        best: output: the best template.
         room: working memory.
-        bound: harm that a template must be below, m2/s2.
+        bound: harm above which a template is rejected, m2/s2.
         number: number of templates.
 
     """
@@ -255,9 +255,7 @@ def draw_templates(world: SearchWorld, best: Plan, room: Plan, bound: float, num
 
 @compiled
 def steps_in(world: Episode, duration_s: float) -> int:
-    """Return the number of decision steps in ``duration_s``, rounded to a whole number of at least 1. ``world`` holds
-    the length of a step.
-    """
+    """Return the number of decision steps of ``world`` in ``duration_s``, rounded to a whole number of at least 1."""
     return max(int(duration_s / world.clock[CLOCK.TIME_STEP] + 0.5), 1)
 
 

@@ -1,6 +1,7 @@
 """Regret: an agent's harm minus the best known harm of the same world.
 
-The best known harm is the least of the ``limits`` known beforehand and the harm of the agents of the same evaluation.
+The best known harm is the smaller one of two values: the best harm known before the evaluation (module ``limits``), and
+the least harm of the agents in this evaluation.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from ethbrake_marl.extensions.search.limits import IncompleteTable, Limits, Unpr
 from ethbrake_marl.game.harm import HarmCount
 from ethbrake_marl.physics.state import Bools, Floats
 
-NO_HARM = 1e-3  # m2/s2; less harm (an impact at 0.03 m/s) counts as none
+NO_HARM = 1e-3  # m2/s2; less harm (an impact at 0.03 m/s) is treated as 0
 
 TOLERANCE = 1e-6  # m2/s2; a harm below the best known by less than this is rounding
 
 
 @dataclass(frozen=True)
 class Regrets:
-    """Best known harm of each world after all agents of an evaluation drove, [n] each."""
+    """Best known harm of each world after all agents of an evaluation have driven it, as arrays [n]."""
 
     limits: Limits  # proofs and best known harm before any agent drove
     first_impact_harm: Floats  # best known first-impact harm, including the agents of this evaluation, m2/s2
@@ -46,21 +47,21 @@ class Regrets:
         return outcome.ledger.world_harm(harm_count) - self.best(harm_count)
 
     def below(self, outcome: Outcome) -> Bools:
-        """Return True for worlds in which an agent's outcome is below the best harm known before, beyond rounding, [n].
+        """Return True for worlds in which an agent does less harm than the best harm known before the evaluation, [n].
 
-        Either harm count suffices.
+        The result is True if the harm is smaller under at least one of the two counts, by more than ``TOLERANCE``.
         """
         first, total = self.limits.first_impact_harm, self.limits.total_harm
         return (outcome.first_impact_harm < first - TOLERANCE) | (outcome.total_harm < total - TOLERANCE)
 
     @property
     def avoidable(self) -> Bools | None:
-        """True for worlds in which contact can be avoided, [n]; None if not decided."""
+        """True for worlds in which contact can be avoided, [n]; None if that is not known."""
         return self.limits.proof.avoidable
 
     @property
     def between(self) -> Between | None:
-        """Summary of the worlds with proven contact but no proven impact; None if contact is not decided."""
+        """Summary of the worlds with proven contact but no proven impact; None if ``avoidable`` is None."""
         if self.avoidable is None:
             return None
         return Between.of(~self.avoidable, self.limits.proof.impact, self.first_impact_harm, self.total_harm)
@@ -77,15 +78,15 @@ class Between:
 
     @property
     def text(self) -> str:
-        """A sentence with the share of these worlds and their least known harm, to append; empty if there are none."""
+        """Sentence with the share of these worlds and their best known harm; empty if there are no such worlds."""
         if self.rate == 0.0:
             return ""
-        text = f" In {100 * self.rate:.1f} % contact is certain, but perhaps no impact"
+        text = f" In {100 * self.rate:.1f} % of the worlds, contact is proven unavoidable but an impact is not."
         if self.mean_first is None or self.harmless_rate is None:
-            return f"{text}."
+            return text
         return (
-            f"{text}: the least harm known there is {self.mean_first:.2f} on average, and practically none in"
-            f" {100 * self.harmless_rate:.0f} % of these."
+            f"{text} Their mean best known harm is {self.mean_first:.2f}; in {100 * self.harmless_rate:.0f} % of them"
+            " it is practically 0."
         )
 
     @classmethod
@@ -122,17 +123,17 @@ KNOWN_OF_WORLDS: dict[str, Callable[[Outcome, Regrets], Values | None]] = {
 
 
 def limits_of(evaluation: Evaluation) -> Limits | Unproven:
-    """Return proofs and best known harm of each world before any agent drives; ``Unproven`` if nothing is proven.
+    """Return the proofs and the best known harm of each world before any agent drives.
 
-    They are computed once per evaluation. Warns with ``IncompleteTable`` if a table of best known harm covers only some
-    of the worlds.
+    Returns ``Unproven`` if the proofs do not cover the evaluation. The result is computed once per evaluation. Warns
+    with ``IncompleteTable`` if a table of best known harm covers only some of the worlds.
     """
     return evaluation.once(_limits)
 
 
 def _limits(evaluation: Evaluation) -> Limits | Unproven:
     if evaluation.host:
-        return Unproven(f"{evaluation.host} moved these worlds, and what is proven is of the physics here")
+        return Unproven(f"{evaluation.host} simulated the worlds; the proofs assume the physics of this package")
     limits = known_limits(evaluation.worlds, evaluation.task)
     if isinstance(limits, Limits) and limits.warning:
         warnings.warn(limits.warning, IncompleteTable, stacklevel=4)
@@ -140,7 +141,7 @@ def _limits(evaluation: Evaluation) -> Limits | Unproven:
 
 
 def regrets_of(evaluation: Evaluation) -> Regrets | None:
-    """Return the best known harm of every world, including the agents of this evaluation; None if nothing is proven."""
+    """Return the best known harm of every world, agents of this evaluation included; None if nothing is proven."""
     return evaluation.once(_regrets)
 
 

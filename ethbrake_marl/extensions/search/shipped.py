@@ -28,11 +28,12 @@ def shipped_tables() -> tuple[BestHarmTable, ...]:
 
 
 def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
-    """Return the best known harm of each world (at t = 0) from the shipped tables, by harm count, [n] m2/s2.
+    """Return the best known harm of worlds at t = 0 from the shipped tables: an array [n] in m2/s2 for each harm count.
 
-    NaN if no shipped table has it. Worlds are recognised by everything that affects their harm: state, parameters,
-    scripts of the others, time step, horizon and the controlled vehicles (in ``task``). Raises ``InvalidInput`` for a
-    script whose command is not fixed at the alert, because no search covers it.
+    The value is NaN if no shipped table contains the world. A world is found by a hash of everything that affects its
+    harm: state, parameters, scripts of the other vehicles, time step, horizon and controlled vehicles. Raises
+    ``InvalidInput`` if the command of a script is not fixed at the alert. ``task`` names the scenario and the
+    controlled vehicles.
     """
     identity = task_problem(worlds, task).identity
     known = {harm_count: np.full(worlds.n, np.nan) for harm_count in HARM_COUNTS}
@@ -44,7 +45,7 @@ def best_known(worlds: Worlds, task: Task) -> dict[HarmCount, Floats]:
 def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Profiles, Bools]:
     """Return the stored profiles of a problem with one controlled vehicle, [n], and a mask [n] of worlds that have one.
 
-    ``harm_count`` is the harm that the profiles minimise, ``first`` or ``total``.
+    ``harm_count`` is the count that the profiles minimise, ``first`` or ``total``.
     """
     last_step, least = problem.last_step, np.full(problem.n, np.inf)
     profiles, known = Profiles(last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, 1))), np.zeros(problem.n, bool)
@@ -61,9 +62,10 @@ def shipped_profiles(problem: ProfileProblem, harm_count: HarmCount) -> tuple[Pr
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
-    """Make the agent ``best_harm`` or ``best_harm:CANDIDATES``, which plays the shipped profile of each world.
+    """Return the agent ``best_harm`` or ``best_harm:CANDIDATES``, which drives the shipped profile of each world.
 
-    A world without a shipped profile is searched. ``argument`` is the number of candidates of that search, or None.
+    In a world without a shipped profile, the agent searches. ``argument`` is the number of candidates of this search,
+    or None.
     """
     return BestHarm.make(argument, settings, shipped_profiles)
 
@@ -71,7 +73,7 @@ def make_best_harm(argument: str | None, settings: AgentSettings) -> Agent:
 BEST_HARM = Part(  # target of the entry point in pyproject.toml
     make_best_harm,
     form="best_harm[:CANDIDATES]",
-    about="the best profile known; a search at the alert where none is known",
+    about="drives the best known profile; searches at the alert if no profile is stored",
     knows=Source.MODEL,
 )
 

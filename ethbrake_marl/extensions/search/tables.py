@@ -1,4 +1,4 @@
-"""Tables of best known harm: small files that find a world by its content, not by its number in a list."""
+"""Tables of best known harm: small files in which a world is found by a hash of its content."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, UInt64s
 
 TABLE_FORMAT = 1
 
-SIZE_LIMIT_BYTES = 64 << 20  # largest file
+SIZE_LIMIT_BYTES = 64 << 20  # largest size of a file
 
-UNPACKED_LIMIT_BYTES = 256 << 20  # largest size of all arrays
+UNPACKED_LIMIT_BYTES = 256 << 20  # largest size of all arrays together
 
-DECODED_LIMIT = 1 << 26  # most numbers in the decoded profiles of one count
+DECODED_LIMIT = 1 << 26  # largest number of numbers in the decoded profiles of one count
 
-TOLERANCE = 1e-6  # an agent must be this much (m2/s2) below the table to replace its value
+TOLERANCE = 1e-6  # m2/s2; a harm replaces the harm in the table if it is smaller by more than this
 
 _ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the header that error messages show
 
@@ -55,7 +55,7 @@ class BestKnown(NamedTuple):
 class BestHarmTable:
     """Best known harm of n worlds, for one or both harm counts."""
 
-    identity: UInt64s  # [n] hash of each world, by which it is found
+    identity: UInt64s  # hash of each world, [n]
     best: Mapping[HarmCount, BestKnown]  # harm and profiles, by harm count
     header: Mapping[str, Any]  # entries that describe how the table was computed: scenario, vehicles, budget, ...
 
@@ -63,12 +63,12 @@ class BestHarmTable:
     def load(cls, path: Path) -> BestHarmTable:
         """Return the table that is stored in the file ``path``.
 
-        Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` if it is not a table. Names, types, shapes
-        and sizes are checked from the headers before anything is unpacked. The harm of a world is not verified;
-        ``check_fits`` checks that the profiles fit a problem.
+        Raises ``InvalidInput`` if the file does not exist, and ``CorruptBundle`` if it is not a table. The names,
+        types, shapes and sizes of the arrays are checked before the file is unpacked. The stored harm is not checked
+        by simulation.
         """
         if not os.path.exists(path):
-            raise InvalidInput(f"{path}: there is no such table of best known harm")
+            raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
         try:
             archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
@@ -85,34 +85,32 @@ class BestHarmTable:
         return cls(arrays["identity"].astype(np.uint64), best, header)
 
     def save(self, path: Path) -> None:
-        """Write the table to the file ``path``, whole or not at all."""
+        """Write the table to the file ``path``. If writing fails, the old file stays unchanged."""
         write_file(path, table_bytes(self))
 
     @property
     def left_out(self) -> Mapping[str, str]:
-        """Worlds that are not in the table because of a failure: number in the list -> reason."""
+        """Worlds that are missing from the table because of a failure: number of the world -> reason."""
         return dict(self.header.get(LEFT_OUT, {}))
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the row of each world, given by its hash ``identity`` [m]; -1 if it is not in the table."""
+        """Return the row of each world with hash ``identity`` [m]; -1 if the table does not contain the world."""
         order = np.argsort(self.identity, kind="stable")
         place = np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)
         rows = order[place]
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def check_holds_any(self, identity: UInt64s) -> None:
-        """Raise ``InvalidInput`` if the table holds none of the worlds with hashes ``identity``: it then belongs to
-        another list.
-        """
+        """Raise ``InvalidInput`` if the table contains none of the worlds with the hashes ``identity``."""
         if not (self.rows(identity) >= 0).any():
             contents = ", ".join(f"{key} {self.header[key]}" for key in _ABOUT if key in self.header)
             raise InvalidInput(
-                f"table of best known harm ({contents}): holds none of these {len(identity)} worlds; give the scenario,"
-                " seed and vehicles that it was made for"
+                f"table of best known harm ({contents}): the table contains none of the {len(identity)} worlds; give"
+                " the scenario, seed and vehicles of the table"
             )
 
     def check_fits(self, problem: ProfileProblem) -> None:
-        """Raise ``InvalidInput`` if a stored profile of a world of ``problem`` cannot be played there."""
+        """Raise ``InvalidInput`` if the stored profile of a world is not a valid profile in ``problem``."""
         for harm_count in self.best:
             try:
                 problem.check(self.profiles(problem.identity, harm_count, problem.last_step)[0])
@@ -120,8 +118,9 @@ class BestHarmTable:
                 raise InvalidInput(f"table of best known harm, {harm_count}: {error}") from None
 
     def harm(self, identity: UInt64s, harm_count: HarmCount) -> Floats:
-        """Return the best known harm of each world, given by its hash ``identity`` [m]: [m] m2/s2, NaN if it is not in
-        the table.
+        """Return the best known harm of each world with hash ``identity`` [m], as an array [m] in m2/s2.
+
+        The harm is NaN if the table does not contain the world.
         """
         rows = self.rows(identity)
         if harm_count not in self.best:
@@ -131,12 +130,12 @@ class BestHarmTable:
     def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
         """Return the stored profile of each world, [m], and a mask [m] of the worlds that have one.
 
-        A world without a profile gets coasting.
+        The returned profile of a world without a stored one is coasting.
 
         Args:
-            identity: [m] hash of each world.
-            harm_count: harm that the profiles minimise, ``first`` or ``total``.
-            last_step: [m] number of steps of each episode, at which a profile ends.
+            identity: hash of each world, [m].
+            harm_count: count that the profiles minimise, ``first`` or ``total``.
+            last_step: number of steps of each episode, [m].
 
         """
         rows = self.rows(identity)
@@ -152,22 +151,24 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """Return the table with smaller values replaced, and a mask [m] of the worlds that were replaced.
+        """Return the table with ``harm`` where it is smaller, and a mask [m] of the worlds with a new value.
 
         A value is replaced if ``harm`` is smaller by more than ``TOLERANCE``. Worlds that are not in the table are
-        ignored. Raises ``InvalidInput`` for a count that the table does not hold, or for shapes that do not match.
+        ignored. Raises ``InvalidInput`` if the table does not contain the count, or if the shapes do not match.
 
         Args:
-            identity: [m] hash of each world.
-            harm_count: ``first`` or ``total``.
-            harm: [m] harm of each world, m2/s2.
-            profiles: [m] command profiles that cause this harm; None: store the harm only.
+            identity: hash of each world, [m].
+            harm_count: harm count, ``first`` or ``total``.
+            harm: harm of each world, [m] m2/s2.
+            profiles: command profiles that cause this harm, [m]; None: the table stores the harm without a profile.
 
         """
         if harm_count not in self.best:
-            raise InvalidInput(f"table of {', '.join(self.best)}: holds no {harm_count!r} harm")
+            raise InvalidInput(
+                f"harm_count = {harm_count!r}: the table contains only the harm counts {', '.join(self.best)}"
+            )
         if harm.shape != identity.shape:
-            raise InvalidInput(f"improve: {harm.shape} harms for {identity.shape} worlds")
+            raise InvalidInput(f"harm has the shape {harm.shape}; give one harm for each of {identity.shape} worlds")
         rows = self.rows(identity)
         old = self.best[harm_count]
         better = (rows >= 0) & (harm < old.harm[rows] - TOLERANCE)
@@ -185,9 +186,10 @@ class BestHarmTable:
 
 
 def table_bytes(table: BestHarmTable) -> bytes:
-    """Return the bytes of a table file: a compressed .npz without pickles.
+    """Return the content of a table file: a compressed .npz without pickles.
 
-    Only phases in use are stored, and the bytes of commands are grouped by significance to compress well.
+    The file contains only the phases in use. The bytes of the commands are grouped by significance, because the file
+    is then smaller.
     """
     arrays: dict[str, NDArray[Any]] = {
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
@@ -208,9 +210,9 @@ def table_bytes(table: BestHarmTable) -> bytes:
 
 
 def _rows(harm_count: HarmCount) -> list[ArrayRow]:
-    """Return name, type and shape of each array that a table file holds for one harm count.
+    """Return the name, type and shape of each array that a table file contains for one harm count.
 
-    n worlds, m phases in all, C controlled vehicles.
+    There are n worlds, m phases in all worlds together, and C controlled vehicles.
     """
     return [
         ArrayRow("header", "|u1", ("bytes",)),
@@ -223,7 +225,7 @@ def _rows(harm_count: HarmCount) -> list[ArrayRow]:
 
 
 class _Header(BaseModel):
-    """Entries of a table's header that other code relies on. A header may have more entries."""
+    """Entries of a table's header that other code reads. A header may have more entries."""
 
     model_config = ConfigDict(strict=True, extra="allow")
 
@@ -239,16 +241,16 @@ class _Header(BaseModel):
 
 
 def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
-    """Return harm and profiles of one count from the arrays of a table file, which have the right shapes.
+    """Return the harm and the profiles of one count from the arrays of a table file.
 
-    Raises ``ValueError`` for impossible numbers.
+    Raises ``ValueError`` if the numbers are impossible.
     """
     harm = arrays[f"{harm_count}_harm"].astype(np.float64)
     used = arrays[f"{harm_count}_phases"].astype(np.int64)
     planes = arrays[f"{harm_count}_commands"]
     flat = np.ascontiguousarray(planes.transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
     if not len(harm):
-        raise ValueError("it holds no world")
+        raise ValueError("the table contains no world")
     if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
         raise ValueError(f"{harm_count}_harm: a harm must be a finite number of at least 0 m2/s2")
     if not np.isfinite(flat).all():
@@ -257,7 +259,10 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
         raise ValueError(f"{harm_count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
     width, controlled = max(int(used.max()), 1), flat.shape[1]
     if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
-        raise ValueError(f"{len(used)} worlds of {width} phases of {controlled} vehicles are beyond what is kept")
+        raise ValueError(
+            f"{len(used)} worlds with {width} phases of {controlled} vehicles: a table may have 64 vehicles and"
+            f" {DECODED_LIMIT:,} numbers"
+        )
     inside = np.arange(width) < used[:, np.newaxis]
     ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
     ends[inside] = arrays[f"{harm_count}_ends"]
@@ -272,7 +277,8 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
 
 
 def _used(ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the number of phases that each profile uses, [n]; 0 if there is no profile. ``ends`` [n, K] are their
-    ends.
+    """Return the number of phases that each profile uses, [n]; 0 for a world without a profile.
+
+    ``ends`` [n, K] are the steps at which the phases end.
     """
     return np.where(ends[:, -1] > 0, np.argmax(ends == ends[:, -1:], axis=1) + 1, 0)

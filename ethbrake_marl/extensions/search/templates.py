@@ -1,7 +1,8 @@
-"""Random templates of a whole episode: brake fully, give way, brake again. The best one in each world is returned.
+"""Draw random templates of commands, and return the best template of each world.
 
-Templates show how a world could be driven differently from a policy (``refine`` climbs from the same templates). They
-are not improved: a random template with little harm is robust, so a policy can imitate it.
+A *template* is one command, another command for a short while, then full braking. Templates show a policy different
+ways to drive a world. The best template is not improved further: a random template with little harm tolerates small
+errors, so a policy can imitate it.
 """
 
 from __future__ import annotations
@@ -17,22 +18,21 @@ from ethbrake_marl.physics.state import Floats, Ints, UInt64s
 
 
 def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-    """Return the best of some random templates in each world: its commands [n, T] (m/s2), and its number of steps [n].
+    """Draw random templates in each world. Return the best commands, [n, T] m/s2, and their number of steps, [n].
 
-    A *template* is a whole episode: brake fully, give way, brake again. The number of steps is 0 if no template is
-    below the bound. Each world draws its own templates and is independent of the others. Raises ``InvalidInput`` for
-    several controlled vehicles, or no template.
+    The number of steps is 0 if no template does less harm than ``bound``. The result for a world does not depend on the
+    other worlds. Raises ``InvalidInput`` if several vehicles are controlled, or if ``number`` is below 1.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.
-        bound: [n] harm that a template must be below, m2/s2.
+        bound: harm above which a template is rejected, [n] m2/s2.
         number: number of templates per world.
         seed: seed of the random draws.
 
     """
     check_whole_number("templates", number, 1)
     if len(problem.vehicles) != 1:
-        raise InvalidInput(f"templates: {len(problem.vehicles)} vehicles; they are of one")
+        raise InvalidInput(f"templates: {len(problem.vehicles)} controlled vehicles; give a problem with one")
     commands = np.zeros((problem.n, int(problem.last_step.max(initial=0))))
     steps = np.zeros(problem.n, np.int64)
     _best_templates(problem, seeded(problem.identity, seed), bound, number, commands, steps)
@@ -45,8 +45,8 @@ def _best_templates(
 ) -> None:
     """Write the best random template of each world to ``commands`` [n, T] and its number of steps to ``steps`` [n].
 
-    ``random`` [n] is the initial state of each world's random stream, ``bound`` [n] the harm to be below, ``number``
-    the number of templates per world.
+    ``random`` [n] is the initial state of each world's random stream. ``bound`` [n] is the harm above which a template
+    is rejected, ``number`` the number of templates per world.
     """
     start, T, S = problem.start, commands.shape[1], problem.start.shape[1]
     best, room = Plan(np.zeros(T), np.zeros((T + 1, S))), Plan(np.zeros(T), np.zeros((T + 1, S)))

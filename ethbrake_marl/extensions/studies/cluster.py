@@ -1,4 +1,4 @@
-"""Connect to Ray while a study works: on this machine, or on a running cluster."""
+"""Connection to Ray, on this machine or on a running cluster, while a study runs."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from contextlib import contextmanager
 
 from ethbrake_marl.parallel import connect_ray, own_signals
 
-_SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # they advise Tuner.restore, which is not used
+_SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # loggers that advise Tuner.restore, not used here
 
 
 @contextmanager
 def connected(address: str, cores: int | None) -> Iterator[None]:
     """Context manager that connects to Ray while its block runs, and disconnects afterwards, also after an error.
 
-    Inside the block the signal SIGTERM acts like Ctrl-C. Afterwards the handlers are those from before.
+    Inside the block, the signal SIGTERM acts like Ctrl-C. Afterwards the earlier signal handlers are restored.
 
     Args:
-        address: address of a running cluster, or ``local`` for a Ray on this machine.
-        cores: number of cores that a local Ray uses; None: all.
+        address: address of a running cluster, or ``local`` to start Ray on this machine.
+        cores: number of cores that Ray on this machine uses; None: all.
 
     """
     with own_signals():

@@ -1,4 +1,4 @@
-"""The commands ``study``: sweep or tune many trainings, or search many worlds for weaknesses."""
+"""The commands ``study sweep``, ``study tune`` and ``study falsify``: many trainings, or many worlds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ethbrake_marl.cli.evaluate import read_task
 from ethbrake_marl.errors import InvalidInput, count_of, need
 from ethbrake_marl.files.sheet import Sheet
 
-REMAINS = "the same command goes on with what is in the folder"
+REMAINS = "the same command continues the work in this folder"
 
 ROUNDING = 1e-6  # m2/s2
 
@@ -23,30 +23,35 @@ MOST_WORKERS = 4096
 
 FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")]
 
-RetriesOption = Annotated[int, typer.Option(help="How often to try again when a process is lost.", min=0, max=100)]
+RetriesOption = Annotated[
+    int, typer.Option(help="Number of further attempts if the process of a training is lost.", min=0, max=100)
+]
 
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print what would be trained; do nothing.")]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the trainings without starting them.")]
 
 ClusterOption = Annotated[
-    str, typer.Option(metavar="local|ADDRESS", help="Ray on this machine, or on a running cluster.")
+    str, typer.Option(metavar="local|ADDRESS", help="Start Ray on this machine, or use a running cluster.")
 ]
 
 study_group = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
-    help="Train and compare many policies; search for the worst worlds.",
+    help="Train and compare many policies; search for the worst worlds of an agent.",
     epilog=example("study sweep sweep.yaml --output runs/sweep", "study ablate --quick --output runs/ablation-quick"),
 )
 
 
 @study_group.command("sweep", epilog=example("study sweep sweep.yaml --output runs/sweep"))
 def sweep_command(
-    file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="A grid or a list of jobs.")],
+    file: Annotated[Path, typer.Argument(metavar="SWEEP.yaml", help="File with a grid of jobs or a list of jobs.")],
     output: FolderOption,
     jobs: Annotated[
         int | None,
         typer.Option(
-            help="Jobs at once, one process and thread each.", show_default="one for each core", min=1, max=MOST_WORKERS
+            help="Number of jobs that run at once, each in one process with one thread.",
+            show_default="one for each core",
+            min=1,
+            max=MOST_WORKERS,
         ),
     ] = None,
     ray: ClusterOption = "local",
@@ -55,10 +60,10 @@ def sweep_command(
     schema: schema_option("ethbrake_marl.extensions.studies.sweep", "SweepPlan", "sweep") = False,  # type: ignore[valid-type]  # made here
     as_json: JsonOption = False,
 ) -> None:
-    """Train every job of a file, and write one table.
+    """Train every job of a file, and write one table of the results.
 
-    The same command goes on after an interruption: finished jobs are kept, begun ones go
-    on. Exit status 1 where jobs failed: failures.csv says why.
+    After an interruption, the same command continues: finished jobs are not trained again, and unfinished jobs continue
+    from their last checkpoint. The exit status is 1 if a job failed; failures.csv contains the reasons.
     """
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.studies.sweep import SweepPlan
@@ -76,7 +81,7 @@ def sweep_command(
         out.result({**counts, "interrupted": result.interrupted, "table": str(result.table)})
         summary = f"{result.finished:,} of {result.jobs:,} jobs finished; table: {result.table}"
         if result.failed:
-            summary += f"; {result.failed:,} failed: {output / 'failures.csv'}"
+            summary += f"; {result.failed:,} failed, for the reasons in {output / 'failures.csv'}"
         _end_study(out, summary, interrupted=result.interrupted, failed=result.failed > 0)
 
 
@@ -84,15 +89,17 @@ def sweep_command(
     "tune", epilog=example("study tune tuning.yaml --output runs/tuning --trials 30 --export best.yaml")
 )
 def tune_command(
-    file: Annotated[Path, typer.Argument(metavar="TUNING.yaml", help="A training and the ranges of its settings.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="TUNING.yaml", help="File with a training and the ranges of its settings.")
+    ],
     output: FolderOption,
     trials: Annotated[
-        int, typer.Option(help="Trials that the folder has at the end, earlier ones included.", min=1, max=10_000)
+        int, typer.Option(help="Number of trials in the folder at the end, earlier trials included.", min=1, max=10_000)
     ] = 30,
     jobs: Annotated[
         int,
         typer.Option(
-            help="Trials at once, one process each; more than 1 changes which values are tried.",
+            help="Number of trials that run at once, one process each. It affects which values are tried.",
             min=1,
             max=MOST_WORKERS,
         ),
@@ -100,17 +107,18 @@ def tune_command(
     ray: ClusterOption = "local",
     retries: RetriesOption = 2,
     export: Annotated[
-        Path | None, typer.Option(metavar="NAME.yaml", help="Write the best trial as a recipe of this name.")
+        Path | None, typer.Option(metavar="NAME.yaml", help="Write the settings of the best trial as a recipe.")
     ] = None,
     dry_run: DryRunOption = False,
     schema: schema_option("ethbrake_marl.extensions.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search the settings of a recipe for the least harm.
+    """Search for the settings of a recipe whose trained policy does the least harm.
 
-    Harm is measured on a list of worlds of its own. The same command goes on after an interruption: trials that ended
-    are kept, those that were begun go on. Exit status 1 where no trial came to its end.
+    The harm of a trial is measured on the list of worlds in the file. After an interruption, the same command
+    continues: finished trials are not trained again, and unfinished trials continue. The exit status is 1 if no trial
+    has finished.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         need("optuna")
@@ -120,35 +128,38 @@ def tune_command(
         plan.folder(output).check()
         if export is not None:  # raise now what would be raised at the end
             if export.suffix != ".yaml":
-                raise InvalidInput(f"export {export}: must end in .yaml, as recipes do")
+                raise InvalidInput(f"--export {export}: the file name of a recipe must end in .yaml")
             plan.best_recipe({}, export, "")
-            out.force = out.force or plan.has_exported(output, export)  # the same command goes on
+            out.force = out.force or plan.has_exported(output, export)  # the same command may continue
             out.check(export)
         if dry_run:
             own = plan.own_values()
             space = {key: dimension.model_dump(mode="json") for key, dimension in plan.file.search.items()}
-            now = {key: "not in the space" if own is None else f"the recipe has {own[key]}" for key in space}
+            now = {
+                key: "the ranges exclude the recipe's own values" if own is None else f"the recipe has {own[key]}"
+                for key in space
+            }
             started, steps, example = len(plan.proposals(output)), plan.recipe.total_steps, plan.example()
             out.result(
                 {
                     **{"search": space, "own_values": own, "trials": trials, "begun": started, "total_steps": steps},
                     **{"scenario": plan.file.scenario, "recipe": plan.file.recipe, "example": example},
                 },
-                f"{count_of(trials, 'trial')} ({started:,} begun before): recipe {plan.file.recipe} in scenario"
-                f" {plan.file.scenario}, {steps:,} decisions each unless it is pruned",
+                f"{count_of(trials, 'trial')} ({started:,} of them begun): recipe {plan.file.recipe} in scenario"
+                f" {plan.file.scenario}; {steps:,} decisions per trial that is not pruned",
                 *(f"{key}  {dimension}  ({now[key]})" for key, dimension in plan.file.search.items()),
-                f"{'the first' if own else 'for example'}: {example}",
+                f"{'the first trial' if own else 'example of a trial'}: {example}",
             )
             return
         need("ray")
         result = plan.run(output, trials, jobs=jobs, ray=ray, retries=retries, tell=out.show_progress)
         counted = ", ".join(f"{number:,} {state}" for state, number in sorted(result.counts.items()))
         summary, best, shown, lines = f"trials: {counted or 'none'}; table: {result.table}", result.best, None, []
-        export = None if best is None or result.interrupted else export  # what goes on exports at its end
+        export = None if best is None or result.interrupted else export  # an interrupted tuning exports at its end
         if best is not None:
             measure = training.RunDirectory.chosen_by([best.figures], plan.recipe.reward.harm_count)
             shown = {"trial": best.number, "measure": measure, "harm": best.harm, "values": best.values}
-            unit = "" if measure == training.RunDirectory.OBJECTIVE else " m²/s²"  # injuries have another one
+            unit = "" if measure == training.RunDirectory.OBJECTIVE else " m²/s²"  # objectives have different units
             lines = [f"best: trial {best.number}, {measure} {best.harm:.4f}{unit}"]
             lines += [f"  {key} = {value}" for key, value in best.values.items()]
             if export is not None:
@@ -167,7 +178,7 @@ def tune_command(
 
 
 def _end_study(out: Out, summary: str, *, interrupted: bool, failed: bool) -> None:
-    """Print ``summary`` of a sweep or tuning, then end the command: status 130 if interrupted, 1 if failed."""
+    """Print the ``summary`` of a sweep or tuning, and exit with status 130 if interrupted, 1 if failed, else 0."""
     if interrupted:
         out.interrupted(f"interrupted; {summary}; {REMAINS}")
     out.note(summary)
@@ -180,16 +191,22 @@ def falsify_command(
     agent: Annotated[
         str | None,
         typer.Option(
-            help="Agent that controls the vehicle; any agent of `ethbrake evaluate`.", show_default="universal"
+            help="Agent whose worst worlds are searched; any agent of `ethbrake evaluate`.", show_default="universal"
         ),
     ] = None,
     measure: Annotated[
         str | None,
-        typer.Option(metavar="harm|regret|difference|bound", help="What to search for.", show_default="regret"),
+        typer.Option(
+            metavar="harm|regret|difference|bound",
+            help="Score of a world that the search maximises.",
+            show_default="regret",
+        ),
     ] = None,
     against: Annotated[
         str | None,
-        typer.Option(metavar="AGENT", help="Agent with which regret or difference compares.", show_default="best_harm"),
+        typer.Option(
+            metavar="AGENT", help="Agent to compare with, for regret and difference.", show_default="best_harm"
+        ),
     ] = None,
     scenario: Annotated[
         str | None,
@@ -198,7 +215,7 @@ def falsify_command(
     budget: Annotated[int | None, typer.Option(help="Number of worlds to try.", min=1, show_default="4000")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the search.", min=0, show_default="0")] = None,
     keep: Annotated[
-        int | None, typer.Option(help="Largest number of worlds to keep.", min=1, max=1000, show_default="20")
+        int | None, typer.Option(help="Largest number of worlds in the result.", min=1, max=1000, show_default="20")
     ] = None,
     settings: SettingsOption = None,
     output: Annotated[
@@ -210,12 +227,12 @@ def falsify_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search for the worlds in which an agent is worst.
+    """Search the ranges of a scenario for the worlds in which an agent does worst.
 
-    It searches the ranges of a scenario. regret: harm beyond that of --against, by default the best profile found with
-    hindsight. bound: how near a shield comes to the bound that it gave; above zero the bound is broken. difference:
-    where the harm of two agents differs most. --again FILE drives the kept worlds again, by --agent or the agent of the
-    file; exit status 1 where one of them is worse.
+    --measure sets the score of a world. harm: the agent's harm. regret: the agent's harm minus the harm of --against,
+    by default the best known profile. difference: the absolute difference between these two harms. bound: the agent's
+    harm minus the bound of its shield; a score above 0 means that the bound is broken. --again FILE drives the worlds
+    of a file again, with --agent or with the agent of the file. The exit status is then 1 if a world has a worse score.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
@@ -231,7 +248,8 @@ def falsify_command(
             }  # fmt: skip
             for option in (name for name, value in asked.items() if value is not None):
                 raise InvalidInput(
-                    f"--again: the file says what is measured; {option} has no place beside it, --agent has"
+                    f"{option} cannot be combined with --again, because that file sets what is measured; leave"
+                    f" {option} out (only --agent may be given)"
                 )
             _drive_again(out, again, agent)
             return
@@ -257,12 +275,12 @@ def falsify_command(
             "worlds": [world.model_dump(exclude_none=True) for world in worlds],
         }
         first, shown = worst.first_above, []
-        left_out = f" ({budget - len(good):,} of them are none of the scenario's)" if len(good) < budget else ""
+        left_out = f" ({budget - len(good):,} of them rejected by the scenario)" if len(good) < budget else ""
         summary = (
             f"{chosen.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {task.harm_count} count: worst"
-            f" {content['worst']:.4g}, median {content['median']:.4g}; above zero in {100 * worst.share_above:.1f} % of"
-            f" those tried, {f'the first after {first:,}' if first else 'none'}."
-            " The search looks for bad worlds: shares of it say nothing about a list."
+            f" {content['worst']:.4g}, median {content['median']:.4g}; above 0 in {100 * worst.share_above:.1f} % of"
+            f" the worlds, {f'first in world {first:,}' if first else 'so in no world'}."
+            " The search prefers bad worlds, so these numbers are no estimates for random worlds."
         )
         if worlds:
             named = NamedWorlds.of(
@@ -280,7 +298,7 @@ def falsify_command(
                 worlds=worlds,
             )  # fmt: skip
             content |= named.model_dump(exclude_none=True)
-            beside = {"harm": [], "bound": ["Bound"]}.get(measure, ["Reference's harm"])
+            beside = {"harm": [], "bound": ["Bound"]}.get(measure, ["Harm of --against"])
             columns = ("World", measure.capitalize(), "Harm", *beside, "State")
             rows = []
             for world in worlds:
@@ -291,14 +309,14 @@ def falsify_command(
             if output is not None:
                 out.write(output, named.text, what="the worlds")
         elif output is not None:
-            out.note(f"nothing was found, and {output} not written")
+            out.note(f"no world has a score above 0, so {output} was not written")
         out.result({**content, "versions": evaluation.result_versions()}, *shown, summary)
 
 
 def _spelled(**options: Any) -> str:
-    """Return the command line ``ethbrake study falsify`` with these options, by name.
+    """Return the command line ``ethbrake study falsify`` with these options.
 
-    Options that are None are left out; a tuple repeats its option.
+    Options with the value None are omitted. An option whose value is a tuple is repeated for each element.
     """
     words = ["ethbrake", "study", "falsify"]
     for option, value in options.items():
@@ -309,10 +327,10 @@ def _spelled(**options: Any) -> str:
 
 
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
-    """Measure the worlds of a file of ``study falsify`` once more, and print a comparison.
+    """Measure the worlds of a file of ``study falsify`` again, and print a comparison with the scores in the file.
 
-    ``agent`` drives; None: the agent that the file names. Ends the command with status 1 if a world is worse than
-    before or could not be driven.
+    ``agent`` is the agent that drives; None: the agent that the file names. Exits with status 1 if the score of a world
+    is worse than in the file, or if the agent cannot drive the world.
     """
     import numpy as np
 
@@ -325,8 +343,8 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     for spec in (*([named.agent] if agent is None else []), *([named.against] if named.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
-                f"{file}: names an agent that is code ({code[0]}), which is not run because a file names it; --agent"
-                " names another one, and who is compared with is edited in the file"
+                f"{file}: names an agent in the code file {code[0]}. Code that a file names is not run; give the agent"
+                " with --agent, or edit the key against in the file"
             )
     chosen = evaluation.load_runnable(named.scenario, training.read_settings(named.settings).scenario, drives="some")
     measured_by = Measure.of(named.measure, agent or named.agent, named.against, chosen, named.harm_count)
@@ -349,7 +367,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
         )
         for row in rows
     ]
-    sheet = Sheet("", ("World", f"{named.measure} before", "now", ""), shown, gap=2)
+    sheet = Sheet("", ("World", f"{named.measure.capitalize()} before", "Now", ""), shown, gap=2)
     out.result({"agent": agent or named.agent, "measure": named.measure, "worlds": rows}, sheet)
     worse = sum(bool(row["worse"]) for row in rows)
     out.note(f"{file}: {agent or named.agent} is worse in {worse} of {count_of(len(rows), 'world')}")

@@ -1,4 +1,4 @@
-"""Adaptive search of the unit cube for several points of high score that are far apart."""
+"""Adaptive search of the unit cube for several points with a high score that are far apart."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from ethbrake_marl.extensions.studies.named_worlds import NamedWorld
 from ethbrake_marl.physics.state import Floats, Ints
 from ethbrake_marl.scenario.sample import Sample
 
-Score = Callable[[Floats], Floats]  # points [n, d] of [0, 1) -> scores [n]; minus infinity: the point does not count
+Score = Callable[[Floats], Floats]  # points [n, d] of [0, 1) -> scores [n]; minus infinity: the point is invalid
 
-Watcher = Callable[[int, int], None]  # called with the number of points scored so far, and their total
+Watcher = Callable[[int, int], None]  # called with the number of points scored so far, and the number of all points
 
-ROUND = 256  # points that are scored together
+ROUND = 256  # number of points that are scored together
 
-APART = 0.1  # least distance of two results, in at least one coordinate
+APART = 0.1  # least difference of two results, in at least one coordinate
 
-_PARENTS = 24  # number of parents of the next round, which are far apart
+_PARENTS = 24  # number of parents of the next round; they are far apart
 
-_EXPLORING = 0.5  # share of each round that is spread evenly over the cube
+_EXPLORING = 0.5  # fraction of each round that is spread evenly over the cube
 
-_NEAREST, _FARTHEST = 1e-3, 0.3  # range of typical steps from a parent
+_NEAREST, _FARTHEST = 1e-3, 0.3  # smallest and largest typical step from a parent
 
 _LAST = np.nextafter(1.0, 0.0)
 
 
 class Scored(NamedTuple):
-    """All n points of the unit cube that were tried, in order, with their scores."""
+    """All n points of the unit cube that a search tried, in order, with their scores."""
 
     points: Floats  # [n, d] coordinates in [0, 1)
-    scores: Floats  # [n] score of each point, the larger the better; minus infinity: the point does not count
+    scores: Floats  # [n] score of each point, the larger the better; minus infinity: the point is invalid
 
 
 def search(
@@ -43,18 +43,18 @@ def search(
 ) -> Scored:
     """Search the unit cube for points with a high score, and return all points that were tried.
 
-    One part of a round's points is spread evenly (scrambled Sobol). The other part is one step from the best points so
-    far that are far apart: a normal step in some coordinates, or the difference of two other points (differential
-    evolution). While no point is better than the median, all points are spread evenly. The same seed gives the same
-    points.
+    Half of the points of a round are spread evenly (scrambled Sobol points). The other half are one step away from
+    parents, which are the best points so far that are far apart. A step is a normal random step in some coordinates, or
+    half the difference of two other parents (differential evolution). As long as no score is above the median, all
+    points are spread evenly. The same seed gives the same points.
 
     Args:
         score: function from points [n, d] to scores [n].
         dimensions: number of coordinates, d.
         budget: number of points to try.
         seed: seed of the points.
-        adaptive: whether to look around the best points; False: all points are uniform.
-        on_round: called after each round with the number of points so far and ``budget``.
+        adaptive: whether to search around the best points; False: all points are uniform random points.
+        on_round: function that is called after each round with the number of points so far and ``budget``.
 
     """
     check_whole_number("search: budget", budget, 1)
@@ -77,9 +77,9 @@ def search(
 
 
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
-    """Yield points that are evenly spread over the unit cube (scrambled Sobol points), one by one, each [d].
+    """Yield points [d] that are evenly spread over the unit cube (scrambled Sobol points), without end.
 
-    ``dimensions`` is d. The sequence has no end, and the same seed gives the same points.
+    ``dimensions`` is d. The same seed gives the same points.
     """
     from scipy.stats import qmc  # imported here, because it takes a second to load
 
@@ -89,9 +89,10 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(scored: Scored, count: int) -> Ints:
-    """Return the row numbers of the best points of ``scored`` that are far apart, best first, at most ``count``.
+    """Return the row numbers of at most ``count`` points of ``scored`` that are good and far apart, best first.
 
-    Any two of them differ by at least 0.1 in some coordinate. Points that do not count (score not finite) are omitted.
+    Any two of these points differ by at least 0.1 in some coordinate. Points with a score that is not finite are
+    omitted.
     """
     order = np.argsort(-scored.scores, kind="stable")
     order = order[np.isfinite(scored.scores[order])]
@@ -104,7 +105,7 @@ def far_apart(scored: Scored, count: int) -> Ints:
 
 
 def _above_median(scored: Scored) -> Scored:
-    """Return the points of ``scored`` with the score -inf for those that are no better than the median."""
+    """Return ``scored`` with all scores that are not above the median replaced by minus infinity."""
     good = np.isfinite(scored.scores)
     if not good.any():
         return scored
@@ -112,7 +113,7 @@ def _above_median(scored: Scored) -> Scored:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Return ``count`` new points near the points ``parents`` [m, d], with equal shares for all parents."""
+    """Return ``count`` new points [count, d] near the points ``parents`` [m, d]; each parent gets equally many."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]
@@ -133,12 +134,12 @@ class Falsified:
 
     sample: Sample  # the worst worlds at the alert
     worlds: list[NamedWorld]  # the same worlds with names, initial states and measurements
-    # Score of every world tried, in order (m2/s2). Minus infinity: not a world of the scenario, or the physics failed.
+    # Score of every tried world, in order (m2/s2). Minus infinity: the scenario rejects it, or the physics failed.
     scores: Floats
-    first_above: int | None  # number of worlds tried up to the first score above zero; None: no score is above zero
+    first_above: int | None  # number of worlds tried until the first score above 0; None: no score is above 0
 
     @property
     def share_above(self) -> float:
-        """Share, 0 to 1, of worlds with a score above zero among those with a finite score."""
+        """Number of worlds with a score above 0, divided by the number of worlds with a finite score."""
         good = self.scores[np.isfinite(self.scores)]
         return float((good > 0.0).mean()) if len(good) else 0.0

@@ -1,4 +1,4 @@
-"""One training of a sweep or a tuning: bring it to its end in its folder, and return its figures for a table."""
+"""Train one job of a sweep or tuning to its end in its folder, and return its numbers for a table."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ _MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
 
 FIGURES = (
     "steps",  # decisions of learners in whole updates
-    "policy_steps",  # decisions after which the kept policy, the best one on the recipe's list, was saved
-    *_MEASURED,  # measures of the kept policy on that list
-    RunDirectory.OBJECTIVE,  # likewise, if a learner has another objective than total harm
+    "policy_steps",  # decisions after which the saved policy (the best one on the recipe's list) was saved
+    *_MEASURED,  # measures of the saved policy on the recipe's list
+    RunDirectory.OBJECTIVE,  # objective of the saved policy, if a learner has another objective than total harm
     *(f"last_{name}" for name in _MEASURED),  # measures of the last policy
-    "policy_sha256",  # hash of the kept policy's manifest; vehicle_i=... for each of several policies
+    "policy_sha256",  # hash of the saved policy's manifest; "vehicle_i=HASH ..." if there are several policies
 )
 
-HARM = "harm"  # key beside FIGURES: the quantity by which the kept policy is the best
+HARM = "harm"  # additional key: the quantity by which the saved policy is the best
 
-REASON = "reason"  # key instead of FIGURES: why a training cannot succeed
+REASON = "reason"  # key that replaces FIGURES: why a training cannot succeed
 
-Evaluation = Mapping[str, float]  # one evaluation during a training: steps, and the measures at that time, by name
+Evaluation = Mapping[str, float]  # one evaluation during a training: number of steps and measures, by name
 
 
 def is_done(job: TrainingJob) -> bool:
-    """Return whether the folder of ``job`` holds the finished training with its policies.
+    """Return whether the folder of ``job`` contains the finished training with its policies.
 
-    Raises ``InvalidInput`` for another training.
+    Raises ``InvalidInput`` if the folder contains another training.
     """
     run = RunDirectory(job.folder)
     if not run.is_finished:
@@ -47,17 +47,18 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Bring the training of ``job`` to its end, from where it stopped. Return False if it was stopped early.
+    """Continue the training of ``job`` to its end. Return False if it was stopped early.
 
-    ``stop_at`` takes each evaluation and returns a reason to stop, or None. Raises the exceptions of a training,
-    ``InvalidInput`` if the folder holds another training, and ``BlockingIOError`` if another worker has just begun it.
+    ``stop_at`` is a function that receives each evaluation, and returns a reason to stop or None. Raises the exceptions
+    of a training, ``InvalidInput`` if the folder contains another training, and ``BlockingIOError`` if another worker
+    has just begun the same training.
     """
     run = RunDirectory(job.folder)
     if run.status.is_file():
-        run.wait_for_others(60.0)  # a worker without driver may still hold the folder
+        run.wait_for_others(60.0)  # a worker whose main process ended may still lock the folder
         check_same_training(run, job.training)
         if run.is_finished and not is_done(job):
-            remove_folder(job.folder)  # without policies it is trained again; there is no checkpoint
+            remove_folder(job.folder)  # the policies are missing, and a finished training has no checkpoint: train anew
     try:
         return bool(job.finish(stop_at=stop_at))
     except AlreadyExists as error:
@@ -65,9 +66,9 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """Return the evaluations so far in the folder of ``job``, each with steps and measures by name.
+    """Return the evaluations so far from the folder of ``job``: number of steps and measures, by name.
 
-    Raises ``InvalidInput`` if its table ``progress.csv`` is damaged.
+    Raises ``InvalidInput`` if the file ``progress.csv`` in the folder is damaged.
     """
     run, names = RunDirectory(job.folder), (*_MEASURED, RunDirectory.OBJECTIVE)
     try:
@@ -79,15 +80,15 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
         if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in evaluations):
             raise ValueError("a measure is missing or not finite")
     except (ValueError, LookupError, csv.Error) as error:
-        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete its folder to train anew") from None
+        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete its folder to train again") from None
     return evaluations
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return the figures of the training ``job`` for a table, given its evaluations so far, by name.
+    """Return the numbers of the training ``job`` for a table, by name, computed from its evaluations so far.
 
-    The names are ``harm`` (the quantity by which the best policy is chosen) and those in ``FIGURES``, without
-    ``policy_sha256``; for example ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
+    The names are ``harm`` (the quantity by which the best policy is chosen) and the names in ``FIGURES`` without
+    ``policy_sha256``. Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
     """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
     lowest, last = min(evaluations, key=lambda each: each[harm]), evaluations[-1]
@@ -101,13 +102,13 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return the figures of the finished training ``job`` for a table, by name: ``harm`` and all in ``FIGURES``.
+    """Return the numbers of the finished training ``job`` for a table, by name: ``harm`` and all names in ``FIGURES``.
 
-    Raises ``InvalidInput`` for a damaged file.
+    Raises ``InvalidInput`` if a file in the folder is damaged.
     """
     run, evaluations = RunDirectory(job.folder), evaluations_of(job)
     if not evaluations:
-        raise InvalidInput(f"{run.progress}: holds no evaluation; delete its folder to train anew")
+        raise InvalidInput(f"{run.progress}: contains no evaluation; delete its folder to train again")
     trained = read_trained(run.policy)
     if isinstance(trained, Policy):
         sha256 = trained.manifest.manifest_sha256

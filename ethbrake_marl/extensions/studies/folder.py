@@ -1,4 +1,4 @@
-"""The folder of a study: it holds the results of one set of settings, and one process at a time works in it."""
+"""The folder of a study. Only one process at a time may work in it, and always with the same settings."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _LOCK = ".lock"
 
 
 class StudyFolder:
-    """Folder of a study's results, so that the same command continues after an interruption.
+    """Folder for the results of a study. The same command can continue its work after an interruption.
 
     Args:
-        path: the folder; it is created when work begins.
-        kind: what the folder holds, for messages: ``a sweep``.
-        question: all settings and versions that the results depend on, as plain data, so that a folder with other ones
-            is refused; None if each result stores its own.
-        record: name of the file inside the folder that stores ``question``.
-        more: further entries of that file, which are not compared.
-        advice: what the user can do about a folder with another ``question``, for messages.
-        beside: names of files that may exist in a folder without that file; None: any.
-        writes: names of files that the work replaces, and that must therefore be writable.
+        path: path of the folder; it is created when the work begins.
+        kind: content of the folder, for messages, such as ``a sweep``.
+        question: all settings and versions that the results depend on, as plain data. A folder with different settings
+            is refused. None: every result stores its own settings.
+        record: name of the file in the folder that stores ``question``.
+        more: additional entries of the file ``record``, which are not compared.
+        advice: what the user can do about a folder with different settings, for messages.
+        beside: names of files that a folder without the file ``record`` may contain; None: any files.
+        writes: names of files that the work replaces; they must be writable.
 
     """
 
@@ -50,22 +50,24 @@ class StudyFolder:
     def check(self) -> bool:
         """Check that work may begin in this folder, and return whether the file ``record`` must still be written.
 
-        Writes nothing. Raises ``InvalidInput`` if the path is not a folder, if it or one of ``writes`` cannot be
-        written, or if it belongs to other settings (the message lists the differences); ``AlreadyExists`` for a folder
-        with other content.
+        The method writes nothing. Raises ``InvalidInput`` if the path is not a folder, if the folder or a file in
+        ``writes`` is not writable, or if the folder has different settings. Raises ``AlreadyExists`` if the folder has
+        a different kind of content.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
             if self._record.is_file():
                 raise AlreadyExists(
-                    f"{self.path}: is no folder of {self._kind}: {self._record.name} of another command is there;"
-                    f" {self._advice}"
+                    f"{self.path}: is not the folder of {self._kind}: it contains {self._record.name} of another"
+                    f" command; {self._advice}"
                 )
             return False
         if not self._record.is_file():
             held = {each.name for each in self.path.iterdir()} if self.path.is_dir() else set()
             if self._beside is not None and held - {*self._beside, _LOCK}:
-                raise AlreadyExists(f"{self.path}: is there already, and holds no {self._kind}; give another folder")
+                raise AlreadyExists(
+                    f"{self.path}: the folder exists, and is not the folder of {self._kind}; give another folder"
+                )
             return True
         try:
             stored = read_object(self._record)
@@ -74,7 +76,7 @@ class StudyFolder:
         other = _differences({key: stored[key] for key in stored if key not in self._more}, self._question)
         if other:
             raise InvalidInput(
-                f"{self.path}: holds {self._kind} with other settings ({'; '.join(other)}); {self._advice}"
+                f"{self.path}: contains {self._kind} with other settings ({'; '.join(other)}); {self._advice}"
             )
         return False
 
@@ -82,13 +84,12 @@ class StudyFolder:
     def work(self) -> Iterator[None]:
         """Context manager that creates the folder, and locks it against other processes while the block runs.
 
-        At the start it also removes unfinished files of processes that were killed.
-
-        Raises the exceptions of ``check``, and ``InvalidInput`` if another process works in the folder.
+        Before the block runs, unfinished files of killed processes are removed. Raises the exceptions of ``check``, and
+        ``InvalidInput`` if another process works in the folder.
         """
         self.check()
         self.path.mkdir(parents=True, exist_ok=True)
-        with hold_lock(self.path / _LOCK, "another process works in it; wait for it, or end it"):
+        with hold_lock(self.path / _LOCK, "another process works in this folder; wait until it ends, or end it"):
             is_new = self.check()
             remove_unfinished(self.path)
             if is_new:
@@ -99,9 +100,10 @@ class StudyFolder:
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
-    """Return the differences of the settings ``now`` from ``before``, in words: ``["seeds 2, here 5", "recipes"]``.
+    """Return the differences between the settings ``before`` and ``now`` as texts: ``["seeds 2, now 5", "recipes"]``.
 
-    For a list or an object, only the name is given. ``inside`` is the text before each name.
+    If the value of a setting is a list or an object, the text is the name alone. ``inside`` is the text before each
+    name.
     """
     differences: list[str] = []
     for name in dict.fromkeys([*now, *before]):
@@ -111,5 +113,5 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str 
             differences += _differences(old, new, f"{name_here} ")
         elif old != new:
             plain = not isinstance(old, list | dict) and not isinstance(new, list | dict)
-            differences.append(f"{name_here} {old!s:.40}, here {new!s:.40}" if plain else name_here)
+            differences.append(f"{name_here} {old!s:.40}, now {new!s:.40}" if plain else name_here)
     return differences

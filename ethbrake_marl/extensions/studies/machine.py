@@ -1,4 +1,4 @@
-"""Description of this machine, for figures of speed and time."""
+"""Description of this machine, printed with every measured time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import ethbrake_marl as eb
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Processor, load and versions of this machine, which belong to every figure of speed."""
+    """Processor, load and versions of this machine, which are printed with every measured time."""
 
     processor: str  # model of the processor
     cores_usable: int  # number of cores that this process may use

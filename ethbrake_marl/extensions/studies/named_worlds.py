@@ -1,6 +1,7 @@
-"""Files of named worlds: the result of a search, to be driven again.
+"""Files of named worlds: the worlds that a search has found, which agents can drive again.
 
-A file stores the scenario of its worlds (with a hash of its content), the agent that drove, and its measurements.
+A file stores the worlds, the scenario with a hash of its content, the agent that drove the worlds, and the
+measurements.
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from ethbrake_marl.physics.state import Worlds
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
 
-MOST_NAMED_WORLDS = 1000  # most worlds in a file
+MOST_NAMED_WORLDS = 1000  # largest number of worlds in a file
 
-SIZE_LIMIT = 8 << 20  # largest file in bytes, enough for that many worlds of a long line
+SIZE_LIMIT = 8 << 20  # largest size of a file in bytes, enough for 1000 worlds with many vehicles
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class NamedWorld(FileModel):
-    """One world of the file: its name, its initial state, and what was measured in it (m2/s2)."""
+    """One world of the file: its name, its initial state, and its measurements."""
 
     # Name of the world, unique in the file.
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
-    score: Number  # value of the measure that was searched for, the larger the worse for the agent (m2/s2)
+    score: Number  # value of the measure that the search maximised, the larger the worse for the agent (m2/s2)
     harm: Number  # harm of the agent (m2/s2)
     reference: Number | None = None  # harm of the agent to compare with, or bound of the shield (m2/s2)
     # Initial state: column of a table of worlds (``gap_1_m``, ``speed_1_mps``) -> value.
@@ -39,7 +40,7 @@ class NamedWorld(FileModel):
 
 
 class NamedWorlds(FileModel):
-    """Content of a YAML file of worlds that a search for an agent's worst worlds found, to be driven again."""
+    """Content of a YAML file of the worst worlds of an agent, as a search found them."""
 
     format: Literal["ethbrake-worlds"]  # mark of this kind of file
     # Version of the format; not a Literal, which would accept true and 1.0.
@@ -49,34 +50,37 @@ class NamedWorlds(FileModel):
     scenario_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     settings: list[str] = Field(default=[])  # settings of the scenario, as for ``--set``
     agent: str  # spec of the agent that drove
-    measure: Literal["harm", "regret", "difference", "bound"]  # what was searched for, as in ``weakness.Measure``
-    against: str | None = None  # spec of the agent to compare with; None: none, or the default
-    harm_count: HarmCount  # impacts that harm counts: each pair's first one (``first``) or all (``total``)
+    measure: Literal["harm", "regret", "difference", "bound"]  # measure that the search maximised, see weakness.Measure
+    against: str | None = None  # spec of the agent to compare with; None: the default, or no comparison
+    harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
     found_by: str  # command of the search
     # The worlds, worst first.
     worlds: Annotated[list[NamedWorld], Field(min_length=1, max_length=MOST_NAMED_WORLDS)]
 
     @classmethod
-    def of(cls, scenario: Scenario, /, **told: Any) -> NamedWorlds:
+    def of(cls, scenario: Scenario, /, **fields: Any) -> NamedWorlds:
         """Return the content of a file of worlds that were drawn from ``scenario``.
 
-        ``told`` are the other fields of this class, except format, version and hash.
+        ``fields`` are the other fields of this class, except format, version and hash.
         """
-        return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **told)
+        return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **fields)
 
     @classmethod
     def read(cls, path: str | Path) -> NamedWorlds:
-        """Read and check a file of named worlds; raise ``InvalidInput`` with file, line and key of an error."""
+        """Read and check a file of named worlds.
+
+        Raises ``InvalidInput`` with the file, the line and the key if the content is invalid.
+        """
         document = read_yaml(path, SIZE_LIMIT)
         worlds = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
         names = [world.name for world in worlds.worlds]
         if twice := next((name for k, name in enumerate(names) if name in names[:k]), None):
-            raise InvalidInput(f"{path}: world {twice!r} is given twice; names must differ")
+            raise InvalidInput(f"{path}: two worlds have the name {twice!r}; give each world a different name")
         return worlds
 
     @property
     def text(self) -> str:
-        """The YAML text of the file. Reading it back gives the same worlds, bit for bit."""
+        """YAML text of the file. Reading this text gives the same worlds, bit for bit."""
         head = self.model_dump(exclude={"worlds"}, exclude_none=True)
         lines = [f"{key}: {flow_text(value)}" for key, value in head.items() if value != []]
         lines.append("worlds:")
@@ -88,21 +92,23 @@ class NamedWorlds(FileModel):
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
         """Return the worlds of the file at the alert.
 
-        Args:
-            scenario: the scenario that the file names, loaded.
-            where: name of the file, for messages.
+        Raises ``InvalidInput`` if the content of ``scenario`` has changed since the worlds were found.
 
-        Raises ``InvalidInput`` if the content of ``scenario`` is not that of the worlds' scenario.
+        Args:
+            scenario: scenario that the file names.
+            where: name of the file, for messages.
 
         """
         if scenario_sha256(scenario) != self.scenario_sha256:
             raise InvalidInput(
-                f"{where}: its worlds were found in scenario {self.scenario!r}"
-                f"{''.join(f' with --set {each}' for each in self.settings)}, which {scenario.name!r} is not, or is no"
-                " longer: their contents differ; use that scenario, or search again (ethbrake study falsify)"
+                f"{where}: the worlds were found in scenario {self.scenario!r}"
+                f"{''.join(f' with --set {each}' for each in self.settings)}, whose content differs from"
+                f" {scenario.name!r} now; use the scenario as it was, or search again (ethbrake study falsify)"
             )
         columns = self.worlds[0].state.keys()
         for k, world in enumerate(self.worlds):
             if world.state.keys() != columns:
-                raise InvalidInput(f"{where}: worlds[{k}].state has other columns than worlds[0]; all need the same")
+                raise InvalidInput(
+                    f"{where}: worlds[{k}].state and worlds[0].state have different keys; give all worlds the same keys"
+                )
         return worlds_from_table(scenario, {name: [world.state[name] for world in self.worlds] for name in columns})

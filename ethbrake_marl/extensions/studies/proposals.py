@@ -1,7 +1,7 @@
-"""Optuna's proposals (values to try) for a tuning, through Ray Tune, stored in a file and reused after a restart.
+"""Proposals of Optuna for a tuning: the values to try in each trial, stored in a file and used again after a restart.
 
-Each trial has a new sampler, seeded by a seed and the trial's number. So a proposal depends on the trials that have
-ended, and not on interruptions of the command.
+Each trial has a new sampler, whose seed depends on the number of the trial. A proposal therefore depends on the trials
+that have ended, but not on interruptions of the command.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ Proposal = Mapping[str, Any]  # key -> value in Optuna's form
 
 
 class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
-    """Optuna's search as Ray Tune uses it, which stores each proposal in a file.
+    """Search algorithm of Ray Tune that asks Optuna for proposals, and stores each proposal in a file.
 
-    A *proposal* is the values to try in one trial, by key, in Optuna's form. The configuration of a trial is its
-    number, ``trial``, and its proposal, ``values``.
+    A *proposal* contains the values to try in one trial, by key, in Optuna's form. The configuration of a trial
+    consists of its number, ``trial``, and its proposal, ``values``.
 
     Args:
-        file: JSON file of the proposals; created with the first one.
-        known: proposals that the file holds already; they are proposed again, before new ones.
-        space: key -> Optuna's distribution of its values.
+        file: JSON file of the proposals; it is created with the first proposal.
+        known: proposals that the file already contains; they are used again before Optuna makes new ones.
+        space: key -> Optuna's distribution of the values of this key.
         sampler: function from the number of a trial to its Optuna sampler.
-        first: proposal of the very first trial, used if ``known`` is empty; None: it is sampled like the others.
+        first: proposal of the first trial, used if ``known`` is empty; None: Optuna makes this proposal, too.
 
     """
 
@@ -63,7 +63,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
     def suggest(self, trial_id: str) -> dict[str, Any] | None:
         """Return the configuration of the next trial: ``{"trial": number, "values": proposal}``.
 
-        A proposal that is not in the file yet is stored there. ``trial_id`` is Ray's name of the trial.
+        A new proposal is stored in the file. ``trial_id`` is Ray's name of the trial.
         """
         values, number = super().suggest(trial_id), self._asked
         if number == len(self.known):
@@ -74,7 +74,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
 
 class _SamplerOfTrial(BaseSampler):
-    """Optuna sampler that makes a new sampler for each trial; ``of`` returns it for the number of the trial."""
+    """Optuna sampler that uses a new sampler for each trial: ``of(number)`` for the trial with this number."""
 
     def __init__(self, of: Callable[[int], BaseSampler]) -> None:
         self._of = of

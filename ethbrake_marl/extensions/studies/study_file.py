@@ -1,4 +1,4 @@
-"""Common parts of the YAML files of a sweep and of a tuning: reading them, and loading scenario and recipe."""
+"""Read the YAML file of a sweep or tuning, and load the scenario and the recipe that it names."""
 
 from __future__ import annotations
 
@@ -22,33 +22,34 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class StudyFile(FileModel):
-    """Base class of the content of a study's YAML file, of a sweep or of a tuning."""
+    """Base class for the content of the YAML file of a sweep or tuning."""
 
-    title: str = Field(default="", description="one line, for you")
+    title: str = Field(default="", description="a title of one line, which has no effect")
     _document: Document = PrivateAttr(Document("the file", {}, {}))  # source document, for messages
 
     @classmethod
     def read_as(cls, path: str | Path, needed: str) -> Self:
-        """Read and check a YAML file of this class.
+        """Read and check a YAML file with the content of this class.
+
+        Raises ``InvalidInput`` with the file, line, key and value of an error, and a correct alternative.
 
         Args:
-            path: the file.
-            needed: what the file must contain, for messages: ``with a grid or a list of jobs``.
-
-        Raises ``InvalidInput`` with file, line, key, value and what would be right.
+            path: path of the file.
+            needed: required content of the file, for messages, such as ``with a grid or a list of jobs``.
 
         """
         document = read_yaml(path)
-        wording = Wording(cls, "it is needed; docs/extensions/studies.md shows an example")
+        wording = Wording(cls, "this key is required; docs/extensions/studies.md shows an example")
         study = read_model(document, cls, wording, needed)
         study._document = document
         return study
 
 
 def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:
-    """Load scenario and recipe, by name or path, and apply the settings ``KEY=VALUE`` to the one that has the key.
+    """Load a scenario and a recipe by name or path, and apply the settings ``KEY=VALUE`` to them.
 
-    Raises ``InvalidInput`` for an unknown name or key, and for a value that is not allowed.
+    A setting is applied to whichever of the two has the key. Raises ``InvalidInput`` if a name or key is unknown, or if
+    a value is not allowed.
     """
     loaded = load_recipe(recipe)
     changes = read_settings(settings, [loaded])
@@ -56,9 +57,9 @@ def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Sce
 
 
 def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
-    """Return which argument causes ``load_parts`` to fail: ``recipe``, ``scenario`` or the key of a setting.
+    """Return which argument makes ``load_parts`` fail: ``recipe``, ``scenario`` or the key of a setting.
 
-    The result is empty if each of them alone is valid.
+    Returns an empty text if each argument alone is valid.
     """
     tried: dict[str, Callable[[], object]] = {
         "recipe": partial(load_recipe, recipe),
@@ -74,5 +75,5 @@ def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
 
 
 def texts_of(values: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return values by key as ``KEY=VALUE`` texts, as ``--set`` takes them."""
+    """Return a text ``KEY=VALUE``, as for the option ``--set``, for each key and value."""
     return tuple(f"{key}={flow_text(value)}" for key, value in values.items())

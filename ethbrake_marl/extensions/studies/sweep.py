@@ -1,7 +1,7 @@
-"""A sweep: the trainings listed in a YAML file, checked first, run on Ray Tune, with one table of results.
+"""A sweep: check the trainings listed in a YAML file, run them on Ray Tune, and write one table of the results.
 
-The table is made only from the folders of the runs. It is the same, byte for byte, in whatever order, place and number
-of attempts the jobs ran.
+The table is computed only from the folders of the trainings. It is the same, byte for byte, whatever the order, the
+computers and the number of attempts of the jobs.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ _GRID: YamlPath = ("grid",)
 
 
 class _OneOrMore:
-    """Annotation of a list for which the file may contain a single entry instead.
+    """Annotation of a list in a file, in whose place a single entry is allowed.
 
-    It only changes the JSON schema; a validator turns a single entry into a list.
+    The annotation changes the JSON schema. A validator turns a single entry into a list.
     """
 
     @classmethod
@@ -57,9 +57,9 @@ _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
     for key in value:
         if key in ("seed", "recipe.seed"):
-            raise ValueError("seed is no setting here; give it beside recipe, as seed")
+            raise ValueError("the seed is not given under set; give the key seed next to recipe")
         if "=" in key:
-            raise ValueError(f"{flow_text(key, 60)}: a key has no = in it")
+            raise ValueError(f"{flow_text(key, 60)}: a key must not contain the character =; write KEY: VALUE")
     return value
 
 
@@ -67,16 +67,16 @@ _Settings = Annotated[dict[str, Any], AfterValidator(_check_keys)]
 
 
 class Request(NamedTuple):
-    """One training of a sweep, as the sweep's file requests it."""
+    """One training of a sweep, as requested in the file of the sweep."""
 
-    path: YamlPath  # keys that lead to its place in the file: ``("grid",)``, or ``("jobs", k)`` for a listed job
+    path: YamlPath  # place of the training in the file: ``("grid",)``, or ``("jobs", k)`` for a listed job
     scenario: str  # name or path of the scenario
     recipe: str  # name or path of the recipe
     settings: tuple[str, ...]  # ``KEY=VALUE`` texts, as for ``train --set``
     seed: int  # seed of the training
 
     def __str__(self) -> str:
-        """Return place, scenario, recipe, seed and settings of the job in words, for messages."""
+        """Return the place in the file, scenario, recipe, seed and settings of the job as text, for messages."""
         settings = f", {', '.join(self.settings)}" if self.settings else ""
         return f"{_place(self.path)} ({self.scenario}, {self.recipe}, seed {self.seed}{settings})"
 
@@ -86,10 +86,10 @@ def _place(path: YamlPath) -> str:
 
 
 class SeedRange(FileModel):
-    """Seeds of the trainings as a range: ``count`` seeds, from ``first`` on."""
+    """Seeds of the trainings as a range of ``count`` whole numbers: ``first``, ``first`` + 1, and so on."""
 
     first: Seed = Field(default=0, description="the smallest seed")
-    count: int = Field(ge=1, le=MOST_JOBS, description="how many seeds")
+    count: int = Field(ge=1, le=MOST_JOBS, description="number of seeds")
 
 
 _Seeds = Annotated[
@@ -100,14 +100,14 @@ _Seeds = Annotated[
 
 
 class Grid(FileModel):
-    """One training for every combination of the listed scenarios, recipes, settings and seeds."""
+    """Grid of trainings: one training for every combination of the listed scenarios, recipes, settings and seeds."""
 
     settings: Annotated[dict[str, _Values], AfterValidator(_check_keys)] = Field(
         default={}, alias="set", description="a list of values for each dotted key"
     )
-    scenario: _Names = Field(description="names or paths, as train --scenario")
-    recipe: _Names = Field(description="names or paths, as train --recipe")
-    seed: _Seeds = Field(default=(0,), description="of the trainings")
+    scenario: _Names = Field(description="names or paths of scenarios, as for train --scenario")
+    recipe: _Names = Field(description="names or paths of recipes, as for train --recipe")
+    seed: _Seeds = Field(default=(0,), description="seeds of the trainings: a number, a list, or a range")
 
     @field_validator("scenario", "recipe", "seed", mode="before")
     @classmethod
@@ -116,27 +116,29 @@ class Grid(FileModel):
 
     @property
     def seeds(self) -> Sequence[int]:
-        """The seeds of the trainings, listed one by one."""
+        """All seeds of the trainings."""
         if isinstance(self.seed, SeedRange):
             return range(self.seed.first, self.seed.first + self.seed.count)
         return self.seed
 
 
 class ListedJob(FileModel):
-    """One training: a scenario, a recipe, settings and a seed."""
+    """One training of the list ``jobs``: a scenario, a recipe, settings and a seed."""
 
-    settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as train --set")
-    scenario: str = Field(description="a name or a path, as train --scenario")
-    recipe: str = Field(description="a name or a path, as train --recipe")
-    seed: Seed = Field(default=0, description="of the training")
+    settings: _Settings = Field(default={}, alias="set", description="settings by dotted key, as for train --set")
+    scenario: str = Field(description="name or path of the scenario, as for train --scenario")
+    recipe: str = Field(description="name or path of the recipe, as for train --recipe")
+    seed: Seed = Field(default=0, description="seed of the training")
 
 
 class SweepFile(StudyFile):
     """Content of the YAML file of a sweep: trainings as a grid of combinations, as a list of single jobs, or both."""
 
-    settings: _Settings = Field(default={}, alias="set", description="settings of every job, as train --set")
-    grid: Grid | None = Field(default=None, description="every combination of what it lists")
-    jobs: tuple[ListedJob, ...] = Field(default=(), strict=False, description="single jobs, after those of the grid")
+    settings: _Settings = Field(default={}, alias="set", description="settings of every job, as for train --set")
+    grid: Grid | None = Field(default=None, description="one training for every combination of the listed values")
+    jobs: tuple[ListedJob, ...] = Field(
+        default=(), strict=False, description="single trainings in addition to the grid"
+    )
 
     def size(self) -> int:
         """Return the number of jobs that the file requests."""
@@ -145,9 +147,9 @@ class SweepFile(StudyFile):
         return (math.prod(map(len, lists)) if lists else 0) + len(self.jobs)
 
     def requests(self) -> Iterator[Request]:
-        """Yield the jobs: first those of the grid, then the listed ones.
+        """Yield all jobs: first the jobs of the grid, then the jobs of the list ``jobs``.
 
-        The grid is ordered by seed, so that first results of all combinations exist early.
+        The jobs of the grid are ordered by seed, so every combination has a first result early.
         """
         if (grid := self.grid) is not None:
             changes = [
@@ -161,10 +163,9 @@ class SweepFile(StudyFile):
             yield Request(("jobs", k), job.scenario, job.recipe, self._texts(job.settings, ("jobs", k)), job.seed)
 
     def where(self, asked: Request, part: str = "") -> str:
-        """Return file and line of a requested job, for messages: ``sweep.yaml, line 7``.
+        """Return the file and the line of a requested job, for messages: ``sweep.yaml, line 7``.
 
-        ``part`` names a part of the job, whose line is returned instead: ``recipe``, ``scenario``, or the key of a
-        setting. Empty: the line of the job itself.
+        If ``part`` is ``recipe``, ``scenario`` or the key of a setting, the line is the line of this entry of the job.
         """
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
@@ -179,7 +180,9 @@ class SweepFile(StudyFile):
         if twice:
             where = self._document.where((*path, "set", twice[0]))
             key = f"{_place(path)}.set.{twice[0]}"
-            raise InvalidInput(f"{where}: {key}: stands in the file's own set too; leave one of them out")
+            raise InvalidInput(
+                f"{where}: {key}: the key {twice[0]} is also in the top-level set of the file; delete it in one place"
+            )
         return texts_of({**self.settings, **own})
 
 
@@ -188,12 +191,12 @@ TABLE, FAILURES, RUNS = "results.csv", "failures.csv", "runs"  # names inside th
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One job of a sweep, checked and loaded: one row of the sweep's table."""
+    """One job of a sweep, checked and loaded, which becomes one row of the sweep's table."""
 
-    asked: Request  # the job as the file requests it
-    identity: str  # SHA-256 of everything that affects its training (``Training.identity``)
+    asked: Request  # job as requested in the file
+    identity: str  # SHA-256 of everything that affects the training (``Training.identity``)
     name: str  # name of the job and of its folder
-    first: Training  # training with the settings of the job, but perhaps another seed; jobs of equal settings share it
+    first: Training  # training with the settings of the job but possibly another seed; shared by jobs of equal settings
 
     @property
     def settings(self) -> dict[str, str]:
@@ -202,7 +205,7 @@ class Row:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Columns of the tables that describe the job: hash, scenario, recipe, algorithm, scheme, seed, steps."""
+        """Table columns that describe the job, by name: hash, scenario, recipe, algorithm, scheme, seed, steps."""
         return {
             "hash": self.identity,
             "scenario": self.asked.scenario,
@@ -222,7 +225,7 @@ class SweepPlan:
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """Return the JSON Schema of a sweep's file, for editors that complete and check YAML."""
+        """Return the JSON Schema of a sweep file, for editors that complete and check YAML."""
         schema = SweepFile.model_json_schema(schema_generator=FileSchema)
         return FileSchema.publish(
             {**schema, "title": "Sweep", "anyOf": [{"required": ["grid"]}, {"required": ["jobs"]}]}
@@ -230,14 +233,16 @@ class SweepPlan:
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read the file of a sweep, and load scenario and recipe of every job.
+        """Read the file of a sweep, and load the scenario and the recipe of every job.
 
-        Raises ``InvalidInput`` with file, line and job for invalid content: an unknown scenario or recipe, an unknown
-        setting, parts that do not fit together, or two jobs with the same hash.
+        Raises ``InvalidInput``, with file, line and job, if a scenario, a recipe or a setting is unknown, if they do
+        not fit together, or if two jobs are the same training.
         """
         file = SweepFile.read_as(path, "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:
-            raise InvalidInput(f"{path}: asks for {count_of(file.size(), 'job')}; must be from 1 to {MOST_JOBS:,}")
+            raise InvalidInput(
+                f"{path}: requests {count_of(file.size(), 'job')}; the number of jobs must be from 1 to {MOST_JOBS:,}"
+            )
         rows: list[Row] = []
         firsts: dict[object, tuple[Training, dict[str, dict[str, Any]]]] = {}
         seen: dict[str, Request] = {}
@@ -266,31 +271,31 @@ class SweepPlan:
     def folder(path: Path) -> StudyFolder:
         """Return the object that checks and locks the folder ``path`` of a sweep.
 
-        The folder itself stores no settings, because each job's folder stores the settings of its training.
+        It compares no settings of the whole sweep, because the folder of each job stores the settings of its training.
         """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
     @staticmethod
     def job(row: Row, path: Path) -> TrainingJob:
-        """Return the training of the job ``row``, with its folder inside the sweep's folder ``path``."""
+        """Return the training of the job ``row``, with its folder in the sweep's folder ``path``."""
         training = Training.of(row.first.recipe, row.first.scenario, seed=row.asked.seed)
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
     def train(self, row: Row, path: Path) -> None:
-        """Bring the training of the job ``row`` in the sweep's folder ``path`` to its end, from where it stopped."""
+        """Train the job ``row`` in the sweep's folder ``path`` to its end. An unfinished training continues."""
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
-        """Return the results of each finished job in the sweep's folder ``path``, by the job's name.
+        """Return the results of each finished job in the sweep's folder ``path``, by the name of the job.
 
-        A result holds the figures of the training by name (``figures.FIGURES``, and ``harm`` of the kept policy), as
-        in ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
+        The results of a job are the numbers in ``figures.FIGURES`` and ``harm``, by name. Example:
+        ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
         """
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
         return {name: final_figures(job) for name, job in jobs if is_done(job)}
 
     def states(self, path: Path) -> list[dict[str, Any]]:
-        """Return one object for each job: ``hash``, ``job`` (name), ``set`` (settings) and ``state``.
+        """Return one dictionary for each job, with ``hash``, ``job`` (its name), ``set`` (settings) and ``state``.
 
         The state is ``new``, ``begun`` or ``finished``. ``path`` is the sweep's folder.
         """
@@ -308,16 +313,16 @@ class SweepPlan:
     def run(
         self, path: Path, *, jobs: int | None = None, ray: str = LOCAL, retries: int = 2, tell: OnProgress | None = None
     ) -> SweepResult:
-        """Run the remaining jobs of a sweep and write its tables, also after Ctrl-C.
+        """Run the unfinished jobs of the sweep, and write the tables. After Ctrl-C, the tables are written, too.
+
+        Raises ``InvalidInput`` if another process works in the folder, or if no cluster runs at the address ``ray``.
 
         Args:
-            path: folder of all results; created if needed.
-            jobs: number of jobs at once; None: one for each core.
-            ray: address of a Ray cluster; ``local``: only this machine.
-            retries: further attempts at a job whose process was lost.
-            tell: called with the number of ended jobs, and reasons of failures.
-
-        Raises ``InvalidInput`` if another process works in the folder, or if there is no cluster.
+            path: folder of all results; created if necessary.
+            jobs: number of jobs that run at once; None: one for each core.
+            ray: address of a Ray cluster; ``local``: Ray is started on this machine.
+            retries: number of further attempts at a job whose process is lost.
+            tell: function that is called with the number of ended jobs and the reasons of failures; None: no reports.
 
         """
         with self.folder(path).work():
@@ -326,7 +331,7 @@ class SweepPlan:
             results = self.results(path)
             left = [number for number, row in enumerate(self.rows) if row.name not in results]
             if results and tell is not None:
-                note = f"{count_of(len(results), 'job')} finished already"
+                note = f"{count_of(len(results), 'job')} finished in an earlier run"
                 tell(Progress("sweep", len(results), len(self.rows), note=note))
             reasons = self._train(left, path, jobs, ray, retries, tell) if left else {}
             results = self.results(path)
@@ -356,14 +361,14 @@ class SweepPlan:
     def _train(
         self, left: list[int], path: Path, jobs: int | None, ray: str, retries: int, tell: OnProgress | None
     ) -> dict[str, str]:
-        """Train jobs on Ray, and return the reason of each failed job, by its name.
+        """Train jobs on Ray, and return the reasons of failures, by the name of the job.
 
-        ``left`` holds the numbers of the jobs in ``rows``; the other arguments are those of ``run``.
+        ``left`` are the indices of the jobs in ``rows``. The other arguments are explained in ``run``.
         """
         with connected(ray, jobs):
             from ray import tune
 
-            from ethbrake_marl.extensions.studies.trials import Told, run_trials
+            from ethbrake_marl.extensions.studies.trials import TrialCallback, run_trials
 
             ends = run_trials(
                 do_job,
@@ -373,7 +378,7 @@ class SweepPlan:
                 {"job": tune.grid_search(left)},
                 jobs=jobs,
                 retries=retries,
-                told=Told("sweep", len(self.rows) - len(left), len(self.rows), tell),
+                callback=TrialCallback("sweep", len(self.rows) - len(left), len(self.rows), tell),
             )
         named = zip(left, ends, strict=False)  # fewer ends than jobs after Ctrl-C
         return {self.rows[number].name: end[REASON] for number, end in named if REASON in end}
@@ -381,11 +386,11 @@ class SweepPlan:
 
 @dataclass(frozen=True, slots=True)
 class SweepResult:
-    """Numbers of jobs after a run of a sweep, and the file of its table."""
+    """Result of a run of a sweep: the file of the table, and the numbers of finished and failed jobs."""
 
     table: Path  # CSV file with a row for each finished job
     jobs: int  # number of all jobs
-    finished: int  # number of jobs that have finished, including earlier runs
+    finished: int  # number of jobs that have finished, in this run or in earlier runs
     failed: int  # number of jobs that failed in this run
 
     @property
@@ -395,11 +400,11 @@ class SweepResult:
 
 
 def do_job(config: dict[str, Any], plan: SweepPlan, path: Path) -> None:
-    """Train one job, in a worker process of Ray.
+    """Train one job in a worker process of Ray.
 
     Args:
-        config: ``{"job": number}`` with the job's number in ``plan.rows``.
-        plan: the sweep.
+        config: configuration of the job, ``{"job": index}``, with its index in ``plan.rows``.
+        plan: plan of the sweep.
         path: folder of the sweep.
 
     """

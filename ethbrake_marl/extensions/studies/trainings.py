@@ -1,4 +1,4 @@
-"""Trainings of a study: finished ones are kept, unfinished ones continue, several at a time; and their cost."""
+"""Trainings of a study in their folders: train several at once, continue unfinished ones, and measure their speed."""
 
 from __future__ import annotations
 
@@ -26,17 +26,15 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Bring every training to its end, from where it stopped. Return False if Ctrl-C stopped one.
+    """Continue every training to its end. Return False if Ctrl-C stopped a training.
 
-    The policies do not depend on ``jobs`` or on interruptions.
+    The policies do not depend on ``jobs`` or on interruptions. Before any training begins, the function raises the
+    exceptions of ``steps_left``. Later it raises the exception of the first training that fails.
 
     Args:
         trainings: trainings with their folders.
-        jobs: number of trainings at once, one process each.
-        tell: called with the progress; None: silent.
-
-    Raises the exceptions of ``steps_left`` before any training begins, and the exception of the first training that
-    fails.
+        jobs: number of trainings that run at once, one process each.
+        tell: function that is called with the progress; None: no reports.
 
     """
     left = [training for training in trainings if training.steps_left()]
@@ -57,27 +55,29 @@ class TrainingJob:
 
     training: Training  # recipe and scenario
     folder: Path  # folder of the run; it need not exist yet
-    noted: tuple[str, ...] = ()  # how scenario and recipe differ from their files, ``KEY=VALUE``, for ``config.json``
+    noted: tuple[str, ...] = ()  # settings ``KEY=VALUE`` that changed scenario and recipe, for ``config.json``
 
     @property
     def per_update(self) -> int:
-        """Number of decisions of all learners together between two updates."""
+        """Number of decisions between two updates, summed over all learners."""
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:
-        """Return the number of decisions until the end of the training; 0 if it has finished.
+        """Return the number of decisions until the end of the training; 0 if the training has finished.
 
-        Raises ``InvalidInput`` if the folder holds another training.
+        Raises ``InvalidInput`` if the folder contains another training, or is not the folder of a training.
         """
         run, total = RunDirectory(self.folder), self.training.recipe.total_steps
         if not run.status.exists():
             if self.folder.exists():
-                raise InvalidInput(f"{self.folder}: is no training; move it away, or give another --output")
+                raise InvalidInput(
+                    f"{self.folder}: is not the folder of a training; move the folder, or give another --output"
+                )
             return total
         try:
             status = read_object(run.status)
         except InvalidInput as error:
-            raise InvalidInput(f"{error}; delete its folder to train anew") from None
+            raise InvalidInput(f"{error}; delete its folder to train again") from None
         check_same_training(run, self.training)
         if status.get("status") == "finished":
             return 0
@@ -85,13 +85,13 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Bring the training to its end, from where it stopped. Return True, or None if it was stopped early.
-
-        Args:
-            tell: called with the progress; None: silent.
-            stop_at: takes each evaluation, and returns a reason to stop, or None.
+        """Continue the training to its end. Return True if it has finished, or None if it was stopped early.
 
         Raises the exceptions of ``train`` and ``resume``.
+
+        Args:
+            tell: function that is called with the progress; None: no reports.
+            stop_at: function that receives each evaluation, and returns a reason to stop or None.
 
         """
         from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
@@ -113,9 +113,9 @@ class TrainingJob:
         return True if ended.status == "finished" else None
 
     def time(self, sample: Sample | None = None) -> Timed:
-        """Measure the speed of this training: of a few updates, and of its policy on 50 worlds.
+        """Measure the time of a few updates of this training, and the time of its policy on 50 worlds.
 
-        ``sample``: worlds for the policy; None: the first ones of the list on which the recipe evaluates.
+        The policy drives the worlds in ``sample``; None: the first worlds of the list on which the recipe evaluates.
         """
         from ethbrake_marl.training.session import train
 
@@ -139,23 +139,23 @@ class TrainingJob:
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
     def world_seconds(self, sample: Sample) -> float:
-        """Return the seconds that the trained policies need to drive one of the worlds of ``sample``."""
+        """Return the time that the trained policies need to drive one world of ``sample``, s."""
         team = {"team": load_team(self.folder, self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
 
 
 class Timed(NamedTuple):
-    """Measured speed of a training on one core, in CPU time, which other work on the machine does not change."""
+    """Measured speed of a training on one core, in CPU time. Other programs on the machine hardly affect CPU time."""
 
     job: TrainingJob  # the measured training
-    decision_s: float  # seconds per decision of a learner, including its share of the learning
-    world_s: float  # seconds per world when its policies are evaluated
+    decision_s: float  # training time divided by the number of decisions, s
+    world_s: float  # time to evaluate the policies in one world, s
 
     def seconds(self, steps: int) -> float:
-        """Return the estimated seconds for ``steps`` decisions of such trainings, including their evaluations.
+        """Return the estimated time of ``steps`` decisions of this training with its evaluations, s.
 
-        A training evaluates its policies on the recipe's fixed list at the start, every few updates, and at the end.
+        A training evaluates its policies on the list of the recipe at the start, every few updates, and at the end.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
@@ -163,9 +163,9 @@ class Timed(NamedTuple):
 
     @staticmethod
     def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
-        """Measure and return the seconds per world of ``work(worlds)``, on at most ``most`` of these worlds.
+        """Measure the time of ``work(worlds)`` on at most ``most`` of the worlds, and return the time per world, s.
 
-        One world runs first, so that compilation is not timed.
+        The function first runs with one world, so the measured time does not include compilation.
         """
         work(worlds.take([0]))
         some, started = worlds.take(range(min(worlds.n, most))), time.process_time()

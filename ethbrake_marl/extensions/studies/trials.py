@@ -1,7 +1,8 @@
-"""Run many trials on Ray Tune, each with one core and thread; a trial whose process was lost is tried again.
+"""Run many trials on Ray Tune, each on one core. A trial whose process is lost is tried again.
 
-Ray stores its state as pickles in a temporary folder that ends with the command. ``Tuner.restore`` is not used, because
-it would load pickles that a stranger may have written. Instead, a trial continues from its own folder.
+Ray stores its state as pickles in a temporary folder, which is removed at the end of the command. ``Tuner.restore`` is
+not used, because it loads pickles that a stranger may have written. Instead, a trial continues from the files in its
+own folder.
 """
 
 from __future__ import annotations
@@ -31,24 +32,24 @@ def run_trials(
     *,
     jobs: int | None,
     retries: int,
-    told: Told,
+    callback: TrialCallback,
 ) -> list[dict[str, Any]]:
     """Run trials on Ray Tune, and return the last report of each trial that began, in order.
 
-    A report is the dictionary that ``work`` passed to ``tune.report``, with Ray's own entries. Its entry ``reason``
-    says why a trial failed; ``done`` is true if Ray has ended the trial. Ctrl-C ends all trials early. Ray must be
-    connected (see ``cluster.connected``).
+    A report is the dictionary that ``work`` passes to ``tune.report``, with Ray's own entries. The entry ``reason`` is
+    the reason why a trial failed. The entry ``done`` is true if Ray has ended the trial. Ctrl-C ends all trials early.
+    The caller must connect to Ray first (see ``cluster.connected``).
 
     Args:
-        work: called as ``work(config, **given)`` in a worker process; reports with ``tune.report``.
-        given: arguments that are the same for all trials.
+        work: function that runs a trial in a worker process, called as ``work(config, **given)``.
+        given: keyword arguments of ``work`` that are the same for all trials.
         folder: folder of all results; every computer of a cluster must see it.
-        config: Ray Tune's settings: search algorithm, scheduler and number of trials.
-        space: Ray Tune's space of configurations: key -> values.
-        jobs: trials at once; None: one for each core.
-        retries: further attempts at a trial whose process was lost, or that failed with an error from outside this
+        config: settings of Ray Tune: search algorithm, scheduler and number of trials.
+        space: space of configurations: key -> values that Ray Tune tries.
+        jobs: number of trials that run at once; None: one for each core.
+        retries: number of further attempts at a trial whose process is lost, or that raises an error from outside this
             package.
-        told: callback that reports ended trials.
+        callback: callback that reports the trials that have ended.
 
     """
     config.max_concurrent_trials, config.reuse_actors = jobs, True
@@ -59,7 +60,10 @@ def run_trials(
             param_space=dict(space),
             tune_config=config,
             run_config=tune.RunConfig(
-                storage_path=notes, failure_config=tune.FailureConfig(max_failures=retries), callbacks=[told], verbose=0
+                storage_path=notes,
+                failure_config=tune.FailureConfig(max_failures=retries),
+                callbacks=[callback],
+                verbose=0,
             ),
         ).fit()
     return [
@@ -76,26 +80,29 @@ def run_trials(
 
 
 def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
-    """Run one attempt at a trial with the configuration ``config``; arguments as in ``run_trials``.
+    """Run one attempt at a trial with the configuration ``config``. ``run_trials`` explains the other arguments.
 
-    Errors of this package are reported, not raised, so that Ray does not try again.
+    An error of this package becomes a report, because Ray would try again after an exception.
     """
     try:
         if not folder.is_dir():
-            raise InvalidInput(f"{folder}: is not there on {os.uname().nodename}; every computer must see this folder")
+            raise InvalidInput(
+                f"{folder}: the computer {os.uname().nodename} does not see this folder; every computer of the cluster"
+                " must see it under the same path"
+            )
         work(config, **given)
     except EthBrakeError as error:
         tune.report({REASON: str(error), HARM: math.inf})
 
 
-class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
-    """Callback of Ray Tune that reports how many trials have ended, and why some failed.
+class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
+    """Callback of Ray Tune that reports the number of ended trials, and the reasons of failures.
 
     Args:
-        name: name of the study, for the progress.
-        done: number of trials that had ended before.
+        name: name of the study, for the progress display.
+        done: number of trials that ended in earlier runs.
         total: number of all trials.
-        tell: called with a ``Progress``; None: silent.
+        tell: function that is called with each ``Progress``; None: nothing is reported.
 
     """
 
@@ -103,23 +110,23 @@ class Told(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         self._name, self._done, self._total, self._tell = name, done, total, tell or (lambda progress: None)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return an empty state for Ray to store, because it is never read."""
+        """Return an empty state for Ray to store, because Ray never reads the state."""
         return {}
 
     def say(self, note: str = "") -> None:
-        """Report how many trials have ended, with ``note`` as a message to print once."""
+        """Report the number of ended trials. ``note`` is a message to print once."""
         self._tell(Progress(self._name, self._done, self._total, note=note))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Count a trial that ended, or that cannot succeed, and report why; Ray calls this method."""
+        """Count a trial that has ended, and report the reason if it failed. Ray calls this method."""
         self._done += 1
         self.say(str(trial.last_result.get(REASON, "")))
 
     def on_trial_error(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Count a trial that has failed after all its attempts; Ray calls this method."""
+        """Count a trial that has failed after all its attempts. Ray calls this method."""
         self._done += 1
-        self.say("a process was lost or failed, too often: the table says why")
+        self.say("a trial failed after all attempts; the table contains the reason")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Report that a trial is tried again; Ray calls this method."""
-        self.say("a process was lost or failed: tried again")
+        """Report that a trial is tried again. Ray calls this method."""
+        self.say("the process of a trial was lost or failed; the trial is tried again")

@@ -1,7 +1,7 @@
-"""A tuning: search the settings of a recipe for the least harm with Optuna on Ray Tune, with one table of the trials.
+"""A tuning: search for the settings of a recipe with the least harm, using Optuna on Ray Tune, and write one table.
 
-The table holds no time or place: with one job at once it is the same, byte for byte, however often the search was
-interrupted.
+The table contains no times and no paths. If only one job runs at a time, the table is the same, byte for byte, however
+often the search was interrupted.
 """
 
 from __future__ import annotations
@@ -58,14 +58,9 @@ _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 def _check_number(value: Any) -> int | float:
-    """Return ``value`` unchanged if it is a finite number, else raise ``ValueError``.
-
-    A whole number stays an ``int``, which limits the search to whole numbers.
-    """
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise ValueError("must be a number")
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number")
+    """Return ``value`` if it is a finite number, else raise ``ValueError``. An ``int`` stays an ``int``."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        raise ValueError("the end of a range must be a finite number")
     return value
 
 
@@ -73,23 +68,25 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 
 
 class Range(FileModel):
-    """Numbers that a search may try for one setting: a range from ``low`` to ``high``, both included.
+    """Range of numbers that a search may try for one setting, from ``low`` to ``high``, both included.
 
-    If both ends are written without a point, only whole numbers are tried.
+    If both ends are written without a decimal point, the search tries only whole numbers.
     """
 
-    low: _Number = Field(description="the least value, included")
-    high: _Number = Field(description="the largest value, included; with low: whole numbers where neither has a point")
-    log: bool = Field(default=False, description="the logarithm is searched, not the number")
+    low: _Number = Field(description="the smallest value")
+    high: _Number = Field(
+        description="the largest value; if low and high have no decimal point, only whole numbers are tried"
+    )
+    log: bool = Field(default=False, description="whether values are spread evenly on a logarithmic scale")
 
     def __str__(self) -> str:
-        """Return the range in words: ``from 0.001 to 0.1, by its logarithm``."""
-        kind = ", whole" * self.whole + ", by its logarithm" * self.log
+        """Return the range as text: ``from 0.001 to 0.1, logarithmic``."""
+        kind = ", whole numbers" * self.whole + ", logarithmic" * self.log
         return f"from {flow_text(self.low)} to {flow_text(self.high)}{kind}"
 
     @property
     def whole(self) -> bool:
-        """Whether only whole numbers are tried: both ends are written without a point."""
+        """Whether the search tries only whole numbers: both ends are written without a decimal point."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     @model_validator(mode="after")
@@ -97,16 +94,16 @@ class Range(FileModel):
         if not self.low < self.high:
             raise ValueError(f"low {flow_text(self.low)} must be less than high {flow_text(self.high)}")
         if self.log and not self.low > 0:
-            raise ValueError(f"low {flow_text(self.low)} must be greater than 0, for its logarithm is searched")
+            raise ValueError(f"low {flow_text(self.low)} must be greater than 0, because log is true")
         return self
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """Both ends of the range; the recipe must allow them, which is checked before the search starts."""
+        """Both ends of the range. Before the search starts, they are checked against the recipe."""
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
-        """Return ``value``, a recipe's own value of this setting, as a number of the range; None if it is not in it."""
+        """Return ``value``, the recipe's own value of this setting, as a number; None if the range excludes it."""
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             return None
         if not self.whole:
@@ -114,7 +111,7 @@ class Range(FileModel):
         return int(value) if value == int(value) else None
 
     def distribution(self) -> BaseDistribution:
-        """Return Optuna's distribution from which values of this range are proposed."""
+        """Return Optuna's distribution of the values in this range."""
         from optuna.distributions import FloatDistribution, IntDistribution
 
         if self.whole:
@@ -122,19 +119,21 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """Return a value as Optuna stores it; for a range, this is the value itself."""
+        """Return ``value`` as Optuna stores it. For a range, this is the value itself."""
         return value
 
     value = stored
 
 
 class Choices(FileModel):
-    """Values that a search may try for one setting: a list of values of any kind."""
+    """List of values, of any kind, that a search may try for one setting."""
 
-    choices: tuple[Any, ...] = Field(strict=False, min_length=2, description="values of any kind that the recipe takes")
+    choices: tuple[Any, ...] = Field(
+        strict=False, min_length=2, description="values of any kind that the recipe accepts for this key"
+    )
 
     def __str__(self) -> str:
-        """Return the values in words: ``one of relu, tanh``."""
+        """Return the choices as text: ``one of relu, tanh``."""
         return f"one of {', '.join(map(flow_text, self.choices))}"
 
     @model_validator(mode="after")
@@ -142,30 +141,30 @@ class Choices(FileModel):
         texts = [*map(flow_text, self.choices)]
         twice = [text for k, text in enumerate(texts) if text in texts[:k]]
         if twice:
-            raise ValueError(f"{twice[0]} stands there twice")
+            raise ValueError(f"the value {twice[0]} is listed twice; list each value once")
         return self
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """All choices; the recipe must allow them, which is checked before the search starts."""
+        """All choices. Before the search starts, they are checked against the recipe."""
         return self.choices
 
     def own(self, value: Any) -> Any:
-        """Return the choice that equals a recipe's own value of this setting; None if it is not one of the choices."""
+        """Return the choice that equals ``value``, the recipe's own value of this setting; None if no choice does."""
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
-        """Return Optuna's distribution from which choices, as texts, are proposed."""
+        """Return Optuna's distribution of the choices, which are stored as texts."""
         from optuna.distributions import CategoricalDistribution
 
         return CategoricalDistribution([*map(flow_text, self.choices)])
 
     def stored(self, value: Any) -> str:
-        """Return a value as Optuna stores it: as text, because Optuna's choices cannot be lists."""
+        """Return ``value`` as Optuna stores it: as text, because Optuna cannot store lists."""
         return flow_text(value)
 
     def value(self, stored: Any) -> Any:
-        """Return the choice that Optuna stores as the text ``stored``."""
+        """Return the choice whose text, as Optuna stores it, is ``stored``."""
         return {flow_text(value): value for value in self.choices}[stored]
 
 
@@ -179,32 +178,34 @@ Dimension = Annotated[Annotated[Range, Tag("#range")] | Annotated[Choices, Tag("
 def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
     for key in value:
         if not key or "=" in key:
-            raise ValueError(f"{flow_text(key, 60)}: must be a key of the recipe, with dots inside a part")
+            raise ValueError(f"{flow_text(key, 60)}: must be a key of the recipe, such as learning_rate.start")
     return value
 
 
 class Measuring(FileModel):
-    """How trials are judged: the list of worlds on which their policies are evaluated, and how often in a training."""
+    """Evaluation of the trials: the list of worlds that policies drive, and the number of evaluations per training."""
 
-    # Number of worlds of the list.
-    worlds: int = Field(default=1000, ge=1, le=1_000_000, description="of the list")
-    # Seed from which these worlds are drawn.
-    seed: Seed = Field(default=4007, description="of the list")
-    # Number of evaluations in the course of a training.
-    times: int = Field(default=10, ge=1, le=1000, description="how often a training is measured")
+    # Number of worlds in the list.
+    worlds: int = Field(default=1000, ge=1, le=1_000_000, description="number of worlds in the list")
+    # Seed from which the worlds are drawn.
+    seed: Seed = Field(default=4007, description="seed from which the worlds are drawn")
+    # Number of evaluations during a training.
+    times: int = Field(default=10, ge=1, le=1000, description="number of evaluations during a training")
 
 
 class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
-    A trial (one training) stops if its least harm so far is above the median of the other trials' mean harm up to the
-    same evaluation.
+    A trial is one training. It is stopped at an evaluation if its least harm so far is above the median of the other
+    trials' mean harm up to the same evaluation.
     """
 
-    # Least number of other trials that must have reached the same evaluation before a trial may be stopped.
-    after_trials: _Count = Field(default=5, description="so many others must have come as far before one is stopped")
-    # Number of evaluations, apart from that before the training, that every trial is allowed to make.
-    after_times: _Count = Field(default=3, description="nobody is stopped before it was measured so often")
+    # Number of other trials that must have reached an evaluation before a trial may be stopped there.
+    after_trials: _Count = Field(
+        default=5, description="number of other trials that must have reached an evaluation before a trial is stopped"
+    )
+    # Number of evaluations that every trial completes, not counting the evaluation before the training.
+    after_times: _Count = Field(default=3, description="number of evaluations before which no trial is stopped")
 
     def rule(self) -> TrialScheduler:
         """Return Ray Tune's scheduler that applies this rule."""
@@ -221,13 +222,13 @@ class Pruning(FileModel):
 
 
 class Sampling(FileModel):
-    """How the values of the next trial are chosen: by Optuna's TPE from the results of earlier trials, or at random."""
+    """Method that chooses the values of the next trial: Optuna's TPE, which uses earlier results, or random values."""
 
-    name: Literal["tpe", "random"] = Field(default="tpe", description="Optuna's TPE, or chance")
+    name: Literal["tpe", "random"] = Field(default="tpe", description="tpe: Optuna's TPE; random: random values")
     # Seed of the proposed values.
-    seed: Seed = Field(default=0, description="of what is proposed")
+    seed: Seed = Field(default=0, description="seed of the proposed values")
     # Number of first trials with random values, before TPE chooses.
-    random_trials: _Count = Field(default=10, description="trials by chance before TPE begins")
+    random_trials: _Count = Field(default=10, description="number of trials with random values before TPE begins")
 
     def of_trial(self, number: int) -> BaseSampler:
         """Return the Optuna sampler that proposes the values of trial ``number``; its seed depends on the number."""
@@ -240,34 +241,39 @@ class Sampling(FileModel):
 
 
 class TuningFile(StudyFile):
-    """Content of the YAML file of a tuning: a training, and the settings of its recipe to search for the least harm."""
+    """Content of the YAML file of a tuning: a training, and the settings of its recipe that the search changes."""
 
-    scenario: str = Field(description="a name or a path, as train --scenario")
-    recipe: str = Field(description="a name or a path, as train --recipe")
-    seed: Seed = Field(default=0, description="of every training")
+    scenario: str = Field(description="name or path of the scenario, as for train --scenario")
+    recipe: str = Field(description="name or path of the recipe, as for train --recipe")
+    seed: Seed = Field(default=0, description="seed of every training")
     settings: Annotated[dict[str, Any], AfterValidator(_check_recipe_keys)] = Field(
-        default={}, alias="set", description="settings of every trial, as train --set"
+        default={}, alias="set", description="settings of every trial, as for train --set"
     )
     search: Annotated[dict[str, Dimension], AfterValidator(_check_recipe_keys)] = Field(
-        min_length=1, description="the space: a dotted key of the recipe, with a range or a list of choices"
+        min_length=1, description="searched keys: for each dotted key of the recipe, a range or a list of choices"
     )
-    measure: Measuring = Field(default=Measuring(), description="the list on which trials are judged, and how often")
-    prune: Pruning | None = Field(default=Pruning(), description="when a trial is given up; null: never")
-    sampler: Sampling = Field(default=Sampling(), description="who proposes")
+    measure: Measuring = Field(
+        default=Measuring(), description="list of worlds for the evaluations, and number of evaluations"
+    )
+    prune: Pruning | None = Field(default=Pruning(), description="rule that stops weak trials early; null: no rule")
+    sampler: Sampling = Field(default=Sampling(), description="method that chooses the values of the next trial")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of a proposal as in a YAML file: key -> value.
+        """Return the values of a proposal in YAML's form, by key.
 
-        ``proposal`` maps each searched key to its value as Optuna stores it.
+        ``proposal`` maps each searched key to its value in Optuna's form.
         """
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
     def space(self) -> dict[str, BaseDistribution]:
-        """Return key -> Optuna's distribution of its values, for each searched key."""
+        """Return Optuna's distribution of the values of each searched key, by key."""
         return {key: dimension.distribution() for key, dimension in self.search.items()}
 
     def points(self, number: int) -> Iterator[dict[str, Any]]:
-        """Return ``number`` random points of the space, each as key -> value; the same ones each time."""
+        """Yield ``number`` random points of the space, each as a dictionary from key to value.
+
+        Every call yields the same points.
+        """
         with naming_extras():
             import optuna
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -278,16 +284,16 @@ class TuningFile(StudyFile):
 
 Values = Mapping[str, Any]  # values of a trial: key -> value in YAML's form
 
-_NOT_SEARCHED = {  # key -> reason; also holds for keys inside it
-    "seed": "a seed is luck; give one for all trials, as seed",
-    "evaluation": "trials are judged on one list; give it as measure",
-    "algorithm": "each algorithm has a recipe of its own; tune one at a time",
-    "total_steps": "every trial gets the same number of decisions; give it in set",
-    "checkpoint_every_updates": "it changes no result",
-    "reward.harm_count": "it says which harm is least; give it in set",
+_NOT_SEARCHED = {  # key (or first part of a key) that cannot be searched -> reason
+    "seed": "a good seed is luck; give one seed for all trials, as the key seed",
+    "evaluation": "all trials are evaluated on the same list; describe it with the key measure",
+    "algorithm": "a recipe has the keys of one algorithm; tune each algorithm in a file of its own",
+    "total_steps": "all trials have the same number of decisions; give it under set",
+    "checkpoint_every_updates": "it has no effect on the result",
+    "reward.harm_count": "it defines the harm that the tuning minimises; give it under set",
 }
 
-PRUNED = "pruned: too much harm for so many decisions"
+PRUNED = "pruned: more harm than other trials after the same number of decisions"
 
 _TRIED = 200  # random points of the space that are checked before the search starts
 
@@ -296,7 +302,7 @@ TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # names ins
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """A tuning, checked and loaded: everything that its trials have in common."""
+    """A tuning, checked and loaded: everything that the trials have in common."""
 
     file: TuningFile  # content of the tuning's file
     recipe: TrainingRecipe  # recipe with the file's settings and seed, before any searched value
@@ -305,15 +311,15 @@ class TuningPlan:
 
     @staticmethod
     def json_schema() -> dict[str, Any]:
-        """Return the JSON Schema of a tuning's file, for editors that complete and check YAML."""
+        """Return the JSON Schema of a tuning file, for editors that complete and check YAML."""
         return FileSchema.publish({**TuningFile.model_json_schema(), "title": "Tuning"})
 
     @classmethod
     def read(cls, path: str | Path) -> TuningPlan:
-        """Read the file of a tuning, load its parts and check its space.
+        """Read the file of a tuning, load the scenario and the recipe, and check the searched keys and values.
 
-        Raises ``InvalidInput`` with file and line for: an unknown scenario or recipe, a key that the recipe does not
-        have or that may not be searched, a value that the recipe does not allow, and values that do not go together.
+        Raises ``InvalidInput``, with file and line, if the scenario, the recipe or a key is unknown, if a key may not
+        be searched, if the recipe does not allow a value, or if the recipe does not allow some values together.
         """
         file = TuningFile.read_as(path, "with scenario, recipe and search")
         at = file._document.refusing_at
@@ -325,7 +331,9 @@ class TuningPlan:
         for key in file.settings:
             with at(("set", key)):
                 if key.removeprefix("recipe.").partition(".")[0] in ("seed", "evaluation"):
-                    raise InvalidInput(f"set.{key}: is no setting here; give seed and measure beside it")
+                    raise InvalidInput(
+                        f"set.{key}: this key is not allowed under set; use the top-level keys seed and measure"
+                    )
         asked = file.scenario, file.recipe, texts_of(file.settings)
         try:
             scenario, recipe = load_parts(*asked)
@@ -358,8 +366,8 @@ class TuningPlan:
     def training(self, values: Values) -> Training:
         """Return the training of a trial with these values of the searched keys.
 
-        It is evaluated as often as the file's ``measure.times`` says, so that all trials can be compared on the way.
-        Raises ``InvalidInput`` if the values do not go together.
+        Every training has about ``measure.times`` evaluations, so that unfinished trials can be compared. Raises
+        ``InvalidInput`` if the recipe does not allow the values together.
         """
         recipe = read_settings(texts_of(values), [self.recipe]).change(self.recipe)
         asked = self.file.measure
@@ -368,19 +376,19 @@ class TuningPlan:
         return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
-        """Return the number of updates of a whole training by this recipe."""
+        """Return the number of updates in a whole training with ``recipe``."""
         return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
 
     def own_values(self) -> dict[str, Any] | None:
-        """Return the recipe's own value of each searched key; None if one of them is not in the space."""
+        """Return the recipe's own value of each searched key; None if a range or list of choices excludes its value."""
         content = self.recipe.model_dump(mode="json")
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
 
     def example(self) -> str:
-        """Return a command line ``ethbrake train ...`` that trains the same as one of the trials.
+        """Return a command line ``ethbrake train ...`` that runs the training of one trial.
 
-        It is the first trial if the space contains the recipe's own values, else one with random values.
+        The trial has the recipe's own values if the ranges contain them, else random values.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -409,13 +417,13 @@ class TuningPlan:
             raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """Return the object that checks and locks the folder ``path``, which may belong to this tuning only."""
+        """Return the object that checks and locks the folder ``path``. It refuses the folder of a different tuning."""
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
     def proposals(self, path: Path) -> list[Values]:
-        """Return the proposals (values of each trial so far) in the tuning's folder ``path``, as Optuna stores them.
+        """Return the proposals in the tuning's folder ``path``: the values of each trial so far, in Optuna's form.
 
-        Raises ``InvalidInput`` if one has other keys or values than the file's ``search`` allows.
+        Raises ``InvalidInput`` if a proposal has keys or values that ``search`` in the file of the tuning excludes.
         """
         file, space = path / PROPOSALS, self.file.search
         if not file.exists():
@@ -427,13 +435,16 @@ class TuningPlan:
                 if values.keys() != space.keys() or None in (space[key].own(value) for key, value in values.items()):
                     raise ValueError
         except (TypeError, ValueError, AttributeError, LookupError):
-            raise InvalidInput(f"{file}: is damaged: a trial has other keys or values than the space") from None
+            raise InvalidInput(
+                f"{file}: is damaged, because a trial has keys or values that the tuning does not search; delete the"
+                " folder to start again"
+            ) from None
         return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
-        """Return the training of a trial with these values, with its folder inside the tuning's folder ``path``.
+        """Return the training of a trial with these values, with its folder in the tuning's folder ``path``.
 
-        Trials with equal values share one training.
+        Trials with equal values share one training and one folder.
         """
         training = self.training(values)
         return TrainingJob(training, path / TRIALS / training.identity[:16], texts_of({**self.file.settings, **values}))
@@ -448,20 +459,20 @@ class TuningPlan:
         retries: int = 2,
         tell: OnProgress | None = None,
     ) -> TuningResult:
-        """Run trials until the folder has ``trials`` of them, and write their table, also after Ctrl-C.
+        """Run trials until the folder contains ``trials`` trials, and write their table.
 
-        The search starts over each time with the stored proposals: a finished training is read from its folder, and an
-        unfinished one continues.
+        Every run repeats the search with the stored proposals. The results of finished trainings are read from their
+        folders, and unfinished trainings continue. After Ctrl-C, the table is written, too. Raises ``InvalidInput`` if
+        another process works in the folder, if a file is damaged, or if no cluster runs at the address ``ray``.
 
         Args:
-            path: folder of all results; created if needed.
-            trials: number of trials that the folder has at the end.
-            jobs: trials at once; more than one changes the proposals.
-            ray: address of a Ray cluster; ``local``: only this machine.
-            retries: further attempts at a trial whose process was lost.
-            tell: called with the number of ended trials, and reasons of failures.
-
-        Raises ``InvalidInput`` if another process works in the folder, for a damaged file, or if there is no cluster.
+            path: folder of all results; created if necessary.
+            trials: number of trials in the folder at the end.
+            jobs: number of trials that run at once; it affects the proposals.
+            ray: address of a Ray cluster; ``local``: Ray is started on this machine.
+            retries: number of further attempts at a trial whose process is lost.
+            tell: function that is called with the number of ended trials and the reasons of failures; None: no
+                reports.
 
         """
         with self.folder(path).work():
@@ -493,24 +504,24 @@ class TuningPlan:
     def _search(
         self, path: Path, known: list[Values], trials: int, jobs: int, retries: int, tell: OnProgress | None
     ) -> tuple[list[Values], list[dict[str, Any]]]:
-        """Run the trials on Ray, and return all proposals and the last report of each of their trials.
+        """Run the trials on Ray. Return all proposals, and the last report of each trial.
 
-        ``known`` are the proposals of earlier runs; the other arguments are those of ``run``.
+        ``known`` are the proposals of earlier runs. The other arguments are explained in ``run``.
         """
         from ray import tune
 
         from ethbrake_marl.extensions.studies.proposals import Proposals
-        from ethbrake_marl.extensions.studies.trials import Told, run_trials
+        from ethbrake_marl.extensions.studies.trials import TrialCallback, run_trials
 
         own = self.own_values()
         first = None if own is None else {key: self.file.search[key].stored(value) for key, value in own.items()}
         search = Proposals(path / PROPOSALS, known, self.file.space(), self.file.sampler.of_trial, first)
         total, prune = max(trials, len(known)), self.file.prune
-        telling = Told("tuning", 0, total, tell)
+        callback = TrialCallback("tuning", 0, total, tell)
         if known:
-            telling.say(f"{count_of(len(known), 'trial')} begun before: what ended is kept, the rest goes on")
+            callback.say(f"{count_of(len(known), 'trial')} begun in earlier runs; unfinished trials continue")
         elif own is None:
-            telling.say("the recipe's own values are not in the space, so no trial has them")
+            callback.say("no trial has the recipe's own values, because the ranges exclude them")
         ends = run_trials(
             do_trial,
             {"plan": self, "path": path.absolute()},
@@ -519,19 +530,19 @@ class TuningPlan:
             {},
             jobs=jobs,
             retries=retries,
-            told=telling,
+            callback=callback,
         )
         return search.known, ends
 
     def best_recipe(self, values: Values, file: Path, source: str) -> str:
         """Return the YAML text of a recipe that repeats the training with these values.
 
+        Raises ``InvalidInput`` if the name of the file is not a valid name of a recipe.
+
         Args:
             values: value of each searched key.
-            file: path that the text will be written to; its name becomes the recipe's.
-            source: text for the recipe's key ``source``.
-
-        Raises ``InvalidInput`` if the file's name is not a valid name of a recipe.
+            file: path of the file for the text; the name of the file becomes the name of the recipe.
+            source: text for the key ``source`` of the recipe.
 
         """
         check_file_name("recipe", file.stem)
@@ -567,15 +578,15 @@ class Trial:
     """One trial of a tuning (a training with some values of the searched keys), and how it ended."""
 
     number: int  # number of the trial, from 0
-    state: State  # how it ended; ``pruned``: stopped early because of too much harm
+    state: State  # state of the trial; ``pruned``: stopped early because of too much harm
     values: Values  # value of each searched key
-    harm: float | None  # harm of its best policy on the tuning's list (m2/s2); None unless finished
-    figures: Mapping[str, Any]  # entries for the table (``FIGURES``) at its end, or when it was pruned
+    harm: float | None  # harm of the best policy on the tuning's list (m2/s2); None unless the trial has finished
+    figures: Mapping[str, Any]  # entries of the table (``FIGURES``) at the end of the trial, or when it was pruned
     reason: str  # reason of a failure; else empty
 
     @classmethod
     def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
-        """Return the trial ``number`` with these values, from its last report ``end`` (see ``run_trials``)."""
+        """Return the trial ``number`` with these values. ``end`` is the last report of the trial (``run_trials``)."""
         reason = str(end.get(REASON, ""))
         state: State = "running"
         if reason:
@@ -588,15 +599,15 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class TuningResult:
-    """Trials after a run of a tuning, and the file of their table."""
+    """Result of a run of a tuning: the trials, and the file of their table."""
 
     table: Path  # CSV file with a row for each trial that ended
-    asked: int  # number of trials that the folder should have at the end
-    trials: tuple[Trial, ...]  # trials that were begun, in order
+    asked: int  # requested number of trials in the folder
+    trials: tuple[Trial, ...]  # trials that have begun, in order
 
     @property
     def counts(self) -> Counter[State]:
-        """State (``finished``, ``pruned``, ...) -> number of trials in it."""
+        """Number of trials in each state (``finished``, ``pruned``, ...)."""
         return Counter(each.state for each in self.trials)
 
     @property
@@ -606,19 +617,19 @@ class TuningResult:
 
     @property
     def best(self) -> Trial | None:
-        """The finished trial with the least harm; of equal ones the first. None if no trial has finished."""
+        """Finished trial with the least harm; the first one if several are equal. None if no trial has finished."""
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
 
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
-    """Train one trial to its end, in a worker process of Ray, and report every evaluation.
+    """Train one trial to its end in a worker process of Ray, and report every evaluation.
 
-    Ray stops a pruned trial at such a report.
+    Ray stops a pruned trial when the trial reports an evaluation.
 
     Args:
-        config: ``{"trial": number, "values": proposal}``, values as Optuna stores them.
-        plan: the tuning.
+        config: configuration of the trial, ``{"trial": number, "values": proposal}``, with values in Optuna's form.
+        plan: plan of the tuning.
         path: folder of the tuning.
 
     """
@@ -630,7 +641,7 @@ def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
 
     def judge(evaluation: Evaluation) -> None:
         if evaluations and evaluation["steps"] <= evaluations[-1]["steps"]:
-            return  # the same evaluation again, after an interruption
+            return  # this evaluation was already reported before an interruption
         evaluations.append(evaluation)
         if evaluation["steps"] < last:
             report(figures(job, evaluations))
@@ -638,7 +649,7 @@ def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
     def stop_at(evaluation: Evaluation) -> str | None:
         try:
             judge(evaluation)
-        except SystemExit:  # Ray's way to end a trial; first let the training close its folder
+        except SystemExit:  # Ray ends a trial with this exception; the training must close its folder first
             return PRUNED
         return None
 
@@ -653,18 +664,19 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
     bare = key.removeprefix("recipe.")
     for inner, reason in _NOT_SEARCHED.items():
         if bare == inner or bare.startswith(f"{inner}."):
-            raise InvalidInput(f"search.{key}: is not searched: {reason}")
+            raise InvalidInput(f"search.{key}: this key cannot be searched: {reason}")
     for other in (*file.settings, *(each for each in file.search if each != key)):
         if f"{bare}.".startswith(f"{other.removeprefix('recipe.')}."):
-            raise InvalidInput(f"search.{key}: {other} stands there too; leave one of them out")
+            raise InvalidInput(f"search.{key}: the file also sets {other}; delete one of the two keys")
     if read_settings([f"{key}=0"], [recipe]).scenario:
         raise InvalidInput(
-            f"search.{key}: is the scenario's; a search changes the recipe, so that harms can be compared"
+            f"search.{key}: is a key of the scenario; give a key of the recipe, because the harms of trials can be"
+            " compared only in the same scenario"
         )
 
 
 def _value_at(content: Any, key: str) -> Any:
-    """Return the value at a dotted key (``network.policy.0``) of the nested data ``content``; None if there is none."""
+    """Return the value of a dotted key (``network.policy.0``) in the nested data ``content``; None if it is missing."""
     for part in key.removeprefix("recipe.").split("."):
         if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
             content = content[int(part)]

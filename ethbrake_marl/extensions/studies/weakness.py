@@ -25,35 +25,40 @@ MeasureName = Literal["harm", "regret", "difference", "bound"]
 
 MEASURES: tuple[MeasureName, ...] = get_args(MeasureName)
 
-HINDSIGHT = "best_harm"  # default reference of regret
+HINDSIGHT = "best_harm"  # default reference agent of the measure regret
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Measurements of an agent in n worlds (m2/s2)."""
+    """Measurements of an agent in n worlds, in m2/s2."""
 
-    score: Floats  # [n] value of the measure, the larger the worse for the agent; -inf where the physics failed
-    harm: Floats  # [n] harm of the agent; NaN where the physics failed
+    score: Floats  # [n] value of the measure, the larger the worse for the agent; minus infinity if the physics failed
+    harm: Floats  # [n] harm of the agent; NaN if the physics failed
     # [n] harm of the agent to compare with, or bound of the agent's shield; None for the measure ``harm``.
     reference: Floats | None
 
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """Measure of how badly an agent does in a world; calling it with a sample measures every world.
+    """Measure of how badly an agent does in a world. Calling the measure with a sample measures every world.
 
-    ``harm``: its harm. ``regret``: its harm minus the harm of the reference, by default the best profile that a search
-    finds with hindsight. ``difference``: the absolute difference between its harm and that of the reference. ``bound``:
-    its harm minus the bound of its shield at the alert; above zero the bound is broken.
+    There are four measures. ``harm`` is the agent's harm. ``regret`` is the agent's harm minus the harm of a reference
+    agent, by default ``best_harm``. ``difference`` is the absolute difference between the harms of the agent and the
+    reference agent. ``bound`` is the agent's harm minus the bound of its shield at the alert; a value above 0 means
+    that the bound is broken.
     """
 
-    name: MeasureName  # one of the four measures above
-    agents: Mapping[str, Driver]  # by name: the agent, then the reference agent if there is one
-    scenario: Scenario  # scenario whose learners they drive
-    harm_count: HarmCount  # impacts that harm counts: each pair's first one (``first``) or all (``total``)
+    name: MeasureName  # name of the measure
+    agents: Mapping[str, Driver]  # agents by name: the agent, then the reference agent if there is one
+    scenario: Scenario  # scenario whose learners the agents drive
+    harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return the measurements in the worlds of ``sample``; if the physics fails in a world, its score is -inf."""
+        """Return the measurements in the worlds of ``sample``.
+
+        The score of a world is minus infinity if the physics fails. Raises ``InvalidInput`` for the measure ``bound``
+        if the agent has no shield.
+        """
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
         try:
@@ -69,8 +74,8 @@ class Measure:
         beside = other[0].ledger.world_harm(self.harm_count) if other else agent.predicted_harm
         if beside is None:
             raise InvalidInput(
-                f"agent {next(iter(self.agents))!r}: tells no bound; --measure bound is for an agent behind a shield,"
-                " for instance ppo+step"
+                f"agent {next(iter(self.agents))!r}: has no shield, but --measure bound compares the harm with the"
+                " bound of a shield; give an agent with a shield, for instance ppo+step"
             )
         reference[rows] = beside
         more = harm[rows] - beside
@@ -80,19 +85,17 @@ class Measure:
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, adaptive: bool = True, on_round: Watcher | None = None
     ) -> Falsified:
-        """Search the worlds of the scenario for those in which the agent is worst.
+        """Search the ranges of the scenario for the worlds in which the agent does worst.
 
-        Worlds without harm, regret or difference are not kept, so the result may be empty.
+        Except for the measure ``bound``, the result contains only worlds with a score above 0, and may be empty. Raises
+        the exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
 
         Args:
             budget: number of worlds to try.
             seed: seed of the search.
-            most: largest number of worst worlds to keep; they differ clearly from one another.
-            adaptive: whether to look around the worst worlds so far; False: worlds are drawn uniformly.
-            on_round: called with the number of worlds tried so far and ``budget``.
-
-        Raises ``InvalidInput`` if the scenario draws nothing, or if none of the tried worlds belongs to it, and the
-        exceptions of ``scenario.ranges``.
+            most: largest number of worlds in the result; any two of them differ clearly.
+            adaptive: whether to search around the worst worlds so far; False: all worlds are uniform random worlds.
+            on_round: function that is called with the number of worlds tried so far and ``budget``.
 
         """
         drawn = ranges(self.scenario)
@@ -110,8 +113,9 @@ class Measure:
             worst = worst[tried.scores[worst] > 0.0]
         if not np.isfinite(tried.scores).any():
             raise InvalidInput(
-                f"scenario {self.scenario.name!r}: none of {budget:,} worlds tried counts: all have an impact before"
-                " anybody may act, or the physics fails; give early_impacts: keep, or a larger --budget"
+                f"scenario {self.scenario.name!r}: all {budget:,} worlds tried are invalid: in each of them an impact"
+                " comes before any agent may act, or the physics fails; set early_impacts: keep in the scenario, or"
+                " give a larger --budget"
             )
         above = np.flatnonzero(tried.scores > 0.0)
         sample, shown_worlds = drawn.sample(tried.points[worst])[0], []
@@ -133,25 +137,29 @@ class Measure:
     def of(cls, name: str, agent: str, against: str | None, scenario: Scenario, harm_count: HarmCount) -> Measure:
         """Return the measure called ``name`` for an agent.
 
-        Args:
-            name: ``harm``, ``regret``, ``difference`` or ``bound``.
-            agent: spec of the agent.
-            against: spec of the agent to compare with; None: for ``regret`` the best profile that a search finds.
-            scenario: scenario whose learners they drive.
-            harm_count: impacts that harm counts.
+        Raises ``InvalidInput`` if ``name`` is unknown, or if ``against`` is missing or not allowed for the measure.
 
-        Raises ``InvalidInput`` if an agent to compare with is missing or not allowed.
+        Args:
+            name: name of the measure: ``harm``, ``regret``, ``difference`` or ``bound``.
+            agent: spec of the agent.
+            against: spec of the reference agent; None: ``best_harm`` for ``regret``, and none for ``harm`` and
+                ``bound``.
+            scenario: scenario whose learners the agents drive.
+            harm_count: harm count: the first impact of each pair (``first``) or all impacts (``total``).
 
         """
         chosen = next((each for each in MEASURES if each == name), None)
         if chosen is None:
             raise unknown_name("measure", name, MEASURES)
         if name in ("harm", "bound") and against is not None:
-            raise InvalidInput(f"--against {against}: --measure {name} compares with nobody; use regret or difference")
+            raise InvalidInput(
+                f"--against {against}: --measure {name} compares with no other agent; leave --against out, or use"
+                " --measure regret or difference"
+            )
         if name == "difference" and against is None:
-            raise InvalidInput("--measure difference: compares two agents; say which is the other one, --against AGENT")
+            raise InvalidInput("--measure difference compares two agents; give the second agent with --against AGENT")
         specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
         lineup = make_lineup(specs, scenario, harm_count=harm_count)
         if len(lineup) != len(specs):
-            raise InvalidInput(f"agent {' or '.join(specs)}: stands for several agents; one is needed here")
+            raise InvalidInput(f"agent {' or '.join(specs)}: the name means several agents; give one agent")
         return cls(chosen, lineup, scenario, harm_count)

@@ -214,7 +214,7 @@ def test_sweep__costs_runs_and_goes_on(
     assert again.status == 0 and "to do: 0 trainings, 0 decisions" in again.err
     assert json.loads(again.out)["levels"] == found["levels"]
     other = ethbrake(*line.replace("0,90", "0,45,90").split())
-    assert other.status == 2 and "holds an ablation with other settings (levels)" in other.err
+    assert other.status == 2 and "contains an ablation with other settings (levels)" in other.err
     (out / "settings.json").unlink()
     more = ethbrake(*line.replace("0,90", "0,45,90").split(), "--cost")
     told = json.loads(more.out)

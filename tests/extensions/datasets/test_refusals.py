@@ -31,10 +31,10 @@ NOBODY = PAPER.with_learners([])
 
 DATASETS: dict[str, Callable[[], object]] = {
     "write_dataset: episodes = 0: must be a whole number, at least 1": lambda: dataset(episodes=0),
-    "write_dataset: no agents given; at least one": lambda: dataset(agents={}),
-    "a.parquet: the format minari is written to a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
-    "a-v0: the format parquet is written to a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
-    "brakes: a dataset of Minari is a folder called NAME-vNUMBER": lambda: dataset("brakes"),
+    "write_dataset: there are no agents; give at least one": lambda: dataset(agents={}),
+    "a.parquet: a dataset in the format minari is a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
+    "a-v0: a dataset in the format parquet is a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
+    "brakes: the folder of a Minari dataset must be named NAME-vNUMBER": lambda: dataset("brakes"),
     "nowhere/a.parquet: there is no folder nowhere; make it first": lambda: dataset("nowhere/a.parquet"),
     "nowhere/a-v0: there is no folder nowhere; make it first": lambda: dataset("nowhere/a-v0"),
     "has no learner to record: scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
@@ -58,7 +58,7 @@ def test_dataset__replaces_nothing_unasked(name: str, make: Callable[[Path], Non
 
 def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
     Path("a-v0").mkdir()
-    with refused("a-v0: is no dataset of Minari, and is not replaced; give another name"):
+    with refused("a-v0: is not a Minari dataset, so force does not replace it; give another name"):
         dataset("a-v0", force=True)
     with refused("unknown format 'csv'; known: minari, parquet", UnknownName):
         dataset(format="csv")

@@ -94,7 +94,7 @@ def test_team__has_a_front_but_no_agents() -> None:
     worlds = pair.sample(2, 3).worlds
     found = search_front(pair, worlds, [[1, 1, 1], [1, 0, 0]], budget=200, harm_count="total")
     assert (found.borne["total"][1, :, 0] <= found.borne["total"][0, :, 0]).all()
-    with pytest.raises(InvalidInput, match="agents drive one"):
+    with pytest.raises(InvalidInput, match="agents can drive only one"):
         search_front(pair, worlds, [[1, 1, 1]], agents=["full_brake"])
 
 

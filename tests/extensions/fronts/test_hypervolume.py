@@ -36,7 +36,7 @@ def test_nondominated__equal_points_do_not_beat_each_other() -> None:
 
 
 def test_volume__of_many_vehicles_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="6 vehicles; it is computed for at most 5"):
+    with pytest.raises(InvalidInput, match="6 coordinates; give points with at most 5"):
         hypervolume(np.zeros((1, 6)), np.ones(6))
 
 
@@ -44,5 +44,5 @@ def test_volume__of_many_vehicles_is_refused() -> None:
     ("points", "reference"), [([[np.nan, 0.0]], [1.0, 1.0]), ([[0.0, 0.0]], [np.inf, 1.0]), ([[0.0]], [1.0, 1.0])]
 )
 def test_volume__of_what_is_not_finite_or_fits_not_is_refused(points: list, reference: list) -> None:
-    with pytest.raises(InvalidInput, match="must be finite numbers, as"):
+    with pytest.raises(InvalidInput, match="give finite numbers with the shapes"):
         hypervolume(np.array(points), np.array(reference))

@@ -35,22 +35,26 @@ def test_corners__put_one_vehicle_first() -> None:
     ],
 )
 def test_weights__that_are_none_are_refused_by_row(row: list[float]) -> None:
-    with pytest.raises(InvalidInput, match=r"weights\[1\] = .*: must be 3 numbers, one per vehicle, each 0 or from"):
+    with pytest.raises(
+        InvalidInput, match=r"weights\[1\] = .*: the weights must be 3 numbers, one per vehicle, each 0 or from"
+    ):
         checked_weights([[1.0, 0.0, 0.0], row], 3)
 
 
 @pytest.mark.parametrize("text", ["1,a,1", "1;1;1", "", "1,,1"])
 def test_text__that_is_no_list_of_numbers_is_refused(text: str) -> None:
-    with pytest.raises(InvalidInput, match="must be numbers with commas between them, as in 1,4,1"):
+    with pytest.raises(InvalidInput, match="must be numbers separated by commas, as in 1,4,1"):
         parsed_weights([text], 3)
 
 
 def test_weights__none_at_all_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="there are none"):
+    with pytest.raises(InvalidInput, match="there are no weights"):
         checked_weights([], 3)
 
 
 @pytest.mark.parametrize(("vehicles", "steps"), [(3, 50), (8, 50), (3, 1_000_000)])
 def test_grid__of_too_many_weights_is_refused_at_once(vehicles: int, steps: int) -> None:
-    with pytest.raises(InvalidInput, match=r"sets of weights of . vehicles; at most 1,000: take fewer steps"):
+    with pytest.raises(
+        InvalidInput, match=r"choices of weights for . vehicles, but at most 1,000 are allowed; give fewer steps"
+    ):
         weight_grid(vehicles, steps)

@@ -93,14 +93,14 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "vehicles = (): must be one or more vehicle indices from 0 to 2": lambda: best_harm(PAPER, WORLDS, vehicles=()),
     "budget = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=0),
     "threads = 0: must be a whole number, at least 1": lambda: best_harm(PAPER, WORLDS, budget=10, threads=0),
-    "counts (): must be first, total, or both": lambda: best_harm(PAPER, WORLDS, budget=10, counts=()),
+    "counts = (): the counts must be first, total, or both": lambda: best_harm(PAPER, WORLDS, budget=10, counts=()),
     "profiles: command -7.1 m/s2 is beyond a vehicle's capacity": lambda: problem().follow(
         problem().constant(np.array([[[-7.1]]]))
     ),
     "profiles: phases must end in order, and the last phase must end at the last step": lambda: problem().follow(
         Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1)))
     ),
-    "t.npz: there is no such table of best known harm": lambda: BestHarmTable.load(Path("t.npz")),
+    "t.npz: there is no such file": lambda: BestHarmTable.load(Path("t.npz")),
     "the braking profiles in these worlds differ from the profiles of the scripts; draw": lambda: best_harm(
         PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}), PAPER.sample(2, 7).worlds
     ),
@@ -125,7 +125,7 @@ def test_file__is_no_table(empty_folder: Path) -> None:
 
 def test_table__is_improved_by_a_harm_of_each_world() -> None:
     table = BestHarmTable.load(TABLES / "paper-random.npz")
-    with refused("improve: (3,) harms for (2,) worlds"):
+    with refused("harm has the shape (3,); give one harm for each of (2,) worlds"):
         table.improved(table.identity[:2], "first", np.zeros(3))
 
 

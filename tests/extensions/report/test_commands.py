@@ -59,7 +59,7 @@ def test_report__says_which_harm_the_shield_bounds(ethbrake: Command) -> None:
     )
     assert answer.status == 0, answer.err
     text = Path("r/report.html").read_text()
-    assert "minus episode mode" in text and "First-impact harm, which the shield bounds" in text
+    assert "minus episode mode" in text and "First-impact harm in m²/s²; the shield bounds this harm" in text
 
 
 def test_target__that_cannot_be_replaced_is_refused_before_any_work(
@@ -82,7 +82,10 @@ def test_film__of_an_extra_that_is_missing_says_the_line_that_installs_it(ethbra
 
 
 REFUSED = [
-    ("watch --agents nobody --output x.txt", "a film that ends in '.txt': films are written as .gif, .mp4, .svg")
+    (
+        "watch --agents nobody --output x.txt",
+        "film with the file ending '.txt': the ending must be one of .gif, .mp4, .svg",
+    )
 ]
 
 

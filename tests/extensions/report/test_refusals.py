@@ -31,15 +31,15 @@ def scene() -> Any:
 @pytest.mark.parametrize(
     ("films", "message"),
     [
-        (lambda scene: film_bytes({"a": scene}, ".gif", fps=30), "film_bytes: fps = 30: must divide 100"),
-        (lambda scene: film_bytes({}, ".gif"), "film_bytes: no films given"),
+        (lambda scene: film_bytes({"a": scene}, ".gif", fps=30), "film_bytes: fps = 30: fps must divide 100"),
+        (lambda scene: film_bytes({}, ".gif"), "film_bytes: there are no scenes; give at least one film"),
         (
             lambda scene: film_bytes({str(k): scene for k in range(13)}, ".gif"),
-            "film: 13 agents, one below the other; at most 12 are shown",
+            "film: 13 agents; a film can show at most 12 agents",
         ),
         (
             lambda scene: film_bytes({str(k): scene * 5000 for k in range(2)}, ".gif"),
-            "film of 2 agents for 200 s: needs 10,000 pictures, and at most 2,500 are kept",
+            "film of 2 agents for 200 s: the film has 10,000 pictures, but at most 2,500 fit",
         ),
     ],
     ids=["rate", "none", "too many", "too long"],
@@ -50,28 +50,24 @@ def test_film__is_refused(films: Callable[[Any], bytes], message: str, scene: An
 
 
 FIGURES: dict[str, Callable[[], object]] = {
-    "deceleration curve: 2 worlds given; exactly one is drawn": lambda: deceleration_curve(
+    "deceleration_curve: 2 worlds; give exactly one world": lambda: deceleration_curve(
         PAPER.sample(2, 7).worlds, Task(PAPER, (1,))
     ),
-    "deceleration curve: points = 1; at least 2 are needed": lambda: deceleration_curve(
+    "deceleration_curve: points = 1: the number of points must be at least 2": lambda: deceleration_curve(
         PAPER.sample(1, 7).worlds, Task(PAPER, (1,)), points=1
     ),
-    "curves of several seeds: the trainings were never evaluated at the same step": lambda: SeedCurve.of(
-        [{0: 1.0}, {1: 1.0}]
-    ),
-    "seed_curves: nothing to draw; at least one training with one evaluation is needed": lambda: seed_curves(
-        {"harm": {}}
-    ),
-    "harm_by_agent: no rows; evaluate at least one agent": lambda: harm_by_agent([]),
-    "learning_curve: no points; evaluate the policy at least once during training": lambda: learning_curve([]),
-    "harm_against_total_gap: bins = 0; at least 1 is needed": lambda: harm_against_total_gap(
+    "SeedCurve.of: no step is common to all trainings": lambda: SeedCurve.of([{0: 1.0}, {1: 1.0}]),
+    "seed_curves: a panel has no curves": lambda: seed_curves({"harm": {}}),
+    "harm_by_agent: there are no rows; give the summary of at least one agent": lambda: harm_by_agent([]),
+    "learning_curve: there are no points; give at least one evaluation": lambda: learning_curve([]),
+    "harm_against_total_gap: bins = 0: the number of bins must be at least 1": lambda: harm_against_total_gap(
         eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), bins=0
     ),
     "agent 'ppo' was not evaluated; evaluated agents: full_brake": lambda: harm_against_total_gap(
         eb.evaluate(PAPER.sample(2, 7), BRAKE, scenario=PAPER), agents=["ppo"]
     ),
-    "map.png.eps: pictures are written as PNG, SVG or PDF": lambda: picture_ending("map.png.eps"),
-    "trajectories: no records given": lambda: trajectories({}),
+    "map.png.eps: the name of a picture file must end in .png, .svg or .pdf": lambda: picture_ending("map.png.eps"),
+    "trajectories: there are no records": lambda: trajectories({}),
 }
 
 

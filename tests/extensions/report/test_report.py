@@ -165,8 +165,8 @@ def test_report__is_well_formed_and_says_everything(html: str, report: Report) -
     page = Page(html)
     told = [
         "paper-random: 200 worlds, seed 7; d = ", "Training seed 5 Command ethbrake run", "numpy 2.4.6",
-        "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "from the alert to rest.",
-        "constant:4.5 does ", "One million steps.", "of these worlds no command of Vehicle 2 avoids contact",
+        "Hybrid PPO 59.74 % 5.6202", "62.3 %", report.rows[0].worlds_sha256, "until all vehicles are at rest.",
+        "constant:4.5 does ", "One million steps.", "of the worlds, no command of Vehicle 2 avoids contact",
     ]  # fmt: skip
     for row in report.rows:
         for estimate in (row.first_impact_harm, row.total_harm):
@@ -202,12 +202,12 @@ def test_report__begins_with_what_the_agent_does_against_full_braking_and_where_
     after, before = (mine.evaluation.outcome(name).world_harm(harm_count) for name in ("ppo", "full_brake"))
     best, worse = regrets_of(mine.evaluation).best(harm_count).mean(), after > before + 1e-6
     words = "first impacts" if harm_count == "first" else "all impacts"
-    more = f"but more in {100 * worse.mean():.1f} % of these worlds, by {(after - before).max():.2f} at most"
+    more = f"but more in {100 * worse.mean():.1f} % of the worlds, by {(after - before).max():.2f} at most"
     assert worse.any() == (harm_count == "total")
     assert mine.first_sentence == (
         f"ppo does {100 * (1 - after.mean() / before.mean()):.0f} % less harm than full braking ({words}:"
         f" {after.mean():.2f} m²/s² per emergency instead of {before.mean():.2f}; best known {best:.2f}),"
-        f" {more if worse.any() else 'and in none of these worlds more'}."
+        f" {more if worse.any() else 'and in no world more'}."
     )
 
 
@@ -247,7 +247,7 @@ def test_report__flatters_nobody(paper_random: eb.Scenario, pair: eb.Scenario) -
     far = pair.replace(gaps_m={"uniform": [60.0, 70.0]})
     harmless = summed_up(far, "full_brake", "constant:5").first_sentence
     assert harmless.startswith("constant:5 does about as much harm as full braking (first impacts: 0.00 ")
-    assert harmless.endswith("), and in none of these worlds more.")
+    assert harmless.endswith("), and in no world more.")
     harmful = summed_up(far, "full_brake", "coast").first_sentence  # no share of nothing
     assert harmful.startswith("coast does more harm than full braking (first impacts: ")
 
@@ -293,7 +293,7 @@ def test_report__says_who_did_not_repeat_itself(pair: eb.Scenario, html: str) ->
 
     result = eb.evaluate(pair.sample(3, 0), {"fickle": Fickle()}, scenario=pair)
     text = Report("t", eb.summarise(result), result).driven({"fickle": Fickle()}).html
-    assert "fickle did not repeat itself in 3 worlds of these" in text and "did not repeat itself" not in html
+    assert "In 3 worlds of these, fickle drove differently" in text and "drove differently" not in html
 
 
 def test_chosen__begin_with_those_of_the_largest_regret_and_say_whose_harm_it_is(
@@ -413,7 +413,7 @@ def test_report__leaves_out_what_has_no_value_and_says_where_the_horizon_cut_epi
     )  # the paper's rows are of its own scenario
     assert [each for each in absent if each in text] == []
     moving = 2 - int(result.outcome("coast").at_rest.sum())
-    assert moving and f"to the horizon of 1 s: in {moving} worlds the line of some agent" in text
+    assert moving and f"the horizon of 1 s. In {moving} worlds, vehicles still moved" in text
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -439,8 +439,8 @@ def test_known_limits__are_the_proof_and_the_best_known() -> None:
 def test_known_limits__say_why_nothing_is_proven() -> None:
     coasts = load_scenario("cooperation-3-pair").replace(roles={"vehicle_1": "coast", "vehicle_2": "learner"})
     for task, why in (
-        (Task(SCENARIO, ()), "controlled are: none; avoidability is proven for one vehicle"),
-        (Task(coasts, (1, 2)), "vehicle_1 follows coast; harm is bounded where it follows full_brake"),
+        (Task(SCENARIO, ()), "the controlled vehicles are none; avoidability is proven for one controlled vehicle"),
+        (Task(coasts, (1, 2)), "vehicle_1 follows the script coast; harm is bounded where it follows full_brake"),
     ):
         assert known_limits(LISTED, task) == Unproven(why)
 
@@ -485,5 +485,5 @@ def test_evaluation__of_a_team_tells_the_proven_harm_where_contact_is_not_decide
         cells = next(csv.DictReader(lines))
     assert cells["avoidable"] == cells["unavoidable_reason"] == "" and float(cells["proven_harm"]) >= 0
     assert avoidable_section(found).title and worst_section(found, "coast", ()).title
-    with pytest.raises(InvalidInput, match="where contact can be avoided is not decided"):
+    with pytest.raises(InvalidInput, match="it is not proven in which worlds contact is avoidable"):
         harm_in_parts(found)

@@ -239,7 +239,7 @@ def test_distance__by_hand(four: Evaluation) -> None:
 
 
 def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Evaluation) -> None:
-    with pytest.warns(IncompleteTable, match=r"holds 2 of these 4 worlds, and not the other 1 \(25.0 %\)"):
+    with pytest.warns(IncompleteTable, match=r"contains 2 of the 4 worlds. The best known harm of 1 world \(25.0 %\)"):
         full, agent = (row.to_json() for row in summarise(four))
     assert "(25.0 %)" in agent["best_known_warning"] and agent["best_known_warning"] == full["best_known_warning"]
     assert agent["known_best_share"] == full["known_best_share"] == 0.75
@@ -248,10 +248,10 @@ def test_distance__a_best_that_is_not_known_everywhere_realises_nothing(four: Ev
     assert full["mean_regret"] == (10.0 + 8.0 + 7.0 + 4.0) / 4.0
     assert (full["below_best_known"], agent["below_best_known"]) == (0, 1)
     table = summarise(four).markdown()
-    assert "WARNING: the table of best known harm holds 2 of these 4 worlds" in table and "≥ 0.75" in table
+    assert "WARNING: the table of best known harm contains 2 of the 4 worlds" in table and "≥ 0.75" in table
     assert (
-        "Found beforehand in 75.0 % of the worlds" in table
-        and "Less harm than the best known before: a in 1 world." in table
+        "The best known harm of 75.0 % of the worlds comes from an earlier search" in table
+        and "Less harm than the earlier best known harm: a in 1 world." in table
     )
 
 
@@ -276,11 +276,11 @@ LINE = load_scenario("paper-random")
     ("scenario", "vehicle", "reason"),
     [
         (LINE.replace(roles={"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "full_brake"}), 1,
-         "vehicle_1 follows coast"),
-        (LINE.with_learners([2]), 2, "vehicle_3 is controlled"),
+         "vehicle_1 follows the script coast"),
+        (LINE.with_learners([2]), 2, "the controlled vehicle is vehicle_3"),
         (LINE.replace(latency_s=[0.6, 0.5, 0.8]), 1, "vehicle_1 may brake later than vehicle_2"),
         (load_scenario("paper-random-obstacle").replace(obstacle_gap_m=30.0), 1,
-         "vehicle_1 reaches the obstacle ahead by itself; nothing is proven then"),
+         "vehicle_1 reaches the obstacle although it brakes; avoidability is proven where it stops in time"),
         (LINE, 1, None),
     ],
 )  # fmt: skip
@@ -300,7 +300,7 @@ def test_limits__an_obstacle_out_of_vehicle_1_s_own_reach_leaves_avoidability_an
     assert all(row[name] == other[name] > 0.0 for name in ("unavoidable_rate", "impact_proven_rate"))
     assert 0.0 < row["proven_harm"] <= row["best_known_first_impact_harm"] <= row["best_known_total_harm"]
     assert row["mean_regret"] is not None and row["parameters"]["no_limits_because"] is None
-    assert f"proven: no less than {row['proven_harm']:.2f}" in summarise(results[0]).markdown()
+    assert f"Proven lower bound: {row['proven_harm']:.2f}" in summarise(results[0]).markdown()
     columns = columns_of(results[0], tmp_path)
     proven, best = (np.array(columns[name], float) for name in ("proven_harm", "best_known_first_impact_harm"))
     assert proven.mean() == pytest.approx(row["proven_harm"]) and (proven <= best + 1e-9).all()
@@ -311,7 +311,7 @@ def test_limits__of_another_line_up_are_null_with_the_reason(pair: Scenario, tmp
     result = evaluate(pair.sample(2, 0), BRAKE, scenario=pair)
     row = summarise(result)[0].to_json()
     assert {row[name] for name in NULLS} == {None} and row["mean_regret_interval"] is None
-    assert row["parameters"]["no_limits_because"] == "2 vehicles; avoidability is proven for 3"
+    assert row["parameters"]["no_limits_because"] == "the line has 2 vehicles; avoidability is proven for 3 vehicles"
     columns = columns_of(result, tmp_path)
     assert columns["avoidable"] == columns["regret_total_harm"] == columns["best_known_source"] == ["", ""]
     assert regrets_of(result) is None and "proven" not in summarise(result).markdown()
@@ -446,7 +446,9 @@ def test_figures__of_a_list_that_is_not_held_are_those_of_evaluate_that_need_no_
             told[name] for name in told if name not in proven
         ]
         assert {**one.parameters, "no_limits_because": None} == other.parameters
-        assert one.parameters["no_limits_because"] == "a list of more than 100,000 worlds is driven without proofs"
+        assert (
+            one.parameters["no_limits_because"] == "proofs and regrets are computed for lists of at most 100,000 worlds"
+        )
 
 
 # ---------------------------------------------------------------- what the limits add to summaries and files

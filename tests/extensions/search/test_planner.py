@@ -118,7 +118,7 @@ def test_refine__is_a_function_of_the_world_and_the_seed(monkeypatch):
         arguments[-1][4] = True
 
     monkeypatch.setattr(refine_module, "_refine_worlds", fail)
-    with pytest.raises(PhysicsError, match="world 4: its commands could not be played"):
+    with pytest.raises(PhysicsError, match="world 4: the given commands cannot be simulated"):
         refine(problem, given, budget=5)
 
 

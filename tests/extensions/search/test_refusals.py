@@ -30,14 +30,20 @@ REFUSED: dict[str, Callable[[], object]] = {
     "agent 'planner+step+episode': must have at most one +search, then at most one shield (+episode": lambda: (
         make_agent("planner+step+episode", scenario=PAPER)
     ),
-    "agent 'planner:0': the argument must be a number of candidates per decision": lambda: make_agent("planner:0"),
-    "agent 'planner:1.5': the argument must be a number of candidates per decision": lambda: make_agent("planner:1.5"),
-    "best_harm: budget = 0; at least 1 candidate is needed": lambda: make_agent("best_harm", most_candidates=0),
+    "agent 'planner:0': the text after the colon must be a number of candidates per decision": lambda: make_agent(
+        "planner:0"
+    ),
+    "agent 'planner:1.5': the text after the colon must be a number of candidates per decision": lambda: make_agent(
+        "planner:1.5"
+    ),
+    "best_harm: budget = 0: the number of candidates must be at least 1": lambda: make_agent(
+        "best_harm", most_candidates=0
+    ),
     "search: candidates = 0: must be a whole number in 1..1000000": lambda: Searched(BRAKE, PAPER, candidates=0),
-    "refine: commands of shape (3, 75); (12, 75) of one vehicle are needed": lambda: refine(
+    "commands of shape (3, 75): give one vehicle and commands of shape (12, 75)": lambda: refine(
         problem(1), np.zeros((3, 75)), budget=5
     ),
-    "refine: a command is beyond the vehicle's capacity": lambda: refine(
+    "refine: a command exceeds the capacity of the vehicle": lambda: refine(
         problem(1), np.full((12, problem(1).last_step.max()), -50.0), budget=5
     ),
     "budget = 0: must be a whole number, at least 1": lambda: refine(
@@ -46,7 +52,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     "templates = 0: must be a whole number, at least 1": lambda: best_templates(
         problem(1), np.full(12, np.inf), number=0
     ),
-    "templates: 2 vehicles; they are of one": lambda: best_templates(problem(1, 2), np.full(12, np.inf), number=40),
+    "templates: 2 controlled vehicles; give a problem with one": lambda: best_templates(
+        problem(1, 2), np.full(12, np.inf), number=40
+    ),
 }
 
 

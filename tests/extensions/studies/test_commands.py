@@ -27,7 +27,7 @@ def test_again__runs_no_code_that_only_a_file_names(ethbrake: Command) -> None:
     whole = Path("worst.yaml").read_text()
     for line in ("agent: coast\n", "against: full_brake\n"):
         Path("worst.yaml").write_text(whole.replace(line, f'{line.partition(" ")[0]} "mine.py:make"\n'))
-        check_refused(ethbrake("study", "falsify", "--again", "worst.yaml"), "is code")
+        check_refused(ethbrake("study", "falsify", "--again", "worst.yaml"), "is not run")
     assert not Path("ran").exists()
 
 
@@ -53,16 +53,16 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent coast --budget 10 --measure bound",
-        "agent 'coast': tells no bound; --measure bound is for an agent behind a shield",
+        "agent 'coast': has no shield, but --measure bound compares the harm with the",
     ),
     (
         "study falsify --agent coast --budget 10 --measure difference",
-        "--measure difference: compares two agents; say which is the other one, --against AGENT",
+        "--measure difference compares two agents; give the second agent with --against AGENT",
     ),
     ("study falsify --agent coast --against coast --budget 10", "agent 'coast' is listed twice; list each agent once"),
     (
         "study falsify --agent full_brake --measure harm --against coast --budget 10",
-        "--against coast: --measure harm compares with nobody; use regret or difference",
+        "--against coast: --measure harm compares with no other agent; leave --against out",
     ),
     ("study falsify --agent coast --budget 10 --measure hram", "unknown measure 'hram'; did you mean 'harm'?"),
     (
@@ -83,7 +83,7 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent ladder --measure harm --budget 8",
-        "agent ladder: stands for several agents; one is needed here",
+        "agent ladder: the name means several agents; give one agent",
     ),
     ("study sweep nowhere.yaml --output new", "nowhere.yaml: no such file"),
 ]
@@ -100,12 +100,16 @@ def test_study__is_refused(line: str, message: str, refuse: Refuse) -> None:
         (
             "scenario: paper-random",
             "scenario: paper-distance",
-            "its worlds were found in scenario 'paper-distance', which",
+            "the worlds were found in scenario 'paper-distance', whose content differs",
         ),
         ("harm_count: first", "harm_count: second", "worst.yaml, line 8: harm_count = second: must be first or total"),
         ("    score: 120", "    skore: 120", "worst.yaml, line 12: worlds[0].skore: unknown key; did you mean score?"),
-        ("name: regret-2", "name: regret-1", "worst.yaml: world 'regret-1' is given twice; names must differ"),
-        ("{gap_1_m: 9.9251", "{gap_3_m: 9.9251", "worlds[1].state has other columns than worlds[0]; all need the same"),
+        (
+            "name: regret-2",
+            "name: regret-1",
+            "worst.yaml: two worlds have the name 'regret-1'; give each world a different name",
+        ),
+        ("{gap_1_m: 9.9251", "{gap_3_m: 9.9251", "worlds[1].state and worlds[0].state have different keys"),
         ("version: 1", "version: 2", "worst.yaml, line 2: version = 2: must be less than or equal to 1"),
     ],
 )
@@ -135,7 +139,11 @@ TUNING = "scenario: paper-random\nrecipe: ppo\nsearch: {%s: {low: 1, high: 4}}\n
         (SWEEP % "ppo", "sweep --retries -1", "Invalid value for '--retries': must be greater than or equal to 0"),
         (TUNING % "n_epoch", "tune", "plan.yaml, line 3: unknown setting 'n_epoch'; did you mean 'n_epochs'?"),
         (TUNING % "n_epochs", "tune --trials 0", "Invalid value for '--trials': must be greater than or equal to 1"),
-        (TUNING % "n_epochs", "tune --export best.txt", "export best.txt: must end in .yaml, as recipes do"),
+        (
+            TUNING % "n_epochs",
+            "tune --export best.txt",
+            "--export best.txt: the file name of a recipe must end in .yaml",
+        ),
         (TUNING % "n_epochs", "tune --export 'Best One.yaml'", "recipe name 'Best One': must be 1 to 64 lower case"),
         (TUNING % "n_epochs", "tune --export plan.yaml", "plan.yaml: is there already; give another name or use force"),
     ],

@@ -40,7 +40,7 @@ def test_folder__of_something_else_is_refused_and_what_may_stand_there_may(tmp_p
     (tmp_path / "mine").touch()
     assert folder_of(tmp_path).check()
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(AlreadyExists, match="is there already, and holds no sums; give another folder"):
+    with pytest.raises(AlreadyExists, match="the folder exists, and is not the folder of sums; give another folder"):
         begun(tmp_path)
     with pytest.raises(InvalidInput, match=r"thesis.tex: .*thesis.tex is no folder; give a folder of its own"):
         begun(tmp_path / "thesis.tex")
@@ -49,13 +49,13 @@ def test_folder__of_something_else_is_refused_and_what_may_stand_there_may(tmp_p
 def test_folder__of_another_question_is_refused_with_what_differs(tmp_path: Path) -> None:
     begun(tmp_path / "new")
     other = folder_of(tmp_path / "new", "you", seed=2, levels=[1], versions={"numpy": "2", "torch": "3"})
-    with pytest.raises(
-        InvalidInput, match=r"other settings \(seed 1, here 2; levels; versions torch 2, here 3\); give"
-    ):
+    with pytest.raises(InvalidInput, match=r"other settings \(seed 1, now 2; levels; versions torch 2, now 3\); give"):
         other.check()
     assert not folder_of(tmp_path / "new", "you").check()  # the record of the first one stays
     assert '"owner": "me"' in (tmp_path / "new" / "question.json").read_text()
-    with pytest.raises(AlreadyExists, match=r"is no folder of curves: question.json of another command is there"):
+    with pytest.raises(
+        AlreadyExists, match=r"is not the folder of curves: it contains question.json of another command"
+    ):
         StudyFolder(tmp_path / "new", "curves").check()
 
 
@@ -159,13 +159,13 @@ def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 STUDIES: dict[str, Callable[[Callable[[str], Any]], Study]] = {
     "reproduction": lambda get: Study(
-        REPRODUCE, get("reproduced"), (*REPRODUCE, "--episodes", "50"), "(episodes 20, here 50)", "reproduction.json"
+        REPRODUCE, get("reproduced"), (*REPRODUCE, "--episodes", "50"), "(episodes 20, now 50)", "reproduction.json"
     ),
     "ablation": lambda get: Study(
         ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE),
         get("finished_ablation"),
         ("study", "ablate", "--recipes", get("tiny_total"), *ABLATE, "--search-episodes", "3", "--seeds", "3"),
-        "(seeds 2, here 3; search-episodes 4, here 3)",
+        "(seeds 2, now 3; search-episodes 4, now 3)",
         "settings.json",
     ),
 }
@@ -205,7 +205,7 @@ def test_other_settings__are_refused_with_what_differs(study: Study, told) -> No
 def test_second_process__is_refused(study: Study, told, tmp_path: Path) -> None:
     shutil.copytree(study.folder, tmp_path / "copy")
     with FileLock(tmp_path / "copy" / ".lock"):
-        assert "another process works in it" in told(tmp_path / "copy", *study.line)
+        assert "another process works in this folder" in told(tmp_path / "copy", *study.line)
 
 
 def test_damaged_record__is_named(study: Study, told, tmp_path: Path) -> None:
@@ -228,7 +228,7 @@ LAST = "trainings/cooperation-3-congested-tiny-shared-seed1"
             ('"total_steps": 256', '"total_steps": 512'),
             "this folder contains another training, which differs in recipe total_steps; choose another folder",
         ),
-        (f"{LAST}/run.json", None, "is no training"),
+        (f"{LAST}/run.json", None, "is not the folder of a training"),
         (f"{LAST}/team.json", ('"scheme"', '"shceme"'), "team.json"),
         (f"{LAST}/policy/manifest.json", ("{", "{}"), "manifest.json"),
     ],

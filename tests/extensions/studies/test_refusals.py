@@ -42,7 +42,7 @@ def plan(text: str = "", **changes: object) -> TuningPlan:
 
 TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 3: search = {}: must not be empty": lambda: plan(search={}),
-    "t.yaml: search: missing; it is needed; docs/extensions/studies.md shows an example": lambda: plan(
+    "t.yaml: search: missing; this key is required; docs/extensions/studies.md shows an example": lambda: plan(
         "scenario: paper-random\nrecipe: ppo\n"
     ),
     "t.yaml, line 4: search, at learning_rate.strat=0.0001: recipe 'ppo': learning_rate.strat: unknown": lambda: plan(
@@ -52,14 +52,14 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 4: search.n_epochs = {high: 4, low: 4}: low 4 must be less than high 4": lambda: plan(
         search={"n_epochs": {"low": 4, "high": 4}}
     ),
-    "low 0 must be greater than 0, for its logarithm is searched": lambda: plan(
+    "low 0 must be greater than 0, because log is true": lambda: plan(
         search={"gamma": {"low": 0, "high": 1, "log": True}}
     ),
     "t.yaml, line 5: search.gamma.high = .nan: must be a finite number": lambda: plan(
         search={"gamma": {"low": 0.5, "high": float("nan")}}
     ),
-    "t.yaml, line 4: search.gamma.high: missing; it is needed; docs/extensions/studies.md shows an example": lambda: (
-        plan(search={"gamma": {"low": 0.5}})
+    "t.yaml, line 4: search.gamma.high: missing; this key is required; docs/extensions/studies.md": lambda: plan(
+        search={"gamma": {"low": 0.5}}
     ),
     "t.yaml, line 7: search.gamma.steps: unknown key": lambda: plan(
         search={"gamma": {"low": 0.5, "high": 0.9, "steps": 3}}
@@ -68,41 +68,43 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 5: search.gamma.choices = [0.9]: must have at least 2 entries": lambda: plan(
         search={"gamma": {"choices": [0.9]}}
     ),
-    "t.yaml, line 4: search.gamma = {choices: [0.9, 0.9]}: 0.9 stands there twice": lambda: plan(
+    "t.yaml, line 4: search.gamma = {choices: [0.9, 0.9]}: the value 0.9 is listed twice": lambda: plan(
         search={"gamma": {"choices": [0.9, 0.9]}}
     ),
     "t.yaml, line 4: search, at network.policy=[0]: recipe 'ppo': network.policy[0] = 0: must be greater": lambda: plan(
         search={"network.policy": {"choices": [[8], [0]]}}
     ),
-    "t.yaml, line 4: search.seed: is not searched: a seed is luck; give one for all trials, as seed": lambda: plan(
-        search={"seed": {"low": 0, "high": 9}}
+    "t.yaml, line 4: search.seed: this key cannot be searched: a good seed is luck; give one seed for all": lambda: (
+        plan(search={"seed": {"low": 0, "high": 9}})
     ),
-    "t.yaml, line 4: search.evaluation.seed: is not searched: trials are judged on one list": lambda: plan(
+    "t.yaml, line 4: search.evaluation.seed: this key cannot be searched: all trials are evaluated on": lambda: plan(
         search={"evaluation.seed": {"low": 0, "high": 9}}
     ),
-    "t.yaml, line 4: search.total_steps: is not searched: every trial gets the same number of decisions": lambda: plan(
+    "t.yaml, line 4: search.total_steps: this key cannot be searched: all trials have the same number": lambda: plan(
         search={"total_steps": {"low": 100, "high": 900}}
     ),
-    "t.yaml, line 4: search.reward.harm_count: is not searched: it says which harm is least; give it": lambda: plan(
+    "t.yaml, line 4: search.reward.harm_count: this key cannot be searched: it defines the harm that": lambda: plan(
         search={"reward.harm_count": {"choices": ["first", "total"]}}
     ),
-    "t.yaml, line 4: search.algorithm: is not searched: each algorithm has a recipe of its own": lambda: plan(
+    "t.yaml, line 4: search.algorithm: this key cannot be searched: a recipe has the keys of one": lambda: plan(
         search={"algorithm": {"choices": ["ppo", "sac"]}}
     ),
-    "t.yaml, line 4: search.mass_t: is the scenario's; a search changes the recipe, so": lambda: plan(
+    "t.yaml, line 4: search.mass_t: is a key of the scenario; give a key of the recipe": lambda: plan(
         search={"mass_t": {"low": 1, "high": 2}}
     ),
-    "t.yaml, line 4: search.gamma: gamma stands there too; leave one of them out": lambda: plan(
+    "t.yaml, line 4: search.gamma: the file also sets gamma; delete one of the two keys": lambda: plan(
         search={"gamma": {"low": 0.5, "high": 0.9}}, set={"gamma": 0.9}
     ),
-    "t.yaml, line 8: search.learning_rate.start: learning_rate stands there too; leave one of them out": lambda: plan(
+    "t.yaml, line 8: search.learning_rate.start: the file also sets learning_rate; delete one of": lambda: plan(
         search={"learning_rate.start": RATE, "learning_rate": {"choices": [1, 2]}}
     ),
     "search, at offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824: recipe 'quick'": lambda: plan(
         recipe="quick",
         search={"offset.smallest": {"low": 0.01, "high": 0.2}, "offset.largest": {"low": 0.1, "high": 0.5}},
     ),
-    "t.yaml, line 9: set.evaluation.worlds: is no setting here; give seed": lambda: plan(set={"evaluation.worlds": 3}),
+    "t.yaml, line 9: set.evaluation.worlds: this key is not allowed under set": lambda: plan(
+        set={"evaluation.worlds": 3}
+    ),
     "t.yaml, line 8: seed = -1: must be greater than or equal to 0": lambda: plan(seed=-1),
     "t.yaml, line 2: measure.world: unknown key; did you mean worlds?": lambda: plan(measure={"world": 10}),
     "t.yaml, line 2: prune.after_trials = -1: must be greater than or equal": lambda: plan(prune={"after_trials": -1}),
@@ -113,7 +115,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 6: recipe 'ppo': vf_coef = -0.5: must be greater than or equal to 0": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "vf_coef: -0.5", 1)
     ),
-    "t.yaml, line 6: set.seed: is no setting here; give seed and measure beside it": lambda: plan(
+    "t.yaml, line 6: set.seed: this key is not allowed under set; use the top-level keys": lambda: plan(
         WRITTEN.replace("vf_coef: 0.5", "seed: 3", 1)
     ),
 }
@@ -170,7 +172,7 @@ def sweep(content: Any) -> SweepPlan:
 
 
 SWEEPS: dict[str, Callable[[], object]] = {
-    "s.yaml: asks for 0 jobs; must be from 1 to 10,000": lambda: sweep({}),
+    "s.yaml: requests 0 jobs; the number of jobs must be from 1 to 10,000": lambda: sweep({}),
     "s.yaml, line 4: grid.seed = []: must not be empty": lambda: sweep({"grid": {**GRID, "seed": []}}),
     "must be a whole number, written without a decimal point": lambda: sweep({"grid": {**GRID, "seed": ["one"]}}),
     "s.yaml, line 5: grid.seed.cont: unknown key; did you mean count?": lambda: sweep(
@@ -180,10 +182,10 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "s.yaml, line 5: grid.seed.count = 20000: must be less than or equal to 10000": lambda: sweep(
         {"grid": {**GRID, "seed": {"count": 20_000}}}
     ),
-    "s.yaml: asks for 10,001 jobs; must be from 1 to 10,000": lambda: sweep(
+    "s.yaml: requests 10,001 jobs; the number of jobs must be from 1 to 10,000": lambda: sweep(
         {"grid": {**GRID, "seed": {"count": 10_000}}, "jobs": [GRID]}
     ),
-    "s.yaml, line 1: grid.scenario: missing; it is needed; docs/extensions/studies.md shows an example": lambda: sweep(
+    "s.yaml, line 1: grid.scenario: missing; this key is required; docs/extensions/studies.md": lambda: sweep(
         {"grid": {"recipe": "ppo"}}
     ),
     "s.yaml, line 4: grid.sede: unknown key; did you mean seed?": lambda: sweep({"grid": {**GRID, "sede": [1]}}),
@@ -191,8 +193,10 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: sweep(
         {"set": {"reward.terminl": 1}, "jobs": [GRID]}
     ),
-    "seed is no setting here; give it beside recipe, as seed": lambda: sweep({"set": {"seed": 3}, "jobs": [GRID]}),
-    's.yaml, line 4: set = {"gamma=0.9, x": 3}: "gamma=0.9, x": a key has no = in it': lambda: sweep(
+    "the seed is not given under set; give the key seed next to recipe": lambda: sweep(
+        {"set": {"seed": 3}, "jobs": [GRID]}
+    ),
+    's.yaml, line 4: set = {"gamma=0.9, x": 3}: "gamma=0.9, x": a key must not contain': lambda: sweep(
         {"set": {"gamma=0.9, x": 3}, "jobs": [GRID]}
     ),
     "s.yaml, line 5: jobs[0] (paper-random, ppo, seed 0, =3): --set '=3': must be KEY=VALUE": lambda: sweep(
@@ -220,7 +224,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
         "grid: {scenario: paper-random, recipe: ppo, recipe: sac}\n"
     ),
     "s.yaml: must be a mapping with a grid or a list of jobs": lambda: sweep("- one\n"),
-    "s.yaml, line 10: grid.set.vf_coef: stands in the file's own set too; leave one of them out": lambda: sweep(
+    "s.yaml, line 10: grid.set.vf_coef: the key vf_coef is also in the top-level set": lambda: sweep(
         SWEPT.replace("gamma", "vf_coef", 1)
     ),
 }
@@ -299,16 +303,16 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "scenario 'paper-scenario-1': draws nothing: all its worlds are the same": lambda: ranges(
         load_scenario("paper-scenario-1")
     ),
-    "--against coast: --measure harm compares with nobody; use regret or difference": lambda: Measure.of(
+    "--against coast: --measure harm compares with no other agent; leave --against out": lambda: Measure.of(
         "harm", "full_brake", "coast", PAPER, "first"
     ),
-    "--measure difference: compares two agents; say which is the other one, --against AGENT": lambda: Measure.of(
+    "--measure difference compares two agents; give the second agent with --against AGENT": lambda: Measure.of(
         "difference", "full_brake", None, PAPER, "first"
     ),
     "agent 'full_brake' is listed twice; list each agent once": lambda: Measure.of(
         "regret", "full_brake", "full_brake", PAPER, "first"
     ),
-    "agent 'full_brake': tells no bound; --measure bound is for an agent behind a shield": lambda: Measure.of(
+    "agent 'full_brake': has no shield, but --measure bound compares the harm with the": lambda: Measure.of(
         "bound", "full_brake", None, PAPER, "first"
     ).falsify(10, 0),
     "search: budget = 0: must be a whole number, at least 1": lambda: search(lambda points: points[:, 0], 2, 0, 0),

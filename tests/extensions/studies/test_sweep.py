@@ -104,9 +104,9 @@ def test_finished_jobs__are_not_repeated_and_the_table_is_the_same(again, capsys
     written = {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*/policy/manifest.json")}
     gone, lost, *_ = sorted((folder / "runs").iterdir())
     for damage, told in (
-        ((folder / TABLE).unlink, "4 jobs finished already"),
-        (partial(shutil.rmtree, gone), "3 jobs finished already"),
-        ((lost / "policy" / "weights.safetensors").unlink, "3 jobs finished already"),
+        ((folder / TABLE).unlink, "4 jobs finished in an earlier run"),
+        (partial(shutil.rmtree, gone), "3 jobs finished in an earlier run"),
+        ((lost / "policy" / "weights.safetensors").unlink, "3 jobs finished in an earlier run"),
     ):
         damage()
         assert sweep(file, folder) == 0 and told in capsys.readouterr().err
@@ -122,7 +122,7 @@ def test_table__of_a_run_that_is_damaged_is_named(again, capsys, damage: bytes) 
     damaged.write_bytes(damage)
     assert sweep(file, folder) == 2
     (told,) = capsys.readouterr().err.splitlines()
-    assert f"{damaged}: is damaged (" in told and told.endswith("; delete its folder to train anew")
+    assert f"{damaged}: is damaged (" in told and told.endswith("; delete its folder to train again")
 
 
 def test_run__of_another_training_is_not_done(again, capsys) -> None:
@@ -368,7 +368,7 @@ def test_dry_run__tells_how_many_trials_of_what_and_a_command_that_trains_the_fi
     assert tune(file, finished_tuning, "--trials", "7", "--dry-run") == 0
     head, *_, last = capsys.readouterr().out.splitlines()
     assert head == (
-        f"7 trials ({TRIALS} begun before): recipe {recipe} in scenario paper-random,"
+        f"7 trials ({TRIALS} of them begun): recipe {recipe} in scenario paper-random;"
         " 512 decisions each unless it is pruned"
     )
     assert last.startswith(f"the first: ethbrake train --scenario paper-random --recipe {recipe} --seed 0 --set ")
@@ -447,7 +447,7 @@ def test_trial__that_diverges_is_failed_with_its_reason_and_the_others_go_on(wri
     assert len(list((tmp_path / "out" / "trials").iterdir())) == 2  # the same is not trained twice
     nothing, export = write_tuning(search={"reward.harm": {"low": 1e299, "high": 1e300}}), tmp_path / "best.yaml"
     assert tune(nothing, tmp_path / "none", "--trials", "1", "--export", str(export)) == 1
-    assert "the recipe's own values are not in the space" in capsys.readouterr().err and not export.exists()
+    assert "no trial has the recipe's own values" in capsys.readouterr().err and not export.exists()
 
 
 def test_same_command__exports_again_over_its_own_recipe_alone(finished_tuning, tmp_path, capsys) -> None:
