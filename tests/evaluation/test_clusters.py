@@ -288,7 +288,7 @@ def test_command__says_how_many_recordings_and_how_many_draws_were_refused(
     assert run_command(["scenario", "explain", "recorded.yaml"]) == 0
     told = in_one_line(capsys.readouterr().out)
     assert f"is rejected and drawn again: {share}." in told
-    assert "one of 5 rows of a table of 5 recordings, by which intervals are: gap_1_m" in told
+    assert "one of the 5 rows of a table" in told and "The rows come from 5 recordings; confidence intervals" in told
     assert run_command(["scenario", "validate", "recorded.yaml"]) == 0
     told = in_one_line(capsys.readouterr().out)
     assert f"early impacts: {share} refused" in told and "recording: 4 different" in told
