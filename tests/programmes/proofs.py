@@ -207,7 +207,7 @@ def prove(end: Ended, statement: Any, what: str, *assumed: Any) -> None:
     "a pair's contact: found where its gap closes, never earlier, never missed; the closing speed there is the root"
 )
 def contact() -> int:
-    """``events.contact`` against ``events.drift``, the gap as a function of time."""
+    """``motion.contact`` against ``motion.drift``, the gap as a function of time."""
     gap, closing, pressing, when = symbols("gap closing pressing when")
     found = list(_run(motion, lambda: motion.contact(gap, closing, pressing), [exact(gap) >= 0]))
     after = exact(motion.drift(gap, closing, pressing, when))
@@ -227,7 +227,7 @@ def contact() -> int:
 
 @states("a vehicle that brakes stands after v tau + v^2 / (2 a), and never drives backwards")
 def stopping() -> int:
-    """``events.solo_motion`` against ``events.stopping_distance``."""
+    """``motion.solo_motion`` against ``motion.stopping_distance``."""
     speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
     known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
     found = list(_run(motion, lambda: motion.solo_motion(speed, -capacity, latency, limit, time), known))
@@ -314,7 +314,7 @@ def plastic() -> int:
 
 @states("a free body's acceleration is the nearest to zero that its forces allow")
 def settling() -> int:
-    """``events.settle`` on any range of forces."""
+    """``motion.settle`` on any range of forces."""
     low, high, other = symbols("low high other")
     found = list(_run(motion, lambda: motion.settle(low, high), [exact(low) <= exact(high)]))
     for end in found:
