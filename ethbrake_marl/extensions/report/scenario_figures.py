@@ -1,4 +1,4 @@
-"""Figure of the worlds of a scenario: distributions of quantities such as gaps, scatter plots, and three worlds to scale."""
+"""Figure of the worlds of a scenario: distributions and scatter plots of quantities, and three worlds to scale."""
 
 from __future__ import annotations
 
