@@ -64,7 +64,7 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
         write_file(path / SETTINGS, json_text({**FORMAT, **question}))
     advice = "give another folder (--output), or replace its results (--force)"
     return StudyFolder(
-        path, "reproduction", question, record=SETTINGS, more=FORMAT, advice=advice, beside=("trainings",),
+        path, "a reproduction", question, record=SETTINGS, more=FORMAT, advice=advice, beside=("trainings",),
         writes=("index.html",),
     )  # fmt: skip
 

@@ -261,7 +261,7 @@ def falsify_command(
             return
         agent, measure, scenario = agent or "universal", measure or "regret", scenario or "paper-random"
         budget, seed, keep = 4000 if budget is None else budget, seed or 0, keep or 20
-        out.check(output, ".yaml", ".yml", what="a file of worlds")
+        out.check(output, ".yaml", ".yml", what="worlds")
         task = read_task(scenario, settings)
         chosen = task.scenario
         measured_by = Measure.of(measure, agent, against, chosen, task.harm_count)

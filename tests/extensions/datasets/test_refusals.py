@@ -32,8 +32,10 @@ NOBODY = PAPER.with_learners([])
 DATASETS: dict[str, Callable[[], object]] = {
     "write_dataset: episodes = 0: must be a whole number, at least 1": lambda: dataset(episodes=0),
     "write_dataset: there are no agents; give at least one": lambda: dataset(agents={}),
-    "a.parquet: a dataset in the format minari is a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
-    "a-v0: a dataset in the format parquet is a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
+    "a.parquet: a dataset in the format minari must be a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
+    "a-v0: a dataset in the format parquet must be a file ending in .parquet": lambda: dataset(
+        "a-v0", format="parquet"
+    ),
     "brakes: the folder of a Minari dataset must be named NAME-vNUMBER": lambda: dataset("brakes"),
     "nowhere/a.parquet: the folder nowhere does not exist; create it first": lambda: dataset("nowhere/a.parquet"),
     "nowhere/a-v0: the folder nowhere does not exist; create it first": lambda: dataset("nowhere/a-v0"),

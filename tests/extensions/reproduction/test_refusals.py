@@ -87,7 +87,9 @@ def test_figure__that_is_more_than_lines_is_not_shown(
         draw_nothing(patch)
         results = reproduced(drawn(), {})
     Path("out/gaps/a-figure.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{svg}</svg>')
-    with refused("out/gaps/a-figure.svg: is not a figure as it was drawn; make it again (--force)"):
+    with refused(
+        "out/gaps/a-figure.svg: the file is not an SVG figure as this package writes it; draw the figure again (--force)"
+    ):
         render_page(Path("out"), results)
 
 
@@ -110,7 +112,7 @@ def test_reproduction__is_written_to_a_folder_of_its_own(empty_folder: Path) -> 
     with refused("link: this is a symbolic link; give the path of a folder (--output)"):
         open_folder(Reproduction("quick", Path("link"), 24))
     Path("mine/thesis.txt").write_text("years of work")
-    with refused("mine: is there already, and holds no reproduction; give another folder", AlreadyExists):
+    with refused("mine: the folder exists, but does not contain a reproduction; give another folder", AlreadyExists):
         open_folder(Reproduction("quick", Path("mine"), 24), force=True).check()
     assert Path("mine/thesis.txt").read_text() == "years of work"
     with refused("page.html: the name of the file must end in .json"):

@@ -45,8 +45,8 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml: search: missing; this key is required; docs/extensions/studies.md shows an example": lambda: plan(
         "scenario: paper-random\nrecipe: ppo\n"
     ),
-    "t.yaml, line 4: search: the recipe rejects learning_rate.strat=0.0001: recipe 'ppo': learning_rate.strat": lambda: (
-        plan(search={"learning_rate.strat": RATE})
+    "t.yaml, line 4: search: the recipe rejects learning_rate.strat=0.0001: recipe 'ppo': learning_rate": lambda: plan(
+        search={"learning_rate.strat": RATE}
     ),
     "must be whole numbers, written without a decimal": lambda: plan(search={"n_epochs": {"low": 1.0, "high": 4.0}}),
     "t.yaml, line 4: search.n_epochs = {high: 4, low: 4}: low 4 must be less than high 4": lambda: plan(
@@ -98,11 +98,9 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 8: search.learning_rate.start: the file also sets learning_rate; delete one of": lambda: plan(
         search={"learning_rate.start": RATE, "learning_rate": {"choices": [1, 2]}}
     ),
-    "search: the recipe rejects offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824: recipe": lambda: (
-        plan(
-            recipe="quick",
-            search={"offset.smallest": {"low": 0.01, "high": 0.2}, "offset.largest": {"low": 0.1, "high": 0.5}},
-        )
+    "search: the recipe rejects offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824": lambda: plan(
+        recipe="quick",
+        search={"offset.smallest": {"low": 0.01, "high": 0.2}, "offset.largest": {"low": 0.1, "high": 0.5}},
     ),
     "t.yaml, line 9: set.evaluation.worlds: this key is not allowed under set": lambda: plan(
         set={"evaluation.worlds": 3}
