@@ -5,7 +5,7 @@ The true value of a quantity with the reported value x lies in [x - h, x + h]. T
 quantity's unit, or a share of x. The interval is cut to possible values: no latency, speed or gap below 0, no speed
 above the vehicle's limit. The *box* of a world is the set of all combinations of values in its intervals. The *members*
 of a world are the reported world and every corner of its box: 2^d corners for d uncertain numbers. Mode ``robust``
-proves its bound for the members (``docs/extensions/certified.md``).
+proves its bound for the members (``docs/internals/proofs/shield-corners.md``).
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def front_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show how much harm each vehicle bears if the vehicles' harms are weighted in many ways.
+    """Show each vehicle's harm for many choices of whose harm counts.
 
     For each choice of weights, the search looks in every world for the commands with the least weighted harm. The
     result is compared with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if

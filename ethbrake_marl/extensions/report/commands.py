@@ -29,7 +29,7 @@ def watch_command(
     settings: SettingsOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Write a real-time film of one world, driven by each of the given agents.
+    """Write a real-time film of agents that drive the same world.
 
     The film shows the road to scale, the commands, the impacts and the harm.
     """

@@ -43,7 +43,7 @@ def reproduce_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Reproduce the paper's figures and tables, and compare them with the paper.
+    """Reproduce the paper's results, and compare ours with them.
 
     An item is a figure or a table of the paper. The command prints how long the work takes, then reproduces each item.
     It writes one page (index.html) with all items and, for each item, figures and data. A verdict says whether our

@@ -36,7 +36,7 @@ ClusterOption = Annotated[
 study_group = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
-    help="Train and compare many policies; search for the worst worlds of an agent.",
+    help="Compare many policies; search for an agent's worst worlds.",
     epilog=example("study sweep sweep.yaml --output runs/sweep", "study ablate --quick --output runs/ablation-quick"),
 )
 
@@ -115,7 +115,7 @@ def tune_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search for settings of a recipe with which the trained policy does the least harm.
+    """Search for the best settings of a training recipe.
 
     A trial is one training. Its harm is measured on the list of worlds that the file describes. After an interruption,
     the same command continues: finished trials are not trained again, and unfinished trials continue. The exit status
@@ -232,7 +232,7 @@ def falsify_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search the ranges of a scenario for the worlds in which an agent does worst.
+    """Search a scenario for the worlds in which an agent does worst.
 
     --measure sets the score of a world; a larger score is worse. harm: the agent's harm. regret: the agent's harm minus
     the harm of --against, by default the best known commands. difference: the absolute difference between the harms of

@@ -49,7 +49,7 @@ FALSIFIED = [
     ("study falsify --agent coast --budget 0", "Invalid value for '--budget': must be greater than or equal to 1 (see"),
     (
         "study falsify --agent coast --budget 10 --output worst.txt",
-        "worst.txt: a file of worlds must end in .yaml or .yml",
+        "worst.txt: the name of a file with worlds must end in .yaml or .yml",
     ),
     (
         "study falsify --agent coast --budget 10 --measure bound",
@@ -75,11 +75,11 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent coast --budget 10 --scenario cooperation-2-blocked",
-        "scenario 'cooperation-2-blocked': v2x: draws delays and losses, which no table of worlds holds",
+        "scenario 'cooperation-2-blocked': its v2x channel has delays and losses, which a table",
     ),
     (
         "study falsify --agent coast --budget 10 --scenario paper-scenario-1",
-        "scenario 'paper-scenario-1': draws nothing: all its worlds are the same",
+        "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same",
     ),
     (
         "study falsify --agent ladder --measure harm --budget 8",

@@ -42,7 +42,7 @@ def test_folder__of_something_else_is_refused_and_what_may_stand_there_may(tmp_p
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(AlreadyExists, match="the folder exists, but does not contain sums; give another folder"):
         begun(tmp_path)
-    with pytest.raises(InvalidInput, match=r"thesis.tex: .*thesis.tex is no folder; give a folder of its own"):
+    with pytest.raises(InvalidInput, match=r"thesis.tex: .*thesis.tex is not a folder; give a new folder"):
         begun(tmp_path / "thesis.tex")
 
 
@@ -67,7 +67,7 @@ def test_folder__a_file_that_cannot_be_replaced_at_the_end_is_refused_at_once(tm
     folder.check()
     (tmp_path / "sums.csv").unlink()
     (tmp_path / "sums.csv").mkdir()
-    with pytest.raises(InvalidInput, match=r"sums.csv: is a folder; give the name of a file"):
+    with pytest.raises(InvalidInput, match=r"sums.csv: is a folder; give the path of a file"):
         folder.check()
 
 
