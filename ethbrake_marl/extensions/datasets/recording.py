@@ -105,7 +105,7 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
     """Let an agent drive the learners of the scenario, and record the episodes.
 
     The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. Raises
-    ``PhysicsError``, which names the worlds, if the physics cannot simulate some worlds; and the exceptions of
+    ``PhysicsError``, which names the worlds, if the physics cannot simulate some worlds. Also raises the exceptions of
     ``episode_engine``.
 
     Args:

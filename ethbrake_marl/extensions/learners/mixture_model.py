@@ -137,9 +137,9 @@ class ExpertsModel(VineModel):
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
         """From B of the visited decisions, let each of K experts drive to the end of the episode; return the costs.
 
-        The cost of an expert is minus its return. In addition, ``tie_break`` times the harm is added, in the count of
-        harm that the reward does not use. The B decisions are drawn from the decisions at which the experts choose
-        different actions.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm. This harm is counted in the way
+        (first impacts or all impacts) that the reward does not use. The B decisions are drawn from the decisions at
+        which the experts choose different actions.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.

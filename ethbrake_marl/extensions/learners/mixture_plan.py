@@ -30,9 +30,9 @@ class Shares(FileModel):
 class ExpertsPlan(FileModel):
     """Settings of a mixture of experts: several networks, and a gating network that chooses which of them acts.
 
-    Each expert after the first is pre-trained in two steps. First, it imitates templates (random braking profiles) in
-    worlds in which a template does better than all earlier experts. Then it is trained in the worlds in which it is
-    nearly as good as the best earlier expert, or better.
+    Each expert after the first is pre-trained in two steps. First, the new expert imitates templates (random braking
+    profiles) in worlds in which a template does better than all earlier experts. Then the new expert is trained in the
+    worlds in which it is better than the best earlier expert, or nearly as good.
     """
 
     networks: int = Field(ge=2, le=16, description="number of experts")

@@ -31,7 +31,7 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 class _TorchActor(Actor):
     """``Actor`` (the network of a policy) with the matrix products of torch instead of numpy.
 
-    This class is three times as fast as ``Actor``. The outputs of the two differ by rounding.
+    This class is three times as fast as ``Actor``. The outputs of the two classes differ only by rounding.
     """
 
     @torch.no_grad()

@@ -84,7 +84,7 @@ class RolloutClassificationModel(VineModel):
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
         """At B of the visited decisions, try C choices: actions, or policies that act.
 
-        Simulate each to the end of the episode.
+        Each choice is simulated to the end of the episode.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.

@@ -149,7 +149,9 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
     @cached_property
     def loaded_policies(self) -> tuple[Policy, ...]:
-        """The trained policies that the key ``policies`` names. They are loaded when this property is first used.
+        """The trained policies that the key ``policies`` names.
+
+        The policies are loaded when this property is first used.
 
         A policy that itself chooses between policies is replaced by these policies.
 

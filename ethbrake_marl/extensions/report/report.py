@@ -68,7 +68,7 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
-    """Return the section with collisions, harm and regret, apart for worlds with avoidable and unavoidable contact."""
+    """Return the section that compares harm in worlds with avoidable contact and with unavoidable contact."""
     regrets, limits = regrets_of(evaluation), limits_of(evaluation)
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -359,7 +359,7 @@ def _words(estimate: Estimate | None) -> str:
 
 
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Return whether an agent does "less" harm than full braking in the same worlds, "more", or "as much".
+    """Return "less", "more" or "as much": the harm of an agent compared with full braking in the same worlds.
 
     The result is "as much" if the interval of the difference contains 0, or if there are several worlds but no
     interval. ``harm`` is the measure to compare, for instance ``total_harm``.

@@ -126,9 +126,9 @@ class Course:
     def unrest(self, points: int) -> Floats:
         """Return how much the return of each training fluctuates in its second half, [seeds].
 
-        The second half is divided by ``points`` equally spaced points, so trainings of different lengths can be
-        compared. The result is the standard deviation of the changes of the return from one point to the next, divided
-        by ``rise``.
+        The return is read at ``points`` equally spaced points of the second half, so trainings of different lengths can
+        be compared. The result is the standard deviation of the changes from one point to the next, divided by
+        ``rise``.
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 

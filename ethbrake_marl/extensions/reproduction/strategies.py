@@ -55,7 +55,7 @@ class Reading:
     acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Return the shipped scenario ``name`` with this assumption, and with ``changes`` of its keys."""
+        """Return the shipped scenario ``name`` with the latency of this assumption and ``changes`` of further keys."""
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
             return scenario

@@ -1,12 +1,12 @@
 """Verdicts on the paper's numbers and statements, computed from our results.
 
-*Chance* is the difference that the results of two random lists of worlds may have by chance. Compared with our result,
-a number that the paper prints
+*Chance* is the difference that the results of two random lists of worlds may have by chance.
 
-- *agrees* if the two differ by no more than chance, or by no more than ``TOLERANCE`` of the printed number;
-- is *undecided* if the two differ by no more than chance, but chance is more than ``WIDE`` of the larger number;
-- *cannot agree* if it is below a proven lower bound for all strategies by more than chance;
-- *differs* in all other cases.
+- A number that the paper prints *agrees* with ours if the two differ by no more than chance, or by no more than
+  ``TOLERANCE`` of the printed number.
+- It is *undecided* if the two differ by no more than chance, but chance is more than ``WIDE`` of the larger number.
+- It *cannot agree* if it is below a proven lower bound for all strategies by more than chance.
+- It *differs* in all other cases.
 
 A statement of the paper *agrees* if the interval of every comparison supports it. It is *undecided* if some intervals
 do not support it, but all these intervals contain 0.

@@ -214,7 +214,7 @@ def falsify_command(
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(metavar="NAME|PATH", help="Scenario whose ranges are searched.", show_default="paper-random"),
+        typer.Option(metavar="NAME|PATH", help="Scenario whose worlds are searched.", show_default="paper-random"),
     ] = None,
     budget: Annotated[int | None, typer.Option(help="Number of worlds to try.", min=1, show_default="4000")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the search.", min=0, show_default="0")] = None,
@@ -234,11 +234,11 @@ def falsify_command(
 ) -> None:
     """Search a scenario for the worlds in which an agent does worst.
 
-    --measure sets the score of a world; a larger score is worse. harm: the agent's harm. regret: the agent's harm minus
-    the harm of --against, by default the best known commands. difference: the absolute difference between the harms of
-    the agent and of --against. bound: the agent's harm minus the bound of its shield; a score above 0 means that the
-    bound is broken. With --again FILE, the agent of the file (or --agent) drives the worlds of the file again. With
-    --again, the exit status is 1 if a world has a worse score than in the file.
+    --measure sets the score of a world; a larger score is worse. With harm, the score is the agent's harm. With regret,
+    it is the agent's harm minus the harm of --against (by default the best known commands). With difference, it is the
+    absolute difference between these two harms. With bound, it is the agent's harm minus the bound of its shield, so a
+    score above 0 means that the bound is broken. With --again FILE, the agent of the file (or --agent) drives the
+    worlds of the file again. With --again, the exit status is 1 if a world has a worse score than in the file.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

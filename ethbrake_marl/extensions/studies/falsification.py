@@ -90,7 +90,9 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(scored: Scored, count: int) -> Ints:
-    """Return the row numbers of at most ``count`` points of ``scored`` with high scores that are far apart, best first.
+    """Choose at most ``count`` points of ``scored`` that have high scores and are far apart.
+
+    Return their row numbers, best point first.
 
     Any two of these points differ by at least 0.1 in some coordinate. Points whose score is not finite are omitted.
     """
@@ -130,7 +132,7 @@ def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Falsified:
-    """Result of a search for worlds in which an agent does badly: the worst worlds, worst first, and all scores."""
+    """Result of a search for worlds in which an agent does badly: the worst worlds, and the scores of all worlds."""
 
     sample: Sample  # the worst worlds at the alert
     worlds: list[NamedWorld]  # the same worlds with names, initial states and measurements

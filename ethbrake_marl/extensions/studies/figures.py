@@ -80,7 +80,7 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
         if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in evaluations):
             raise ValueError("a measure is missing or not finite")
     except (ValueError, LookupError, csv.Error) as error:
-        raise InvalidInput(f"{run.progress}: the file is damaged ({error}); delete its folder to train again") from None
+        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete the run's folder to train again") from None
     return evaluations
 
 
@@ -108,7 +108,7 @@ def final_figures(job: TrainingJob) -> dict[str, Any]:
     """
     run, evaluations = RunDirectory(job.folder), evaluations_of(job)
     if not evaluations:
-        raise InvalidInput(f"{run.progress}: the file contains no evaluation; delete its folder to train again")
+        raise InvalidInput(f"{run.progress}: the file contains no evaluation; delete the run's folder to train again")
     trained = read_trained(run.policy)
     if isinstance(trained, Policy):
         sha256 = trained.manifest.manifest_sha256

@@ -1,4 +1,7 @@
-"""The folder of a study. Only one process at a time may work in the folder, and all must have the same settings."""
+"""The folder of a study.
+
+Only one process at a time may work in the folder, and all processes must use the same settings.
+"""
 
 from __future__ import annotations
 

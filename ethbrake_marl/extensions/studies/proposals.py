@@ -29,8 +29,8 @@ Proposal = Mapping[str, Any]  # key -> value in Optuna's form
 class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
     """Search algorithm of Ray Tune that asks Optuna for proposals, and stores each proposal in a file.
 
-    A *proposal* contains the values to try in one trial, by key, in Optuna's form. The configuration of a trial
-    consists of its number, ``trial``, and its proposal, ``values``.
+    A *proposal* contains the values to try in one trial, by key, in the form in which Optuna stores values. The
+    configuration of a trial consists of its number, ``trial``, and its proposal, ``values``.
 
     Args:
         file: JSON file of the proposals; it is created with the first proposal.

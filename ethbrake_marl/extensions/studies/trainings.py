@@ -77,7 +77,7 @@ class TrainingJob:
         try:
             status = read_object(run.status)
         except InvalidInput as error:
-            raise InvalidInput(f"{error}; delete the folder of the file to train again") from None
+            raise InvalidInput(f"{error}; delete the run's folder to train again") from None
         check_same_training(run, self.training)
         if status.get("status") == "finished":
             return 0

@@ -36,9 +36,9 @@ def run_trials(
 ) -> list[dict[str, Any]]:
     """Run trials on Ray Tune, and return the last report of each trial that began, in order of beginning.
 
-    A report is the dictionary that ``work`` passes to ``tune.report``, with Ray's own entries. If the trial failed, the
-    entry ``reason`` says why. The entry ``done`` is True if the trial has ended. Ctrl-C stops all trials. The caller
-    must connect to Ray first (see ``cluster.connected``).
+    A report is the dictionary that ``work`` passes to ``tune.report``, and to which Ray adds entries. If the trial
+    failed, the entry ``reason`` says why. The entry ``done`` is True if the trial has ended. Ctrl-C stops all trials.
+    The caller must connect to Ray first (see ``cluster.connected``).
 
     Args:
         work: function that runs a trial in a worker process, called as ``work(config, **given)``.

@@ -422,7 +422,7 @@ class TuningPlan:
     def folder(self, path: Path) -> StudyFolder:
         """Return the object that checks and locks the folder ``path``.
 
-        Its methods refuse the folder of a tuning with other settings.
+        The object refuses the folder of a tuning with other settings.
         """
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
