@@ -95,7 +95,8 @@ def choose_rows(
         expect: function from observations [rows, F] to expected sizes [rows]; None: decisions are drawn as for
             ``focus`` = 0.
 
-    Returns the row numbers of the drawn decisions, and their importance (1 if they are drawn uniformly).
+    Returns the row numbers of the drawn decisions, and the importance of each: its weight in the loss, 1 if the
+    decisions are drawn uniformly.
 
     """
     if focus == 0.0 or expect is None or len(rows) == 0:

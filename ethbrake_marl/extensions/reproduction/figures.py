@@ -1,4 +1,4 @@
-"""Figures that are drawn to reproduce figures of the paper."""
+"""Functions that draw the figures of a reproduction of the paper."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         return {}
 
     def say(self, note: str = "") -> None:
-        """Report the number of ended trials. ``note`` is a message to print once."""
+        """Report how many trials have ended. ``note`` is a message to print once."""
         self._tell(Progress(self._name, self._done, self._total, note=note))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
