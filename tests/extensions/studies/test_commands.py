@@ -53,7 +53,7 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent coast --budget 10 --measure bound",
-        "agent 'coast': has no shield, but --measure bound compares the harm with the",
+        "agent 'coast' has no shield, but --measure bound compares the harm with the",
     ),
     (
         "study falsify --agent coast --budget 10 --measure difference",
@@ -62,7 +62,7 @@ FALSIFIED = [
     ("study falsify --agent coast --against coast --budget 10", "agent 'coast' is listed twice; list each agent once"),
     (
         "study falsify --agent full_brake --measure harm --against coast --budget 10",
-        "--against coast: --measure harm compares with no other agent; leave --against out",
+        "--against coast: --measure harm uses no second agent; leave --against out",
     ),
     ("study falsify --agent coast --budget 10 --measure hram", "unknown measure 'hram'; did you mean 'harm'?"),
     (
@@ -83,7 +83,7 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent ladder --measure harm --budget 8",
-        "agent ladder: the name means several agents; give one agent",
+        "agent ladder: the name stands for several agents; name one agent",
     ),
     ("study sweep nowhere.yaml --output new", "nowhere.yaml: the file does not exist"),
 ]

@@ -122,7 +122,7 @@ def test_table__of_a_run_that_is_damaged_is_named(again, capsys, damage: bytes) 
     damaged.write_bytes(damage)
     assert sweep(file, folder) == 2
     (told,) = capsys.readouterr().err.splitlines()
-    assert f"{damaged}: is damaged (" in told and told.endswith("; delete its folder to train again")
+    assert f"{damaged}: is damaged (" in told and told.endswith("; delete the run's folder to train again")
 
 
 def test_run__of_another_training_is_not_done(again, capsys) -> None:
