@@ -97,21 +97,21 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
         observes = f"{path}: the policy observes {was.name!r:.80}"
         if was.name not in FEATURES:
             raise InvalidInput(
-                f"{observes}, which is not registered; install the package that registers this feature, or register it first"
-                " with eb.register_feature"
+                f"{observes}, which is not registered; install the package that registers this feature, or register it"
+                " first with eb.register_feature"
             )
         entry = FEATURES[was.name]
         now = {name: getattr(entry.feature, name) for name in ("unit", "scale", "low", "high")}
         for key, value in (now | {"of": entry.of, "unknown": entry.unknown}).items():
             if getattr(was, key) != value:
                 raise InvalidInput(
-                    f"{observes}, whose {key} was {getattr(was, key)!r:.60} in training and is {value!r:.60} now; register"
-                    " the feature as in training, or train again"
+                    f"{observes}, whose {key} was {getattr(was, key)!r:.60} in training and is {value!r:.60} now;"
+                    " register the feature as in training, or train again"
                 )
         if len(was.tried) != len(entry.tried) or not np.allclose(was.tried, entry.tried, rtol=1e-6, atol=1e-6):
             raise InvalidInput(
-                f"{observes}, whose function returns other numbers than in training; register the feature as in training, or"
-                " train again"
+                f"{observes}, whose function returns other numbers than in training; register the feature as in"
+                " training, or train again"
             )
     with suppress(InvalidInput):  # a feature that no longer exists
         today = ObservationSchema.of(seen.spec)

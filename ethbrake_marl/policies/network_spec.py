@@ -66,8 +66,8 @@ class NetworkSpec(FileModel):
     def _settings_fit(self) -> NetworkSpec:
         if (self.networks > 1) != bool(self.gate_hidden):
             raise ValueError(
-                f"gate_hidden = {list(self.gate_hidden)}: must have a layer if networks is above 1, and must be left out"
-                f" if networks is 1; networks is {self.networks}"
+                f"gate_hidden = {list(self.gate_hidden)}: must have a layer if networks is above 1, and must be left"
+                f" out if networks is 1; networks is {self.networks}"
             )
         if self.networks > 1 and self.value_hidden:
             raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty if networks is above 1")
