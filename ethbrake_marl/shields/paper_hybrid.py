@@ -35,7 +35,7 @@ Bound = Literal["coupled", "pairwise"]  # method to compute H* and a*: the engin
 
 
 class HybridAgent(AgentAround):
-    """Agent that drives by ``policy`` in worlds where the policy's rollout does harm of at most ``H*``, else by E-V2X-BM.
+    """Agent that drives by ``policy`` in worlds where the harm of its rollout is at most ``H*``, otherwise by E-V2X-BM.
 
     The rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
 

@@ -169,7 +169,7 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
     np.testing.assert_allclose(action, policy(seen), rtol=0.0, atol=1e-5)
     for wrong, why in (
         ({"output": "clip", "choices": None}, "among: can only be given if output is 'choice'"),
-        ({"among": (spec,)}, "and policies without among"),
+        ({"among": (spec,)}, "and only for policies without among"),
         (
             {"among": (squashed.model_copy(update={"observation_size": 26}),)},
             r"among\[0\]: observation_size and action_size are",
