@@ -4,7 +4,7 @@ Importing the package registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/et
 name is imported when it is first used, so torch and matplotlib are loaded only if they are needed.
 
 The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read this block as imports. At run time
-the package reads the list from this file and imports each name on first use.
+the package reads the names from this file and imports each name when it is first used.
 """
 
 from __future__ import annotations

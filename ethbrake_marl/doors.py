@@ -18,7 +18,7 @@ from typing import Any
 
 @cache
 def names_behind(file: str) -> dict[str, str]:
-    """Return a dictionary name -> module of all imports in the ``if TYPE_CHECKING`` block of an ``__init__``.
+    """Return the imports in the ``if TYPE_CHECKING`` block of an ``__init__``, as a dictionary name -> module.
 
     ``file``: path of the ``__init__`` file.
     """
@@ -29,13 +29,13 @@ def names_behind(file: str) -> dict[str, str]:
 
 
 def front_door(package: str, file: str) -> Callable[[str], Any]:
-    """Return the ``__getattr__`` of a folder's ``__init__``, and set the folder's ``__all__`` and ``__dir__``.
+    """Return a ``__getattr__`` function for a package's ``__init__``, and set its ``__all__`` and ``__dir__``.
 
-    The returned function raises ``AttributeError`` for a name that is not in the folder's list.
+    The returned function raises ``AttributeError`` for a name that the ``__init__`` does not list.
 
     Args:
-        package: the folder's ``__name__``.
-        file: the folder's ``__file__``.
+        package: name of the package (``__name__`` of its ``__init__``).
+        file: path of the ``__init__`` file.
 
     """
     folder, names = sys.modules[package], names_behind(file)

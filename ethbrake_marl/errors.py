@@ -54,8 +54,8 @@ RENAMED: dict[str, str] = {  # old name -> new name, for messages
 def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
 
-    Control, direction and separator characters are escaped, except the space and the characters in ``keep``. Names,
-    keys and paths come from files and command lines. Unescaped text could move the cursor or print a line backwards.
+    Control, direction and separator characters are escaped, except the space and the characters in ``keep``. Names and
+    paths from files could otherwise move the cursor or print a line backwards.
     """
     if text.isprintable():
         return text
@@ -85,8 +85,8 @@ def count_of(n: int, thing: str) -> str:
 def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
-    ``path``: the user's file. The line is then the last line of this file in the traceback. If ``path`` is None, the
-    line is the innermost line of the traceback. An error of this package is described by its message alone.
+    ``path``: the user's file; the last line of this file in the traceback is reported. If ``path`` is None, the
+    innermost line of the traceback is reported. An error of this package is described by its message alone.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -186,11 +186,11 @@ def _missing(package: str) -> MissingExtra:
 class PhysicsError(EthBrakeError, ArithmeticError):
     """Some worlds of a batch could not be advanced. The cause is a defect of the physics kernel, never of the input.
 
-    All other worlds of the batch are valid. A world's result does not depend on its batch, so a caller may leave out
-    the failed worlds and go on (``physics.left_out.leaving_out_failed``).
+    The failure does not affect the other worlds of the batch, so a caller may compute the batch again without the
+    failed worlds (``physics.left_out.leaving_out_failed``).
 
     Args:
-        worlds: dictionary from the row of each failed world in the batch to the reason of its failure.
+        worlds: row of each failed world in the batch -> reason of the failure.
 
     """
 
@@ -233,7 +233,7 @@ class AgentFailed(InvalidInput):
     @staticmethod
     @contextmanager
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
-        """Context manager: replace the agent's name in an ``AgentFailed`` error by ``name``, the user's name for it.
+        """Context manager: change the agent's name in an ``AgentFailed`` error to ``name``, which the user knows.
 
         ``others``: names of the agents of the other vehicles; an error of one of these agents passes unchanged.
         """
@@ -278,11 +278,11 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     """Return the error for an unknown name, which shows its new name, a similar name, or all known names.
 
     Args:
-        kind: what the name stands for, for example ``scenario``.
+        kind: kind of thing that should have the name, for example ``scenario``.
         name: the unknown name.
         known: the known names.
-        may_be_own: true if users can register names of this kind. The message then says that a name must be
-            registered first.
+        may_be_own: true if users can register names of this kind. The message then says that the user's own name must
+            be registered or installed first.
 
     """
     names = sorted(known)
@@ -308,7 +308,7 @@ def refuse_shipped_path(path: str, agent: str = "") -> None:
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
 
-    ``what``: name of the value in the message.
+    ``what``: name of the value, with which the message begins.
     """
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole

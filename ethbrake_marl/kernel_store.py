@@ -1,4 +1,4 @@
-"""The folder of cached compiled kernels, and callbacks before the first compilation. Does not import numba."""
+"""Find the folder of the cached compiled kernels, and call functions before the first compilation, without numba."""
 
 from __future__ import annotations
 

@@ -44,11 +44,12 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
     """Run function calls in parallel and yield their results in the order of the calls.
 
     Args:
-        calls: tuples (function, argument, ...) with module-level functions. A tuple is taken from the iterable shortly
-            before its call starts.
-        jobs: number of calls that run at once. None: one call without Ray, one call per core with Ray. Without Ray and
-            with one call at a time, the calls run in this process.
-        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. None: joblib without Ray.
+        calls: tuples (function, argument, ...) with module-level functions. If ``calls`` is a generator, each tuple is
+            requested shortly before its call starts.
+        jobs: number of calls that run at once. None means 1 without Ray, and the number of cores with Ray. A single
+            call at a time without Ray runs in this process.
+        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. None: run in processes of joblib,
+            without Ray.
 
     Raises the error of a call that fails; ``WorkerLost`` if a worker process is killed (Ray repeats the call instead);
     ``MissingExtra`` if joblib or Ray is not installed; ``InvalidInput`` if no cluster answers at the address.

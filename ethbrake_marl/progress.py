@@ -41,7 +41,7 @@ class Progress:
     def listener(told: Told) -> OnProgress | None:
         """Return the function to call with each ``Progress``, or None if progress is not reported.
 
-        ``told`` is such a function, ``"show"`` to print progress on stderr, or None.
+        ``told`` is a function that receives each ``Progress``, or ``"show"`` to print progress on stderr, or None.
         """
         return ShownProgress() if told == "show" else told
 

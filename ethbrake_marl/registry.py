@@ -52,9 +52,9 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return a dictionary name -> entry points of this name in a group; several packages may use the same name.
+    """Return the entry points of a group by name; several packages may define an entry point with the same name.
 
-    This package's own names come first.
+    The names from this package precede the names from other packages.
 
     ``group``: name of the group without the prefix ``ethbrake_marl.``, for example ``agents``.
     """
@@ -73,7 +73,7 @@ def giver(point: EntryPoint) -> str:
 def versions_used() -> dict[str, str]:
     """Return a dictionary name -> version of the other packages that have added parts, such as agents, to this process.
 
-    A package counts only if one of its entry points has been loaded.
+    A package is included only if one of its entry points has been loaded.
     """
     return dict(sorted(_VERSIONS.items()))
 
@@ -168,8 +168,8 @@ class Registry(Mapping[str, T]):
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
         """Add ``part`` under ``name``; raise ``AlreadyExists`` if the name belongs to another part.
 
-        ``is_same`` is called with the part that has the name and returns whether it equals the new one; if so, nothing
-        changes.
+        ``is_same`` returns whether the part that has the name already equals the new part; an equal part is not added
+        again.
         """
         if name not in self.loaded and name in self and name not in self._loading:
             self.load(name)

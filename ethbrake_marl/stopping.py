@@ -13,7 +13,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Context manager: yield a function that returns whether Ctrl-C or SIGTERM has asked to stop.
+    """Context manager: yield a function that returns whether Ctrl-C was pressed or SIGTERM was received in the block.
 
     A second Ctrl-C or SIGTERM has its usual effect. Outside the main thread, where Python delivers no signals, the
     function always returns False.

@@ -39,7 +39,7 @@ class Episodes:
 
         Args:
             engine: an engine made by ``episode_engine``, before its first step.
-            worlds: worlds of the engine at the alert, with which the first call of each observer begins.
+            worlds: worlds of the engine at the alert; the first call of each observer gets them as ``before``.
             watched_by: observers that are called after every step.
             summed: names of reward terms to sum over the episodes.
 
@@ -108,7 +108,7 @@ def episode_engine(
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent for ``vehicle``, or a team, which knows its vehicles.
+        agent: an agent that drives ``vehicle``, or a team, which has its own vehicles.
         scenario: scenario whose scripts drive the other vehicles.
         vehicle: index of the agent's vehicle (0 = front); None for a team.
         reward: reward whose terms the engine computes.
@@ -151,7 +151,7 @@ def drive(
 
     Args:
         worlds: n worlds at the alert.
-        agent: an agent for ``vehicle``, or a team, which knows its vehicles.
+        agent: an agent that drives ``vehicle``, or a team, which has its own vehicles.
         scenario: scenario whose scripts drive the other vehicles.
         vehicle: index of the agent's vehicle (0 = front); None for a team.
         watched_by: observers that are called after every step.
@@ -198,15 +198,15 @@ def record_commands(agent: Driver, worlds: Worlds, scenario: Scenario, vehicle: 
 
 
 def write_down(engine: Engine, steps: int, column: Callable[[], Floats]) -> Floats:
-    """Run an engine to the end of all episodes and record a value after each of the first ``steps`` steps.
+    """Run an engine to the end of all episodes, and record K numbers per world after each of the first ``steps`` steps.
 
     Args:
         engine: an engine made by ``episode_engine``.
         steps: number of steps to record.
-        column: function that returns the values to record of the engine's n worlds, [n, K].
+        column: function that returns the K numbers to record for each of the engine's n worlds, [n, K].
 
-    Returns the recorded values, [n, steps, K], NaN after the end of an episode. Raises ``PhysicsError`` naming the
-    worlds in which the physics failed.
+    Returns the recorded numbers, [n, steps, K]; they are NaN after the end of an episode. Raises ``PhysicsError``
+    naming the worlds in which the physics failed.
 
     """
     columns = np.full((steps, *column().shape), np.nan)

@@ -70,8 +70,8 @@ def adapt_policy(policy: Any, name: str, features: int, initial_state: Begin | N
 def _without_memory(action: Any) -> Any:
     if isinstance(action, tuple):
         raise InvalidInput(
-            f"gave a tuple of {len(action)}; must give an action; for a policy with a memory, which gives (action,"
-            " state), pass initial_state"
+            f"returned a tuple of {len(action)} values; must return an action; for a policy with a memory, which"
+            " returns (action, state), pass initial_state"
         )
     return action
 
@@ -80,7 +80,7 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
     """Return the same functions as ``adapt_policy``, for a model with a method ``predict`` (Stable-Baselines3).
 
     A recurrent model returns its memory. Predictions for two and for three worlds show which axis of each array in the
-    memory counts worlds.
+    memory has one entry per world.
 
     Args:
         model: the model.
@@ -101,7 +101,7 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
         if len(candidates) != 1:
             raise InvalidInput(
                 f"a state array has shape {shapes[0]} for two worlds and {shapes[1]} for three; exactly one axis must"
-                " count worlds"
+                " be as long as the number of worlds"
             )
         return candidates[0]
 
@@ -109,7 +109,7 @@ def _ask_model(model: Any, name: str, features: int) -> tuple[Infer, Begin | Non
         like, of_three = (predict(np.zeros((n, features), np.float32))[1] for n in (2, 3))
         axes = map_memory(world_axis, like, of_three)
     except Exception as error:
-        raise InvalidInput(f"agent {name!r}: predict on {features} features: {describe_error(error)}") from error
+        raise InvalidInput(f"agent {name!r}: predict fails for {features} features: {describe_error(error)}") from error
     if like is None:
         return lambda seen, _: (predict(seen)[0], None), None
 
@@ -141,7 +141,7 @@ def _ask_torch(module: Any, name: str, with_state: bool) -> Infer:
         ):
             raise InvalidInput(
                 f"agent {name!r}: the layer {type(layer).__name__} is in training mode, in which results are random or"
-                " depend on the other worlds of a batch; call eval() of the module first"
+                " depend on the other worlds of a batch; call the eval() of the module first"
             )
 
     def call(seen: Observations, state: State) -> tuple[Any, State]:
@@ -171,8 +171,8 @@ def _open_onnx(path: Path, name: str) -> Any:
 def weights_sha256(policy: Any) -> str | None:
     """Return the SHA-256 of an .onnx file (given by its path), or of the present weights of a torch or SB3 model.
 
-    The statistics of a ``VecNormalize`` count as weights. Returns None for other policies, because their weights cannot
-    be read.
+    The hash of an SB3 model includes the statistics of its ``VecNormalize``. Returns None for other policies, because
+    their weights cannot be read.
     """
     if isinstance(policy, str | os.PathLike):
         return hashlib.sha256(Path(policy).read_bytes()).hexdigest() if Path(policy).is_file() else None
@@ -216,7 +216,7 @@ def policy_agent(
     model whose ``predict`` returns a state.
 
     Args:
-        policy: one of the following; copies of the agent share it.
+        policy: one of the following objects, which all copies of the agent share.
 
             - a function of observations;
             - a model with ``predict``. A Stable-Baselines3 model is called deterministically, with the statistics of
@@ -226,22 +226,22 @@ def policy_agent(
         name: name of the agent in tables and messages; None: the name of the function or class.
         scenario: scenario, or its name, in which the policy was trained; it defines the observation. None: unknown.
         observation: the observation that the policy takes, in place of the scenario's (see ``choose_observation``).
-            None: the scenario's observation. Without a scenario, it is the observation of the policy, of the
-            environment of a Stable-Baselines3 model, or the default.
-        initial_state: function that returns the memory at the start of n episodes: an array whose first axis counts
-            worlds, or tuples and mappings of such arrays. None: the policy is a function without memory, or a model.
-        clip: whether actions are clipped to [-1, 1], and indices to the valid range. If False, a value outside is an
-            error.
+            None: the scenario's observation. Without a scenario, None means the observation of the policy or of the
+            Stable-Baselines3 model's environment, or the default observation.
+        initial_state: function that returns the memory at the start of n episodes: an array with one row per world, or
+            tuples and mappings of such arrays. None: the policy is a function without memory, or a model.
+        clip: whether actions are clipped to [-1, 1], and indices to the valid range. If False, a value outside its
+            range is an error.
         appended: features that were appended to each observation in training, as for ``make_sb3_vec_env``: ``number``
-            (the learner's number) or ``state`` (the true state of the line); needs ``scenario``. None: the same as in
-            the model's training environment, or no features.
+            (the learner's number) or ``state`` (the true state of the line). This argument needs ``scenario``. None:
+            the same as in the model's training environment, or no features.
         ignore_wrappers: whether to accept a model whose training wrappers may have changed observations or actions,
             whose actions have other bounds, or whose ``VecNormalize`` statistics are missing.
         actions: number of discrete actions, if the policy returns the index of one. None: the same as in the model's
             environment, or actions in [-1, 1].
 
-    Raises ``InvalidInput`` if ``policy`` is none of these kinds, if it takes another number of features, and if it was
-    trained under wrappers that may change observations or actions.
+    Raises ``InvalidInput`` if ``policy`` is none of these objects, if the policy takes another number of features, and
+    if the policy was trained under wrappers that may change observations or actions.
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -260,19 +260,19 @@ def policy_agent(
     if appended is None and (appended := getattr(trained, "appended", None)) is not None:
         scenario = trained.engine.scenario if scenario is None else scenario
     if appended is not None and scenario is None:
-        raise InvalidInput(f"agent {named!r}: appended = {appended!r}: pass scenario=, the scenario of the training")
+        raise InvalidInput(f"agent {named!r}: appended = {appended!r}: pass scenario=, the training scenario")
     size = spec.size if scenario is None else len(row_features(spec.features, appended, scenario))
     shape = getattr(getattr(policy, "observation_space", None), "shape", None)
     if shape not in (None, (size,)):
         raise InvalidInput(
             f"agent {named!r}: the policy takes observations of shape {shape}, but this observation has {size}"
-            " features; pass scenario, observation or appended as in the training"
+            " features; pass scenario, observation or appended as in training"
         )
     seen = spec if trained is None or ignore_wrappers else trained.engine.observation
     if [f.name for f in spec.features] != [f.name for f in seen.features]:
         raise InvalidInput(
             f"agent {named!r}: the model was trained with the observation {seen}, not with {spec}; leave observation"
-            " out, and pass the scenario of the training or no scenario"
+            " out, and pass the training scenario or no scenario"
         )
     actions = getattr(trained, "actions", None) if actions is None else actions
     if not ignore_wrappers:
@@ -297,7 +297,7 @@ def _check_action_space(policy: Any, name: str, actions: int | None) -> None:
     advice = "write a function around the policy that converts its actions"
     if least == 0:
         advice = f"pass actions={count} if the actions are evenly spaced from -1 to 1, or {advice}"
-    raise InvalidInput(f"agent {name!r}: the policy gives actions in {space}; must be {right}; {advice}")
+    raise InvalidInput(f"agent {name!r}: the actions of the policy are in {space}; must be {right}; {advice}")
 
 
 def _appending(appended: Appended, scenario: Scenario) -> Callable[[Worlds, int], Observations]:
@@ -432,7 +432,7 @@ class PolicyAgent:
 
         ``seen``, ``worlds`` and ``steps`` [n] (number of steps so far) are for the error message only.
         """
-        n, what = worlds.n, f"gave {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
+        n, what = worlds.n, f"returned {action.dtype} of shape {action.shape} for observations of shape {seen.shape}"
         if self._actions is not None:
             return self._checked_indices(action, self._actions, what, worlds, steps)
         if action.shape != (n, 1) or action.dtype.kind not in "fiu":
@@ -441,12 +441,14 @@ class PolicyAgent:
         values: Floats = action[:, 0].astype(np.float64)
         if not np.isfinite(values).all():
             k = int(np.argmin(np.isfinite(values)))
-            raise self._refusal(k, worlds, steps, f"{what}; its action is {values[k]}; must be in [-1, 1]")
+            raise self._refusal(
+                k, worlds, steps, f"{what}; the action of this world is {values[k]}; must be in [-1, 1]"
+            )
         inside = np.abs(values) <= LARGEST
         if not (self._clip or inside.all()):
             k = int(np.argmin(inside))
             right = "must be in [-1, 1]; clip=True clips such actions"
-            raise self._refusal(k, worlds, steps, f"{what}; its action is {values[k]:g}; {right}")
+            raise self._refusal(k, worlds, steps, f"{what}; the action of this world is {values[k]:g}; {right}")
         return values.clip(-1.0, 1.0)
 
     def _checked_indices(self, indices: NDArray[Any], count: int, what: str, worlds: Worlds, steps: Ints) -> Floats:
@@ -459,7 +461,7 @@ class PolicyAgent:
         inside = (row >= 0) & (row <= last)
         if not inside.all():
             k = int(np.argmin(inside))
-            raise self._refusal(k, worlds, steps, f"{what}; its index is {row[k]}; {right}")
+            raise self._refusal(k, worlds, steps, f"{what}; the index of this world is {row[k]}; {right}")
         return index_to_action(row, count)
 
     def _refusal(self, k: int, worlds: Worlds, steps: Ints, reason: str) -> AgentFailed:

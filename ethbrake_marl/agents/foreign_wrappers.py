@@ -1,7 +1,7 @@
 """Find wrappers in a Stable-Baselines3 model's training environment that may change observations or actions.
 
 An agent calls the model without these wrappers, so the model would get other observations than in training, or its
-actions would have other effects. The checks work without Stable-Baselines3 and the wrappers' libraries.
+actions would have other effects. The checks need neither Stable-Baselines3 nor the wrappers' libraries.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class _WhatChanges(type):
 
 
 class _Changing(metaclass=_WhatChanges):
-    """Argument for ``env_is_wrapped``: an object is an instance if its class may change observations or actions.
+    """Class for ``env_is_wrapped``: its instances are all objects whose class may change observations or actions.
 
     ``env_is_wrapped`` also works for environments in other processes, where ``changes`` cannot be called directly.
     """
@@ -87,23 +87,25 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
     for layer in [] if env is None else _layers(env):
         wrapper, inside = _look(layer, name)
         if hasattr(type(layer), "normalize_obs") and layer is not statistics:
-            wrapper = "VecNormalize inside another one"
+            wrapper = "VecNormalize inside another VecNormalize"
         if wrapper is not None and not ignore_wrappers:
             raise InvalidInput(
                 f"agent {name!r}: the model was trained under {wrapper}, which may change observations or actions and"
                 " is not applied here; write a function around the model that makes the same changes, or pass"
-                " ignore_wrappers=True if there are none"
+                " ignore_wrappers=True if there are no changes"
             )
         bases += inside
     features = [base.engine.observation.features for base in bases]
     if not ignore_wrappers and any(each != features[0] for each in features):
         raise InvalidInput(
-            f"agent {name!r}: the copies of the model's environment observe different features; must be the same"
+            f"agent {name!r}: the copies of the model's environment observe different features; all copies must"
+            " observe the same"
         )
     counts = {getattr(base, "actions", None) for base in bases}
     if not ignore_wrappers and len(counts) > 1:
         raise InvalidInput(
-            f"agent {name!r}: the copies of the model's environment have different actions, {counts}; must be the same"
+            f"agent {name!r}: the copies of the model's environment have different numbers of actions, {counts}; all must"
+            " have the same number"
         )
     return bases[0] if bases else None
 
@@ -117,7 +119,8 @@ def _was_normalised(model: Any) -> bool:
     """Return whether the saved training data of a Stable-Baselines3 model show that its observations were normalised.
 
     This is so if the last observation lies outside the observation space, or if the model also saved the observation
-    before normalisation. Off-policy algorithms always save the latter, so only the space is checked for them.
+    before normalisation. Off-policy algorithms always save the observation before normalisation, so for them only the
+    observation space is checked.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

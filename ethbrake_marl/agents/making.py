@@ -31,18 +31,18 @@ def make_agent(
     uncertainty: object = None,
     time_step_s: float | None = None,
 ) -> Driver:
-    """Make a new agent for one vehicle in one batch, or a team of agents from one training run.
+    """Make a new agent, which drives one vehicle, or a team of agents from one training run.
 
     Args:
         spec: ``name[:argument][@policy]``, followed by wrappers, for example ``constant:3.5``, ``planner:64`` or
             ``ppo+search+step``. ``ethbrake agent list`` lists all agents and wrappers. ``my_file.py:make_agent`` runs
-            this file with all your rights, and calls the function with the arguments of a factory (see
-            ``register_agent``), or without arguments if it has no parameters.
+            ``my_file.py`` with all your rights, and calls ``make_agent`` with the arguments of a factory (see
+            ``register_agent``), or without arguments if the function has no parameters.
         scenario: scenario, its name, or the path of its file; teams and wrappers need it.
         harm_count: impacts whose harm an optimising agent minimises: ``first`` (each pair's first) or ``total`` (all).
         horizon_s: time after the alert until which an agent looks ahead, s; None: the scenario's horizon, or 8 s.
         most_candidates: upper limit for the candidates of a search, to try an agent out quickly.
-        uncertainty: uncertainty of the worlds for a shield that considers it, for example ``"gaps_m=0.5"``.
+        uncertainty: uncertainty of the worlds, for a shield that takes it into account, for example ``"gaps_m=0.5"``.
         time_step_s: time between two decisions of agents that search or follow a control law, s; None: the scenario's
             time step, or 0.1 s.
 
@@ -119,7 +119,7 @@ def find_entry(spec: AgentSpec | str) -> Entry:
         return Entry(written.name, form, "your own", Source.UNSTATED, make_from_file)
     if written.name not in AGENTS:
         if written.name in group_names():
-            raise InvalidInput(f"agent {written.core!r}: is the name of a group of agents; must be a single agent")
+            raise InvalidInput(f"agent {written.core!r}: is the name of a group of agents; write the name of one agent")
         raise AGENTS.unknown(written.name, {*agent_names(), *group_names()})
     entry = AGENTS[written.name]
     if written.argument is not None and ":" not in entry.whole_form:
@@ -142,7 +142,7 @@ def _make(entry: Entry, argument: str | None, settings: AgentSettings, *inside: 
         entry: the registry entry.
         argument: text after the colon in the specification; None if there is no colon.
         settings: settings for the factory.
-        inside: agent or team that a shield or a search wraps; empty for an agent.
+        inside: the agent or team to wrap, if the entry is a shield or a search; otherwise empty.
 
     """
     try:
@@ -167,7 +167,9 @@ def make_from_file(argument: str | None, settings: AgentSettings) -> Driver:
     assert named is not None
     function = load_from_file(*named, reads=settings.policy)
     if not callable(function):
-        raise InvalidInput(f"file {named[0]!r}: {named[1]!r} is not a function; name the function that makes the agent")
+        raise InvalidInput(
+            f"file {named[0]!r}: {named[1]!r} is not a function; write FILE.py:FUNCTION, where FUNCTION makes the agent"
+        )
     arguments: tuple[Any, ...] = (argument, settings)
     with suppress(TypeError, ValueError):  # a built-in function may have no signature
         if not inspect.signature(function).parameters:

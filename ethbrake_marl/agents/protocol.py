@@ -1,7 +1,8 @@
 """The interfaces of agents, teams and shielded drivers, and the names of their sources of knowledge.
 
-The attribute ``knows`` of an agent states its sources of knowledge: a ``Source``, its text, or several of them, for
-example for a policy behind a shield. A lossy or slow channel (``v2x``) limits only the first three sources.
+The attribute ``knows`` of an agent states its sources of knowledge: one ``Source`` or its text, or several of these,
+for example for a policy behind a shield. A lossy or slow channel (``v2x``) limits only agents that use the first three
+sources.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Source(StrEnum):
-    """Source of an agent's knowledge, in increasing order; each source includes the sources before it."""
+    """Sources of an agent's knowledge, in increasing order; each source includes the sources before it."""
 
     SENSORS = "own sensors"  # the own vehicle, and the neighbours that its sensors see
     MESSAGES = "messages"  # also the messages that the vehicle has received
@@ -39,7 +40,7 @@ class Knowledge(tuple[Source, ...]):
         """Return the combined knowledge of several agents or teams.
 
         Args:
-            agents: agents or teams; an agent without an attribute ``knows`` counts as ``UNSTATED``.
+            agents: agents or teams; the knowledge of an agent without an attribute ``knows`` is ``UNSTATED``.
             also: knowledge that a shield or search around the agents adds; None: no further knowledge.
 
         Raises ``InvalidInput`` for an unknown source.
@@ -173,7 +174,7 @@ def fixed_commands(
 class ByPolicy:
     """Base class of agents with an attribute ``policy``: a trained policy, or another agent that the agent wraps.
 
-    A subclass sets ``policy``; hash and manifest are read from it.
+    A subclass sets ``policy``; the hash and the manifest are read from ``policy``.
     """
 
     policy: Any  # the trained policy, or the wrapped agent
@@ -288,7 +289,8 @@ class Team:
                 raise InvalidInput(f"team {name!r}: key {vehicle!r}: must be the index of a vehicle, 0 or more")
             if not isinstance(agent, Agent):
                 raise InvalidInput(
-                    f"team {name!r}: {agent!r} of vehicle_{vehicle + 1}: must be an agent, for instance from make_agent"
+                    f"team {name!r}: {agent!r} of vehicle_{vehicle + 1}: must be an agent, for instance one from"
+                    " make_agent"
                 )
         self.drivers = {int(vehicle): drivers[vehicle] for vehicle in sorted(drivers)}
         self.name, self.shield = name, shield

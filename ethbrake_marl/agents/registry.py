@@ -53,7 +53,7 @@ class Entry:
     def words(self) -> tuple[str, ...]:
         """Every text of a wrapper after the ``+`` of a specification, for example ``("step", "step:estimated")``.
 
-        This is complete only if ``form`` lists all arguments of the wrapper.
+        The tuple is complete only if ``form`` lists all arguments of the wrapper.
         """
         name, *options = re.findall(r"[^\[\]+]+", self.whole_form)
         words = [name]
@@ -73,7 +73,7 @@ class Entry:
             argument: text after the first colon, such as ``pairwise``; None: no argument. If the last word is a
                 registered variant (``pairwise:estimated``), the variant's function is called.
             settings: settings for the function that makes the agent or wrapper.
-            inside: agent or team that a wrapper wraps; empty for an agent.
+            inside: the agent or team to wrap, if this is the entry of a wrapper; otherwise empty.
 
         """
         make: Any = self.make
@@ -156,8 +156,8 @@ def shield_modes() -> dict[str, Any]:
 def variants_of(name: str) -> tuple[str, ...]:
     """Return the variants of the agent or shield called ``name``, for example ``("estimated",)``.
 
-    A variant is written as the last word, as in ``episode:pairwise:estimated``. Another function then makes the agent
-    or shield.
+    A variant is written as the last word, as in ``episode:pairwise:estimated``. If a variant is written, another
+    function makes the agent or shield.
     """
     keys = (key.rpartition(".") for key in VARIANTS)
     return tuple(variant for of, _, variant in keys if of == name)
@@ -219,8 +219,8 @@ def register_agent(
             ``settings`` an ``AgentSettings``.
         about: description in one line, for ``ethbrake agent list``.
         knows: sources of the agent's knowledge while it drives, for ``ethbrake agent list``.
-        form: syntax of the agent, for ``ethbrake agent list``; None: ``name[:ARGUMENT]``. Without ``:`` the agent takes
-            no argument, without ``@`` no policy.
+        form: syntax of the agent, for ``ethbrake agent list``; None: ``name[:ARGUMENT]``. If this text has no ``:``,
+            the agent takes no argument; if it has no ``@``, the agent takes no policy.
         takes_policy: whether ``name@policy`` is allowed; ``AgentSettings.policy`` is then the policy.
 
     Registering the same factory again has no effect. Raises ``AlreadyExists`` if the name belongs to another factory,
@@ -259,7 +259,7 @@ def register_shield(
         about: description in one line, for ``ethbrake agent list``.
         knows: sources of knowledge that the wrapper adds to the agent's.
         form: syntax of the wrapper, ``+name[:WORD]`` with every argument that it takes; None: any argument is allowed.
-        inner: whether the wrapper is a search, which wraps the agent itself and stands before any shield.
+        inner: whether the wrapper is a search, which wraps the agent itself and is written before any shield.
         teams: whether the wrapper can also wrap a team.
         needs: name of each required setting of ``AgentSettings`` -> example of its value; None: no required settings.
         options: settings class of a shield (``shields.options.ShieldOptions`` or a subclass), which makes it available
@@ -283,8 +283,8 @@ def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a varia
 
     Args:
         key: ``name.variant``; for example, ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
-        make: function that replaces the factory or wrapper called ``name``, with the same arguments. Its ``argument``
-            does not contain the name of the variant.
+        make: function that replaces the factory or wrapper called ``name``, with the same arguments. The ``argument``
+            that this function gets does not contain the name of the variant.
         about: description in one line, for ``ethbrake agent list``.
 
     Raises ``AlreadyExists`` if the key belongs to another variant.

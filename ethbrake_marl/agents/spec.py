@@ -83,7 +83,8 @@ def split_names(text: str, is_one: Callable[[str], bool] = os.path.lexists) -> l
     """Split a comma-separated list of names, some of which may contain commas.
 
     ``is_one`` tests whether a text with commas is a single name; by default, whether a file or folder of this name
-    exists. The longest such text becomes a name; without one, the name ends at the next comma.
+    exists. The longest text for which ``is_one`` is true becomes a name; if there is none, the name ends at the next
+    comma.
     """
     parts, names = text.split(","), list[str]()
     while parts:

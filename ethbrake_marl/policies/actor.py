@@ -54,11 +54,11 @@ class Actor:
         return chosen
 
     def take(self, number: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the action for each observation after output ``choice`` has chosen a policy or an action, [1, rows].
+        """Return the action for each observation, [1, rows], given the network's choice of a policy or fixed action.
 
         Args:
-            number: index of the choice for each observation, [rows]. The first indices stand for the policies in
-                ``NetworkSpec.among``, the later indices for fixed actions.
+            number: index of the choice for each observation, [rows]. Indices from 0 on choose a policy in
+                ``NetworkSpec.among``; the indices after these policies choose a fixed action.
             x: observations, [F, rows].
 
         """

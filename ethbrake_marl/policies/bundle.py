@@ -25,11 +25,11 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     Raises ``InvalidInput`` if there is no bundle, and ``CorruptBundle`` with file and reason if it is damaged.
     """
     if not isinstance(path, str | os.PathLike):
-        raise InvalidInput(f"policy = {path!r:.60}: must be the path of a run or of a policy bundle")
+        raise InvalidInput(f"policy = {path!r:.60}: must be the path of a training run or of a policy bundle")
     folder = _bundle_folder(Path(path))
     entries = {entry.name for entry in os.scandir(folder)}
     for name in sorted({MANIFEST, WEIGHTS} - entries):
-        raise CorruptBundle(f"{folder / name}: is missing")
+        raise CorruptBundle(f"{folder / name}: is missing from the policy bundle")
     for name in sorted(entries - {MANIFEST, WEIGHTS}):
         raise CorruptBundle(
             f"{folder / name}: does not belong in a bundle, which has only the files {MANIFEST} and {WEIGHTS}"
@@ -73,7 +73,9 @@ def _bundle_folder(path: Path) -> Path:
             return folder
     members = sorted((path / "policy").glob("vehicle_*"))
     if members:
-        raise InvalidInput(f"{path}: has one policy for each learner; give the path of one, for instance {members[0]}")
+        raise InvalidInput(
+            f"{path}: has one policy for each learner; give the path of one of them, for instance {members[0]}"
+        )
     reason = "contains no policy" if path.is_dir() else "is not a folder"
     raise InvalidInput(
         f"{path}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
@@ -92,24 +94,24 @@ def _check_observed(path: Path, manifest: Manifest) -> None:
     """
     seen = manifest.observation
     for was in seen.registered:
-        of = f"{path}: the policy observes {was.name!r:.80}"
+        observes = f"{path}: the policy observes {was.name!r:.80}"
         if was.name not in FEATURES:
             raise InvalidInput(
-                f"{of}, which is not registered; install the package that registers this feature, or register it first"
-                " with eb.register_feature"
+                f"{observes}, which is not registered; install the package that registers this feature, or register it"
+                " first with eb.register_feature"
             )
         entry = FEATURES[was.name]
         now = {name: getattr(entry.feature, name) for name in ("unit", "scale", "low", "high")}
         for key, value in (now | {"of": entry.of, "unknown": entry.unknown}).items():
             if getattr(was, key) != value:
                 raise InvalidInput(
-                    f"{of}, whose {key} was {getattr(was, key)!r:.60} in training and is {value!r:.60} now; register"
-                    " the feature as in training, or train again"
+                    f"{observes}, whose {key} was {getattr(was, key)!r:.60} in training and is {value!r:.60} now;"
+                    " register the feature as in training, or train again"
                 )
         if len(was.tried) != len(entry.tried) or not np.allclose(was.tried, entry.tried, rtol=1e-6, atol=1e-6):
             raise InvalidInput(
-                f"{of}, whose function returns other numbers than in training; register the feature as in training, or"
-                " train again"
+                f"{observes}, whose function returns other numbers than in training; register the feature as in"
+                " training, or train again"
             )
     with suppress(InvalidInput):  # a feature that no longer exists
         today = ObservationSchema.of(seen.spec)

@@ -1,7 +1,7 @@
 """Layers of a network: matrix product and hyperbolic tangent with the same bits in any batch, on any machine.
 
 Mathematics libraries round ``tanh`` and sums differently on different machines, and even at different positions in an
-array. In this module both are fixed sequences of IEEE operations.
+array. This module computes ``tanh`` and sums by fixed sequences of IEEE operations.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
     """Compute one layer of a network, ``y = weight x + bias``.
 
     The products are added in groups of four, ``(a + b) + (c + d)``, always in this order, without fused or reordered
-    operations (no fastmath). The rounding error is half that of a running sum. Each column of ``x`` is computed
-    independently.
+    operations (no fastmath). The rounding error is half as large as the error of a running sum. Each column of ``x`` is
+    computed independently.
 
     Args:
         weight: weights of K inputs and O outputs, [O, K].

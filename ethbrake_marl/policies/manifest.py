@@ -63,7 +63,7 @@ class ObservationSchema(_Strict):
 
     @classmethod
     def of(cls, spec: ObservationSpec) -> Self:
-        """Return the description of the observation ``spec``, in which later changes of its features are detected."""
+        """Return a description of the observation ``spec``, which makes later changes of its features detectable."""
         names = tuple(f.name for f in spec.features)
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in spec.features]
         return cls(
@@ -114,7 +114,7 @@ class Manifest(_Strict):
         if self.format_version != network.format_version:
             raise ValueError(
                 f"format_version = {self.format_version}: must be {network.format_version} with"
-                f" networks = {network.networks} and output {network.output}"
+                f" networks = {network.networks} and output = {network.output!r}"
             )
         if len(features) != network.observation_size:
             raise ValueError(

@@ -26,24 +26,27 @@ class TensorRow(NamedTuple):
     shape: tuple[int, ...]  # length of each axis
 
     def inside(self, part: str) -> TensorRow:
-        """Return the row of this tensor as part of another policy, with the name ``part.name``."""
+        """Return this row with the tensor name ``part.name``, for a network that is a part of another policy."""
         return self._replace(name=f"{part}.{self.name}")
 
 
 class NetworkSpec(FileModel):
     """The networks of a policy: an actor, and optionally a critic, both multilayer perceptrons on the same observation.
 
-    The action is ``output(actor(observation))`` in [-1, 1]. Output ``clip`` clips the actor's mean to [-1, 1] (PPO: a
-    Gaussian with one noise parameter per action). Output ``tanh`` applies tanh to the mean (SAC: a Gaussian whose noise
-    is a second head of the actor). Without ``value_hidden`` there is no critic, which a policy does not need to act.
+    The action is ``output(actor(observation))`` in [-1, 1]. Output ``clip`` clips the actor's result to [-1, 1]; in
+    training (PPO) this result is the mean of a Gaussian with one noise parameter per action. Output ``tanh`` applies
+    tanh to the actor's result; in training (SAC) it is the mean of a Gaussian whose noise comes from a second head of
+    the actor. If ``value_hidden`` is empty, there is no critic; a policy can act without a critic.
 
-    With ``networks`` above 1 the policy is a mixture of experts: ``networks`` actors of this shape, and a gating
-    network with ``gate_hidden`` layers, which scores the actors at every decision. The actor with the highest score
-    acts; of equal scores, the first one. A mixture of experts has no noise and no critic.
+    If ``networks`` is above 1, the policy is a mixture of experts. It then has ``networks`` actors of the same shape,
+    and a gating network (hidden layers ``gate_hidden``) that scores the actors at every decision. The actor with the
+    highest score acts; if several actors have this score, the first of them acts. A mixture of experts has no noise and
+    no critic.
 
-    With output ``choice`` the actor scores ``choices`` actions, evenly spaced from -1 to 1. The action with the highest
-    score is taken; of equal scores, the lowest action. There is no noise and no critic. The actor may also score whole
-    policies (``among``), which get the same observation. The scores of the policies precede the scores of the actions.
+    With output ``choice`` the actor scores ``choices`` actions, evenly spaced from -1 to 1. The policy takes the action
+    with the highest score; if several actions have this score, it takes the lowest of them. Such a policy has no noise
+    and no critic. The actor may also score whole policies (``among``), which get the same observation. In the actor's
+    result, the scores of the policies precede the scores of the actions.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F, length of an observation
@@ -63,26 +66,26 @@ class NetworkSpec(FileModel):
     def _settings_fit(self) -> NetworkSpec:
         if (self.networks > 1) != bool(self.gate_hidden):
             raise ValueError(
-                f"gate_hidden = {list(self.gate_hidden)}: must be given with several networks, and only then; networks"
-                f" = {self.networks}"
+                f"gate_hidden = {list(self.gate_hidden)}: must have a layer if networks is above 1, and must be left"
+                f" out if networks is 1; networks is {self.networks}"
             )
         if self.networks > 1 and self.value_hidden:
-            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty with several networks")
+            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty if networks is above 1")
         if (self.output == "choice") != (self.choices is not None):
             raise ValueError(
-                f"choices = {self.choices}: must be a number with output choice, and left out with any other output;"
-                f" output is {self.output}"
+                f"choices = {self.choices}: must be a number if output is 'choice', and must be left out otherwise;"
+                f" output is {self.output!r}"
             )
         if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
-            raise ValueError("output = 'choice': must have one network, no critic, and action_size 1")
+            raise ValueError("output = 'choice': networks must be 1, value_hidden empty and action_size 1")
         for m, member in enumerate(self.among):
             if self.choices is None or member.among:
-                raise ValueError("among: must have output choice, and policies without among")
+                raise ValueError("among: can only be given if output is 'choice', and only for policies without among")
             if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
                 raise ValueError(
                     f"among[{m}]: observation_size and action_size are {member.observation_size} and"
                     f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as in the network"
-                    " that chooses"
+                    " that chooses among these policies"
                 )
         return self
 
@@ -93,7 +96,7 @@ class NetworkSpec(FileModel):
 
     @property
     def actions(self) -> Float32s:
-        """The actions that output ``choice`` scores, [choices], from -1 to 1."""
+        """The fixed actions that the actor scores if ``output`` is ``choice``, [choices], from -1 to 1."""
         levels: Float32s = np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
         return levels
 
@@ -125,7 +128,7 @@ class NetworkSpec(FileModel):
 
     @property
     def _outputs(self) -> int:
-        """Number of outputs of each actor: size of an action, or with output ``choice`` the number of scores."""
+        """Number of outputs of each actor: size of an action, or number of scores if ``output`` is ``choice``."""
         return self.action_size if self.choices is None else len(self.among) + self.choices
 
     def _network(self, name: str, hidden: tuple[int, ...], outputs: int) -> list[TensorRow]:

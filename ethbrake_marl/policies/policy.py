@@ -59,7 +59,7 @@ class Policy:
         return Actor(self.manifest.network, self.tensors)
 
     def __call__(self, observation: Float32s) -> Float32s:
-        """Return the action [n, A] for the observations [n, F], float32, in [-1, 1]; rows are independent."""
+        """Return the actions [n, A] in [-1, 1] for the observations [n, F], float32; each row is computed alone."""
         return self._actor(observation)
 
     @cached_property

@@ -31,8 +31,9 @@ def load_shipped(name: str) -> Policy:
 def load_named_policy(name: str) -> Policy:
     """Load a shipped policy by its name, or any policy by its path.
 
-    ``name`` is the name of a shipped policy, or the path of a run or a bundle. Write ``./ppo`` for a folder called
-    ``ppo``. Raises the errors of ``load_policy``, and ``UnknownName`` for the old spelling ``shipped/NAME``.
+    ``name`` is the name of a shipped policy, or the path of a run or a bundle. If a folder has the same name as a
+    shipped policy, such as ``ppo``, write ``./ppo`` for the folder. Raises the errors of ``load_policy``, and
+    ``UnknownName`` for the old spelling ``shipped/NAME``.
     """
     refuse_shipped_path(name)
     return load_shipped(name) if name in shipped_policies() else load_policy(name)

@@ -1,4 +1,4 @@
-"""Attach a shield to an environment, with the same options and checks for every interface."""
+"""Attach a shield to an environment, with the same options and checks for every kind of environment."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def proposing_agents(
     Args:
         policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
         vehicles: indices of the shielded vehicles.
-        where: name of the user's interface, with which error messages begin.
+        where: name of the function or class that the user called, with which error messages begin.
 
-    Raises ``InvalidInput`` if ``policy`` is none of these, and if the team or mapping does not cover exactly the
+    Raises ``InvalidInput`` if ``policy`` is something else, and if a team or mapping does not contain exactly the
     shielded vehicles.
 
     """
@@ -74,7 +74,7 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
             ``episode``.
         options: settings of the shield.
 
-    Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn in another mode than ``step``, and if
+    Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if
     ``policy`` is not a policy.
 
     """
@@ -104,13 +104,13 @@ class Attached:
     Args:
         env: the environment to shield.
         interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
-        maker: code that makes such an environment, for error messages.
+        maker: code with which the user makes an environment of this class, for error messages.
         policy: policy that proposes the actions that the caller leaves out; None: no policy.
         where: name of the wrapper, with which error messages begin.
         options: keywords of ``ShieldOptions``.
 
-    It has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env`` is not an
-    environment of this package, or already has a shield.
+    An ``Attached`` object has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env``
+    is not an environment of this package, or already has a shield.
 
     """
 
@@ -151,8 +151,8 @@ class Attached:
     def shield(self) -> Any:
         """Current state of the shield, for reading only; None before the first reset.
 
-        In mode ``step`` it is a ``StepShield``, in mode ``episode`` the memory of the ``HybridAgent``. Modes of
-        extensions have types of their own.
+        In mode ``step`` it is a ``StepShield``, in mode ``episode`` the memory of the ``HybridAgent``. In the mode of
+        an extension its type belongs to the extension.
         """
         return self.memory.shield
 
@@ -177,7 +177,7 @@ class Attached:
             self.engine.protect(None)
 
     def penalty(self) -> Floats:
-        """Return the intervention penalty of each learner in the last step, [n, L]; the wrapper subtracts it."""
+        """Return each learner's intervention penalty in the last step, [n, L], to be subtracted from the reward."""
         self.check_open()
         ruling = self.engine.ruling
         if ruling is None:

@@ -1,11 +1,12 @@
-"""``certify``: apply the proposed action if some plan after it keeps the budget, else apply the backup plan's action.
+"""``certify``: apply the proposed action if some plan after it stays within the budget, else the backup plan's action.
 
 A *plan* is a sequence of actions, one for each decision up to the horizon. The *backup* is the present plan of the
 shield. The *budget* is the largest harm that the shield accepts for the whole episode. The shield may consider several
-*possible worlds* (members) for each world; each plan is simulated in all of them, with the kernels of ``members``.
+*possible worlds* (members) for each world; each plan is simulated in all of them, with the compiled functions of the
+module ``members``.
 
-After a proposal two plans are tried: the rest of the backup, and the best constant action. The module ``step`` proves
-that the harm of the episode never exceeds the bound at the alert.
+After a proposal, two plans are simulated: the rest of the backup, and the best constant action. The module ``step``
+proves that the harm of the episode never exceeds the bound at the alert.
 """
 
 from __future__ import annotations
@@ -51,16 +52,17 @@ NEARLY = 1e-9
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Return the index of the constant action with the least harm in the worst possible world, and this harm (m2/s2).
+    """Return the index of the constant action of least harm, and its harm, m2/s2.
 
-    Each action is held from now to the horizon, simulated in one segment.
+    The harm of an action is its largest harm over the possible worlds. Each action is held from now to the horizon and
+    simulated in one segment, not decision by decision.
 
     Args:
         world: parameters of the M possible worlds of one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        constants: C constant actions of the K shielded vehicles, [C, K].
+        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
 
     """
     best, least, critical = 0, math.inf, 0
@@ -90,8 +92,8 @@ def better_plan(
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision; actions from this decision on are replaced.
-        constants: C constant actions of the K shielded vehicles, [C, K].
-        value: harm of the plan in the worst possible world, m2/s2.
+        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
+        value: largest harm of the plan over the possible worlds, m2/s2.
         most: largest harm that is accepted, m2/s2.
         plan: actions of each decision, [L, K]; changed in place.
         trial: workspace, [L, K].
@@ -136,9 +138,9 @@ def try_action(
     world: Members, states: Floats, ended: Bools, step: int, action: Floats, budget: float, certified: float,
     constants: Floats, plan: Floats, room: Floats, after: Floats, over: Bools,
 ) -> tuple[float, float, int]:  # fmt: skip
-    """Simulate one step with an action, then search for a plan from the next state on that keeps the budget.
+    """Simulate one step with an action, then search for a plan from the next state on that stays within the budget.
 
-    The rest of the present plan is tried first, then the constant actions. An action for which the physics fails is
+    The rest of the present plan is simulated first, then the constant actions. An action for which the physics fails is
     not certified.
 
     Args:
@@ -149,8 +151,9 @@ def try_action(
         action: action of each shielded vehicle to try, [K].
         budget: largest harm of the episode that is accepted, m2/s2.
         certified: harm of ``plan``, m2/s2.
-        constants: C constant actions of the K shielded vehicles, [C, K].
-        plan: present plan, [L, K]; on success it is replaced by the action and the plan found for the later decisions.
+        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
+        plan: present plan, [L, K]; if the search succeeds, it is replaced by the action and the plan found for the
+            later decisions.
         room: workspace, [2, L, K].
         after: receives the state of each possible world after the step, [M, S].
         over: receives whether the episode has ended after the step in each possible world, [M].
@@ -186,7 +189,7 @@ def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> Non
 
     Args:
         out: columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN`` for each vehicle, [K, 4]; changed in place. The
-            reasons must be filled in already.
+            column ``REASON`` must be filled in already.
         action: applied actions, [K].
         bound: harm that the episode will not exceed, m2/s2.
         margin: budget minus the harm of the plan, m2/s2.
@@ -205,8 +208,9 @@ def decide_world(
 ) -> bool:  # fmt: skip
     """Decide in one world: accept the proposed actions, or replace them by the actions of the plan.
 
-    All proposals are tried together first. If no plan after them keeps the budget, they are tried one by one, front to
-    rear, while the other vehicles act as planned. An accepted proposal becomes part of the plan for the next attempts.
+    First, all proposals are tried together. If no plan after these actions stays within the budget, the proposals are
+    tried one by one, front to rear, while the other vehicles act as planned. An accepted proposal becomes part of the
+    plan with which the next vehicle's proposal is tried.
 
     Args:
         world: the M possible worlds of this world (``Members``).
@@ -311,8 +315,9 @@ def certify_worlds(
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
     """Write to ``value`` [n] the harm of the whole episode if each plan is executed from now on, m2/s2.
 
-    The harm is the largest over the possible worlds; infinity if the physics fails. If one of the constant actions
-    ``constants`` [C, K] does less harm than the rest of a plan, it first replaces that rest in ``plans`` [n, L, K].
+    The harm of a plan is its largest harm over the possible worlds; it is infinite if the physics fails. If one of the
+    ``constants`` [C, K], held to the horizon, causes less harm than the rest of a plan, it replaces this rest in
+    ``plans`` [n, L, K], and ``value`` is the harm of the new plan.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -331,9 +336,9 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    ``running`` has n worlds with M possible worlds each. ``rests`` [n] receives whether every possible world of a world
-    comes to rest before the horizon and stays at rest. ``borne`` [n * M, N] receives the harm that each vehicle bears
-    in the whole episode, m2/s2; it is 0 for an obstacle ahead.
+    ``running`` has n worlds with M possible worlds each. ``rests`` [n] receives whether, in every possible world, all
+    vehicles come to rest before the horizon and stay at rest. ``borne`` [n * M, N] receives the harm that each vehicle
+    bears in the whole episode, m2/s2; it is 0 for an obstacle ahead.
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -350,7 +355,8 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
     """Improve constant actions by coordinate descent over the vehicles.
 
-    Vehicle by vehicle, the action is replaced by the action of ``grid`` with the least harm, simulated in one segment.
+    For one vehicle after the other, the action is replaced by the entry of ``grid`` with the least harm. Each candidate
+    is held to the horizon and simulated in one segment.
 
     Args:
         running: the episodes, n worlds with exactly one possible world each.
@@ -385,7 +391,7 @@ class Backup(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """Result of ``certify`` for n worlds and K shielded vehicles; a single vehicle has no axis K."""
+    """Result of ``certify`` for n worlds and K shielded vehicles; for a single vehicle the axis K is left out."""
 
     applied: Floats  # [n] or [n, K] actions in [-1, 1]
     intervened: Bools  # [n] or [n, K] whether the proposal was replaced (clipping to [-1, 1] does not count)
@@ -419,21 +425,22 @@ class Decision(NamedTuple):
 def plan_harm(running: Running, plan: Floats) -> Floats:
     """Return the harm of the whole episodes if the plans are executed from now on, [n] m2/s2.
 
-    ``plan`` has the actions of each decision, [n, L], or [n, L, K] for K vehicles. The harm is the largest over the
-    possible worlds, and equals the engine's harm to the bit. Caps on the harm of single vehicles are ignored.
+    ``plan`` has the actions of each decision, [n, L], or [n, L, K] for K vehicles. Each harm is the largest over the
+    possible worlds, and equals the harm that the engine would count, to the bit. Caps on the harm of single vehicles
+    are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Return each plan and its harm; if the best constant action from now on does less harm, it replaces the plan.
+    """Return the plans, improved by the best constant action where it causes less harm, and the harm of each plan.
 
     Args:
         running: n episodes at a decision.
         plan: actions of each decision, [n, L] or [n, L, K].
-        constants: constant actions to compare with, [C] or [C, K].
+        constants: constant actions that may replace the rest of a plan, [C] or [C, K].
 
-    Returns the plans, in the shape of ``plan``, and the harm of the whole episode in the worst possible world, [n]
+    Returns the plans, in the shape of ``plan``, and the largest harm of the whole episode over the possible worlds, [n]
     m2/s2.
 
     """
@@ -448,7 +455,7 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Return plans that consist of ``past`` before decision number ``steps`` [n], and of ``later`` from there on.
+    """Return plans that consist of ``past`` before decision ``steps`` [n], and of ``later`` from this decision on.
 
     ``past`` and the result are plans, [n, L] or [n, L, K]; ``later`` is a plan of the same shape, or a single action.
     """

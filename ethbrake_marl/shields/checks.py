@@ -11,7 +11,7 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def is_amount(value: object, below: float = np.inf) -> bool:
-    """Return whether ``value`` is a number of at least 0 and less than ``below``. True and False do not count."""
+    """Return whether ``value`` is a number (not True or False) of at least 0 and less than ``below``."""
     return isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= float(value) < below
 
 
@@ -21,7 +21,7 @@ def check_amount(name: str, value: object, where: str, unit: str = "") -> None:
     The message begins with ``where`` and ends with ``unit``, such as " m2/s2".
     """
     if not is_amount(value):
-        raise InvalidInput(f"{where}: {name} = {value!r}: must be a number, at least 0{unit}")
+        raise InvalidInput(f"{where}: {name} = {value!r}: must be a number of at least 0{unit}")
 
 
 def check_scenario(scenario: object, where: str) -> None:

@@ -72,9 +72,9 @@ def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     ``plan`` has the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` has n worlds
     with M possible worlds each.
 
-    The first result is whether all vehicles are at rest at the horizon in every possible world, [n]. The second is the
-    harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. It equals the harm in the engine's ledger to
-    the bit. With an obstacle ahead, the first column is the obstacle's and is 0.
+    The first result is whether all vehicles are at rest at the horizon in every possible world, [n]. The second result
+    is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. This harm equals the harm in the
+    engine's ledger to the bit. With an obstacle ahead, the first column belongs to the obstacle and is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

@@ -5,20 +5,21 @@ A *guard* is the object in an engine that decides which actions are applied. The
 
     decide(state, memory, proposed) -> (applied, memory, info)
 
-``state``     the engine with its running episodes. The guard reads it and does not change it.
-``memory``    the guard's memory of these episodes. It is never changed in place: ``decide`` returns a new memory.
-``proposed``  proposed actions [n, L] in [-1, 1]. One NaN is an invalid action. A column of NaN means that the caller
+``state``     the engine with its running episodes. The guard reads it and does not change it. ``memory``    the guard's
+memory of these episodes. It is never changed in place: ``decide`` returns a new memory. ``proposed``  proposed actions
+[n, L] in [-1, 1]. A single NaN in a column is an invalid action. A column of NaN means that the caller
               gave that learner no action.
 ``applied``   actions [n, L] that the engine applies in this step.
 ``info``      details of the decision, which environments report in their infos as ``shield_...``.
 
-``decide`` returns the three results in a ``Ruling`` (``engine.engine``). After the step, ``check`` compares the new
-state with the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and keeps its old memory.
+``decide`` returns ``applied``, ``memory`` and ``info`` in one ``Ruling`` (``engine.engine``). After the step, ``check``
+compares the new state with the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and
+keeps its old memory.
 
 ``begin`` starts episodes in some rows of the batch, and ``report`` returns the infos. ``ShieldGuard`` implements what
 all modes share: it asks the policies for proposals, stores their memories, and arranges the infos by vehicle. The
-subclasses ``paper_hybrid.EpisodeGuard`` and ``guard.StepGuard`` add the decision of their mode. The module ``step``
-states and proves the guarantee of mode ``step``.
+subclasses ``paper_hybrid.EpisodeGuard`` and ``guard.StepGuard`` implement ``decide`` for their mode. The module
+``step`` states and proves the guarantee of mode ``step``.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from ethbrake_marl.shields.rollouts import Proposer, proposed_actions
 
 
 class ShieldMode(IntEnum):
-    """Mode of a shield. The infos report its number as ``shield_mode``; extensions number their own modes.
+    """Mode of a shield. The infos report its number as ``shield_mode``; an extension chooses other numbers.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldMode(1).name
@@ -68,7 +69,7 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """The shield's ``predicted_harm`` and ``chosen_policy`` by name, each [n]; None for one that it lacks.
+        """The shield's ``predicted_harm`` and ``chosen_policy`` by name, each [n]; None where the shield has no value.
 
         ``predicted_harm`` is the harm predicted at the alert (m2/s2), ``chosen_policy`` whether the policy drives.
         """
@@ -82,12 +83,12 @@ class ShieldGuard(ABC):
     the infos). It may override ``check``, which compares a step with the prediction, and ``intervened``.
 
     Args:
-        engine: the engine that gets this guard. All its learners are shielded, front to rear.
+        engine: the engine that gets this guard. All learners of the engine are shielded.
         policies: vehicle index -> policy that proposes if the caller gives no action. A policy with a memory is called
             at every decision, to update its memory.
         shield: initial state of the shield, before any episode; its type depends on the mode.
-        mode: mode of the shield; the infos report its number.
-        where: name of the user's interface, with which error messages begin.
+        mode: mode of the shield; the infos report the number of the mode.
+        where: name of the function or class that the user called, with which error messages begin.
 
     """
 
@@ -116,8 +117,8 @@ class ShieldGuard(ABC):
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
         """Start episodes in the rows with the indices ``rows``; return the shield's new state.
 
-        ``alert`` contains the worlds of these rows only, at t = 0. ``shield`` is the shield's old state, a copy that
-        may be changed.
+        ``alert`` contains the worlds of these rows only, at t = 0. ``shield`` is a copy of the shield's old state,
+        which may be changed.
         """
 
     @abstractmethod
@@ -128,7 +129,8 @@ class ShieldGuard(ABC):
 
         Args:
             memory: memory of the guard.
-            ruling: the decision; None before the first decision. The result has the same names in both cases.
+            ruling: the decision; None before the first decision. Before the first decision the infos have the same
+                names as later.
 
         """
 
@@ -144,7 +146,7 @@ class ShieldGuard(ABC):
         return Guarded(self._started(copy.copy(shield), alert, rows), policies)
 
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
-        """Return the memory to keep after the step.
+        """Return the guard's memory after the step.
 
         ``ruling`` is the decision that was applied, ``after`` the engine after the step. This base class accepts every
         step and returns the memory in ``ruling``.
@@ -176,8 +178,8 @@ class ShieldGuard(ABC):
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
         """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
 
-        ``running`` is the engine. In values with one column per learner, an unshielded vehicle gets the reason
-        ``NO_DECISION``, and 0 everywhere else.
+        ``running`` is the engine. If a value has one column per learner, every other vehicle gets 0, or ``NO_DECISION``
+        as its reason.
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -190,9 +192,10 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos that all modes have: mode, proposed action, applied action, and whether it was replaced.
+        """Return the infos of every mode: mode, proposed action, applied action, and whether the proposal was replaced.
 
-        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None, and both actions are 0.
+        ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None; the proposed and the
+        applied action are then 0.
         """
         infos: dict[str, Any] = {"mode": self.mode}
         if ruling is None:
@@ -208,12 +211,16 @@ class ShieldGuard(ABC):
         Args:
             worlds: the n worlds that the policies observe; may be None if no policy is called.
             memories: vehicle index -> memory of its policy.
-            proposed: the caller's actions, [n, L]. A column of NaN is replaced by the actions of that learner's policy.
+            proposed: the caller's actions, [n, L]. A column of NaN is replaced by the actions that this learner's
+                policy proposes.
 
         """
         left_out = np.isnan(proposed).all(axis=0)
         if left_out.any() and not self._policies:
-            raise InvalidInput("shield: an action is missing, and no policy can propose it; pass an action or policy=")
+            raise InvalidInput(
+                "shield: an action is missing, and no policy can propose it; pass the action, or make"
+                " the shield with policy="
+            )
         remember = (i for i, agent in self._policies.items() if getattr(agent, "remembers", memories[i] is not None))
         if left_out.any() or any(True for _ in remember):
             assert worlds is not None

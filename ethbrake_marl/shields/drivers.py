@@ -19,17 +19,17 @@ from ethbrake_marl.shields.paper_hybrid import HybridAgent
 class ShieldedDriver(ByPolicy):
     """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
 
-    At the alert the policy is simulated to the end of the episode. In worlds where it does at most the harm of
-    E-V2X-BM, it drives without interventions, and its harm is the bound. In all other worlds each proposed action must
-    be certified: by the rest of the plan, by a constant action, or by a rollout, which simulates the policy from the
-    state after the action. The proposals of a team are decided together.
+    At the alert the policy is simulated to the end of the episode. In worlds where the policy does at most the harm of
+    E-V2X-BM, the policy drives without interventions, and its harm is the bound. In all other worlds each proposed
+    action must be certified: by the rest of the plan, by a constant action, or by a rollout, which simulates the policy
+    from the state after the action. The shield decides on all proposals of a team together.
 
     Args:
         policy: the agent or team that proposes.
         scenario: the scenario in which actions are certified.
         later_rollouts: whether a rollout of the policy may certify an action.
-        told: the shield's assumption about the worlds at the alert; None: the true worlds. The policy always observes
-            the true worlds.
+        told: the worlds at the alert, as the shield assumes them; None: the shield knows the true worlds. The policy
+            always observes the true worlds.
         options: keywords of ``ShieldOptions``.
 
     Raises ``InvalidInput`` if ``policy`` is not an agent or team, for invalid options, and if a team does not drive
@@ -52,7 +52,9 @@ class ShieldedDriver(ByPolicy):
     ) -> None:
         self.options = ShieldOptions(**options)
         if self.options.mode == "episode":
-            raise InvalidInput("shield: mode = 'episode': use HybridAgent, the agent of this mode")
+            raise InvalidInput(
+                "shield: mode = 'episode': has an agent of its own; use HybridAgent instead of ShieldedDriver"
+            )
         check_agent(policy, str(self.options.mode), alone=not isinstance(policy, Team))
         check_scenario(scenario, str(self.options.mode))
         if not (told is None or isinstance(told, Worlds)):
@@ -83,7 +85,7 @@ class ShieldedDriver(ByPolicy):
     def around(cls, driver: Driver, task: Task, **settings: Any) -> Team:
         """Return a team in which copies of ``driver``, behind one shield, drive the vehicles of ``task``.
 
-        ``task`` gives the scenario and the harm count; ``settings`` are further keywords of ``ShieldedDriver``.
+        The scenario and the harm count come from ``task``; ``settings`` are further keywords of ``ShieldedDriver``.
         """
         if isinstance(driver, Team) and len(task.vehicles) == 1:
             driver = Team.of(driver, task.vehicles).drivers[task.vehicle]

@@ -64,7 +64,7 @@ def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) 
 
     Args:
         driver: an agent or a team.
-        worlds: n worlds at the alert, simulated in chunks of ``CHUNK``.
+        worlds: n worlds at the alert, simulated in groups of at most ``CHUNK`` worlds.
         task: scenario, shielded vehicles and harm count.
         settings: further keywords of ``ShieldedDriver``.
 

@@ -43,9 +43,9 @@ class Review(NamedTuple):
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
     """Compare each intervention with the same episode in which ``policy`` drives unshielded from that decision on.
 
-    An intervention is *needed* if the unshielded harm is higher, *costly* if it is lower, and *harmless* if it is the
-    same. The actual episode is simulated again as well. Both harms are thus computed in the same worlds, even if the
-    shield assumed other worlds.
+    An intervention is *needed* if the harm without it is higher than the harm with it, *costly* if the harm without it
+    is lower, and *harmless* if the harm is the same. The episode with the interventions is simulated again as well, so
+    both harms are computed in the same worlds, even if the shield assumed other worlds.
 
     Args:
         shield: a shield with ``logging``, after its episodes in ``worlds``. Log entries of earlier episodes are
@@ -60,8 +60,8 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
         raise InvalidInput("review: the shield has no log; make it with logging=True, and run episodes behind it")
     if worlds.n != shield.memory.running.n:
         raise InvalidInput(
-            f"review: worlds: has {count_of(worlds.n, 'world')}; must be the {shield.memory.running.n} of the shield's"
-            " last episodes"
+            f"review: worlds: has {count_of(worlds.n, 'world')}; must be the"
+            f" {count_of(shield.memory.running.n, 'world')} of the shield's last episodes"
         )
     log = [
         entry for entry in shield.log if entry.world < worlds.n and entry.episode == shield.memory.episode[entry.world]
@@ -109,7 +109,7 @@ class _Released(AgentAround):
         policy: the policy.
         actions: recorded action of each decision, [m, L].
         release: number of the first decision of the policy, [m].
-        deciding: indices of the vehicles that decide at the same times.
+        deciding: indices of all shielded vehicles, which decide at the same times.
         time_step_s: time between two decisions, s.
 
     """

@@ -1,6 +1,6 @@
 """The first plan of a step shield at the alert: the constant actions of least harm.
 
-For one shielded vehicle the constant action is that of E-V2X-BM (the coupled optimum). For several vehicles the plan is
+For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled optimum). For several vehicles the plan is
 the best of these candidates:
 
 - All vehicles brake fully.
@@ -41,7 +41,7 @@ def best_constants(
 
     Args:
         worlds: n worlds at the alert.
-        running: the episodes of these worlds, with all possible worlds.
+        running: the episodes of these worlds, with the possible worlds of each world.
         vehicle: index of the shielded vehicle (0 = front), or indices of several.
         width: number of decisions of a plan.
         scenario: the scenario of these worlds.

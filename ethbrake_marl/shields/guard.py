@@ -31,12 +31,12 @@ class StepGuard(ShieldGuard):
         policies: vehicle index -> policy that is rolled out (simulated) from each alert, and that proposes if the
             caller gives no action.
         shield: the shield of the engine's learners, before any episode.
-        mode: mode of the shield; the infos report its number.
-        where: name of the user's interface, with which error messages begin.
-        shares: whether the infos contain the harm that each vehicle bears; with a cap they always do.
+        mode: mode of the shield; the infos report the number of the mode.
+        where: name of the function or class that the user called, with which error messages begin.
+        shares: whether the infos contain the harm that each vehicle bears; with a cap they always contain it.
         later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
-        told: the shield's assumption about the worlds at the alert; None: the true worlds. Policies always observe the
-            true worlds.
+        told: the worlds at the alert, as the shield assumes them; None: the shield knows the true worlds. Policies
+            always observe the true worlds.
         warns: whether to warn with ``MovingAtHorizon``, once, if a vehicle still moves at the horizon under the first
             plan.
 
@@ -109,8 +109,9 @@ class StepGuard(ShieldGuard):
         """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
         ``ruling`` is the decision that was applied, ``after`` the engine after the step. Raises ``UncertifiedStep`` if
-        a world differs from the prediction. If the shield assumes other worlds than the true ones (``told``), a
-        differing world becomes distrusted instead. Worlds in which the physics failed are not compared.
+        a world differs from the prediction. If the shield assumes other worlds than the true ones (``told``), a world
+        that differs from the prediction becomes distrusted instead. Worlds in which the physics failed are not
+        compared.
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield

@@ -92,7 +92,7 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
         action: actions of the shielded vehicles, [K].
         after: receives the new state, [S].
 
-    Returns ``GOES_ON``, another code for the end of the episode, or a negative code if the physics failed.
+    Returns ``GOES_ON``, a code that says how the episode ended, or a negative code if the physics failed.
 
     """
     enter(world, m, state)
@@ -201,7 +201,8 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
         ended: whether the episode has ended in this possible world.
         step: number of the present decision.
         plan: actions of each decision, [L, K].
-        most: harm at which the simulation stops once it is exceeded, m2/s2. Harm never falls during an episode.
+        most: limit of the harm, m2/s2. The simulation stops when the harm exceeds this limit, because harm never falls
+            during an episode.
 
     Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
 
@@ -253,7 +254,8 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
     """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
 
-    The time until the horizon is simulated in one segment. Returns infinity if the physics fails.
+    The time until the horizon is simulated in one segment, not decision by decision. Returns infinity if the physics
+    fails.
 
     Args:
         world: parameters of the M possible worlds of one world (``Members``).
@@ -261,8 +263,8 @@ def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int,
         state: present state of this possible world, [S].
         ended: whether the episode has ended in this possible world.
         step: number of the present decision.
-        constants: C constant actions of the K shielded vehicles, [C, K].
-        c: row of the constant action to hold.
+        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
+        c: index of the row of ``constants`` to hold.
 
     """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds

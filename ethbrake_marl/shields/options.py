@@ -2,7 +2,7 @@
 
 A mode is a registered name of a shield (entry-point group ``ethbrake_marl.shields``). The registry entry of a mode
 contains its class of settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with further settings
-has a subclass, which adds and checks the further fields and makes the guard of that mode.
+has a subclass of ``ShieldOptions``, which adds and checks the further fields and makes the guard of the mode.
 """
 
 from __future__ import annotations
@@ -32,19 +32,20 @@ class ShieldOptions:
     Args:
         mode: ``step`` certifies or replaces each action; an action is certified if some plan after it keeps the harm
             within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM drives the whole episode.
-            None means ``step``, or the mode of an extension if only that mode has the other settings.
+            None means ``step``; but if only the mode of an extension has the other settings, None means this mode.
         bound: method to compute ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled`` (the engine's physics)
             or ``pairwise`` (the paper's closed form).
         harm_count: impacts whose harm is bounded: ``first`` (each pair's first) or ``total`` (all).
-        allowance: amount by which the bound is loosened, for fewer replaced actions, m2/s2; not in mode ``episode``.
-        cap: ``baseline``: no vehicle bears more harm than under the constant actions of least harm; only in mode
-            ``step``. None: only the sum over the vehicles is bounded.
+        allowance: amount by which the bound is loosened, for fewer replaced actions, m2/s2; not allowed in mode
+            ``episode``.
+        cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; only allowed
+            in mode ``step``. None: only the sum over the vehicles is bounded.
         intervention_penalty: amount subtracted from the reward of a step in which the proposed action was replaced.
-        logging: whether ``shield.log`` collects the replaced actions; not in mode ``episode``.
+        logging: whether ``shield.log`` collects the replaced actions; not allowed in mode ``episode``.
         shares: whether ``infos`` contains the harm that each vehicle bears under the current plan and under the
-            constant actions of least harm; with a ``cap`` it always does. This slows a step by a few percent; not in
-            mode ``episode``.
-        where: name of the user's interface, with which error messages begin.
+            constant actions of least harm; with a ``cap`` it always contains this harm. The computation slows a step by
+            a few percent. Not allowed in mode ``episode``.
+        where: name of the function or class that the user called, with which error messages begin.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
 
@@ -125,7 +126,8 @@ class ShieldOptions:
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
         """Raise ``InvalidInput`` if a shield with these settings cannot be used in the scenario.
 
-        With ``several``, which means that a team is shielded, nothing is checked: making the guard does the checks.
+        If ``several`` is true (a team is shielded), this method checks nothing, because making the guard checks the
+        same.
         """
         if not several:
             self.shield(scenario, one_learner(scenario) or 0)
@@ -137,7 +139,7 @@ class ShieldOptions:
             engine: the engine that gets the guard.
             policies: vehicle index -> policy that proposes the vehicle's actions; may be empty except in mode
                 ``episode``.
-            several: whether a single learner counts as a team of one.
+            several: whether a single learner is treated as a team of one vehicle.
             how: further keywords of ``StepGuard``.
 
         """
@@ -164,14 +166,14 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
         value: value of the setting.
         mode: the mode.
         takers: modes that accept the setting.
-        where: name of the user's interface, with which the message begins.
+        where: name of the function or class that the user called, with which the message begins.
 
     """
     return InvalidInput(f"{where}: {name} = {value!r}: not a setting of mode {mode}; use mode {' or '.join(takers)}")
 
 
 def shielded_vehicle(engine: Engine, several: bool) -> int | tuple[int, ...]:
-    """Return the index of an engine's learner; a tuple of indices for several learners, or with ``several``."""
+    """Return the index of an engine's learner; for several learners, or if ``several``, a tuple of indices."""
     vehicles = tuple(engine.learners)
     return vehicles if several or len(vehicles) > 1 else vehicles[0]
 
@@ -182,7 +184,7 @@ def one_learner(scenario: Scenario) -> int | None:
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class of a mode that does.
+    """Return the settings class of ``mode`` if it has all ``settings``, otherwise that of the first mode that has them.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

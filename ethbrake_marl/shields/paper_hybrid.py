@@ -3,10 +3,11 @@
 The policy is rolled out (simulated) in the engine from the alert on. Its harm is compared with ``H*``, the harm of the
 baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole episode.
 
-The coupled ``H*`` is computed in the same engine. With it, the hybrid does at most the harm of the baseline in every
-world, provided that the policy repeats its rollout. A policy with random actions does not repeat its rollout; use the
-step shield for it. With the paper's pairwise ``H*`` there is no such guarantee: it treats the two pairs as independent,
-and is about half of the harm that the same deceleration causes in the engine.
+The coupled ``H*`` is computed in the same engine. With the coupled ``H*``, the hybrid does at most the harm of the
+baseline in every world, provided that the policy repeats its rollout. A policy with random actions does not repeat its
+rollout; use the step shield for such a policy. With the paper's pairwise ``H*`` there is no guarantee: the pairwise
+``H*`` treats the two pairs as independent, and is only about half of the harm that the same deceleration causes in the
+engine.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ Bound = Literal["coupled", "pairwise"]  # method to compute H* and a*: the engin
 
 
 class HybridAgent(AgentAround):
-    """Agent that drives by ``policy`` in worlds where the policy's rollout does at most ``H*`` harm, else by E-V2X-BM.
+    """Agent that drives by ``policy`` in worlds where the harm of its rollout is at most ``H*``, otherwise by E-V2X-BM.
 
     The rollout simulates the policy from the alert on. ``H*`` is the harm of E-V2X-BM's constant deceleration.
 
     Args:
-        policy: the agent to choose or reject in each world.
-        scenario: the scenario in which both are compared.
+        policy: the agent that is chosen or rejected in each world.
+        scenario: the scenario in which ``policy`` and E-V2X-BM are compared.
         bound: method to compute ``H*`` and the deceleration: ``coupled`` (the engine's physics) or ``pairwise`` (the
             paper's closed form).
         harm_count: harm that is compared: ``first`` (each pair's first impact) or ``total`` (all impacts).
@@ -127,7 +128,7 @@ class EpisodeGuard(ShieldGuard):
     Args:
         engine: the engine that gets this guard.
         hybrid: the agent that chooses and drives.
-        where: name of the user's interface, with which error messages begin.
+        where: name of the function or class that the user called, with which error messages begin.
 
     """
 

@@ -1,4 +1,4 @@
-"""Rollouts of the proposing policies: simulations in which the policies drive. Their actions become a plan.
+"""Rollouts of the proposing policies: simulations in which the policies drive. The actions of a rollout become a plan.
 
 A plan has one action for each decision. A rollout starts at the alert or at a later decision, and its plan is certified
 like any other plan (``plan_harm``). If a policy later deviates from its rollout, the shield may have to intervene; the
@@ -46,7 +46,7 @@ def rolled_out(
     Args:
         worlds: n worlds at the alert.
         policies: index of each shielded vehicle -> its policy.
-        scenario: the scenario, whose scripts drive the other vehicles.
+        scenario: the scenario whose scripts drive the other vehicles.
         vehicle: index of the only shielded vehicle, or a tuple of K indices.
         width: number of decisions to return.
 
@@ -93,8 +93,8 @@ def certify_rollouts(
     """Decide again in worlds whose proposals were rejected, with rollouts of the policy as plans.
 
     The plan consists of the clipped proposal, followed by the actions of the policy in a simulation from the next state
-    on. If this plan keeps the budget, it becomes the backup and the proposal is accepted. Otherwise the reason stays
-    ``NO_CERTIFICATE``. With several vehicles, a vehicle whose proposal is NaN takes its planned action.
+    on. If this plan stays within the budget, it becomes the backup and the proposal is accepted. Otherwise the reason
+    stays ``NO_CERTIFICATE``. With several vehicles, a vehicle whose proposal is NaN takes its planned action.
 
     Args:
         running: the n episodes of the whole batch.

@@ -33,7 +33,7 @@ class Running(NamedTuple):
 
     @property
     def n(self) -> int:
-        """Number n of worlds; several possible worlds of a world count once."""
+        """Number n of worlds; a world with several possible worlds counts once."""
         return len(self.steps)
 
     @property
@@ -43,7 +43,7 @@ class Running(NamedTuple):
 
     @property
     def finished(self) -> Bools:
-        """Whether the episode is over in every possible world of a world, [n]."""
+        """Whether the episode of each world is over in all possible worlds of this world, [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property

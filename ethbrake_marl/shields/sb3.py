@@ -17,10 +17,11 @@ from ethbrake_marl.shields.attach import Attached, Proposing
 
 
 class ShieldedVecEnv(SeededInside, VecEnvWrapper):
-    """``make_sb3_vec_env`` behind a shield, by default in mode ``step``. The rows of one world are decided together.
+    """The environment of ``make_sb3_vec_env`` behind a shield, by default in mode ``step``.
 
-    The infos of each row contain ``shield_bound_harm`` and the other shield entries at every step; ``reset_infos``
-    contains them at the alert. The return in ``infos[row]["episode"]`` does not include the intervention penalty.
+    The shield decides on all learners (rows) of one world together. The infos of each row contain ``shield_bound_harm``
+    and the other shield entries at every step; ``reset_infos`` contains them at the alert. The return in
+    ``infos[row]["episode"]`` does not include the intervention penalty.
 
     Args:
         venv: an environment made by ``make_sb3_vec_env``.
@@ -28,7 +29,7 @@ class ShieldedVecEnv(SeededInside, VecEnvWrapper):
             None: the bound is the harm of E-V2X-BM.
         options: keywords of ``ShieldOptions``.
 
-    Raises ``InvalidInput`` for another kind of environment, or for several learners in another mode than ``step``.
+    Raises ``InvalidInput`` for another kind of environment, and for several learners if the mode is not ``step``.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np

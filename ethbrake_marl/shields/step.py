@@ -6,10 +6,10 @@ bound never rises during the episode. An episode ends at rest or at the scenario
 anything that happens after the horizon.
 
 **Induction.** Between two decisions the shield has a *plan* with an action for every decision up to the horizon. Let
-``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. It includes
-the harm so far, and takes into account which pairs were already hit. The function ``members.follow_plan`` computes
-``c``. It advances decision by decision with the same operations as the engine's step, in the same order, and adds harm
-in the same order. Hence:
+``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. ``c``
+includes the harm so far, and takes into account which pairs were already hit. The function ``members.follow_plan``
+computes ``c``. This function advances decision by decision with the same operations as the engine's step, in the same
+order, and adds harm in the same order. Hence:
 
 1. *Start.* ``c = B``.
 2. *A proposal is applied* only if there is a plan from the next state on whose harm is at most the budget. The function
@@ -17,17 +17,18 @@ in the same order. Hence:
    becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because the same
    operations act on the same numbers.
 3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, it passed through the state after
-   this action, so the harm of the rest of the plan is ``c`` to the last bit. A plan with less harm may replace it.
+   this action, so the harm of the rest of the plan is ``c`` to the last bit. A plan with less harm may replace this
+   rest.
 4. *End.* When the episode ends, no action is left to execute, and ``c`` is the harm of the episode.
 
 The *budget* is the largest harm that a new plan may have: ``c``, or any value between ``c`` and ``B``. Hence
 ``c <= B`` always. ∎ The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode
 and the last bound are the same floating-point number.
 
-**Several vehicles.** With several shielded vehicles, each action in the proof is a row of actions, one per vehicle. All
-proposals are tried together first. If they cannot be certified together, they are tried one by one, front to rear: the
-proposal of one vehicle replaces its action in the plan. The proposal is accepted if a plan after it keeps the budget;
-otherwise the vehicle's planned action stays. Each attempt begins and ends with a certified plan.
+**Several vehicles.** With several shielded vehicles, each action in the proof is a row of actions, one per vehicle.
+First, all proposals are tried together. If they cannot be certified together, they are tried one by one, front to rear:
+the proposal of one vehicle replaces its action in the plan. The proposal is accepted if a plan after it stays within
+the budget; otherwise the vehicle's planned action remains. Each attempt begins and ends with a certified plan.
 
 **Several members.** The shield may consider several possible worlds, the *members* of a world. Each harm in the proof
 is then the largest over the members, and the same actions advance all members. So the harm of *every* member is at
@@ -68,8 +69,8 @@ Cap = Literal["baseline"]  # plan that sets the caps: a vehicle may bear at most
 class StepShield:
     """Bound the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` in every step.
 
-    Both methods replace ``memory`` as a whole and change no array in place. After an error the old memory is still
-    there, and a ``copy.copy`` of the shield is independent.
+    Both methods replace ``memory`` as a whole and change no array in place. If a method raises an error, the old memory
+    remains. A ``copy.copy`` of the shield is independent of the shield.
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. If
     ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises. It
@@ -80,10 +81,10 @@ class StepShield:
     brakes beyond its capacity, a number is NaN, a message is missing), ``memory.distrusted`` [n] is set, and the bound
     no longer holds. The shield then ignores proposals for the rest of the episode. It applies the rest of the plan or
     the best constant action, whichever does less harm, and chooses again whenever the world differs from the
-    prediction. A world that goes on after the predicted end of its episode brakes fully.
+    prediction. If a world goes on after the predicted end of its episode, the shielded vehicles brake fully.
 
-    With several ``possible`` worlds, each harm is the largest over them, and the observed world must lie within the
-    range of their predictions.
+    With several ``possible`` worlds, each harm is the largest harm over these worlds, and every number in the observed
+    world must lie within the range of the numbers predicted for them.
 
     Args:
         scenario: the scenario of all worlds.
@@ -92,8 +93,8 @@ class StepShield:
         allowance: amount by which the bound is loosened until the episode ends, m2/s2.
         others: index of each other vehicle -> its script, whose command must be fixed at the alert; None: the
             scenario's scripts.
-        cap: ``baseline``: no vehicle bears more harm than under the constant actions of least harm; None: only the sum
-            over the vehicles is bounded.
+        cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; None: only the
+            sum over the vehicles is bounded.
         logging: whether ``log`` collects the interventions.
 
     Raises ``InvalidInput`` for an unknown harm count, an unknown vehicle, a negative allowance, or a script in
@@ -123,7 +124,7 @@ class StepShield:
         if not each or any(not isinstance(i, int | np.integer) or isinstance(i, bool) or i not in known for i in each):
             raise InvalidInput(f"shield: vehicle = {vehicle!r}: must be an index from 0 to {scenario.vehicles - 1}")
         if list(each) != sorted(set(each)):
-            raise InvalidInput(f"shield: vehicle = {vehicle!r}: several indices must be in increasing order, each once")
+            raise InvalidInput(f"shield: vehicle = {vehicle!r}: must have each index once, in increasing order")
         if cap not in (None, *get_args(Cap)):
             raise unknown_name("shield cap", cap, get_args(Cap))
         self.vehicles = tuple(map(int, each))
@@ -197,12 +198,12 @@ class StepShield:
         To enlarge the batch to k rows, start all rows 0 to k - 1 in one call.
 
         Args:
-            worlds: the shield's assumption about the worlds of these rows at the alert.
+            worlds: the worlds of these rows at the alert, as the shield assumes them.
             rows: indices of the rows in which the episodes start.
             policy: the proposing policy, which is simulated from the alert; for several vehicles, vehicle index ->
                 policy. None: the bound is the harm of the best constant actions.
-            possible: the M possible worlds of each world, [len(rows) * M], each time beginning with the world itself;
-                None: ``members_of(worlds)``.
+            possible: M possible worlds for each world, the first of which is the world itself, [len(rows) * M]; None:
+                the result of ``members_of(worlds)``.
 
         Raises ``InvalidInput`` for rows that do not exist in the batch, and if the messages in ``worlds`` lack a
         quantity that the shield needs.
@@ -211,8 +212,8 @@ class StepShield:
         running_rows = len(self.memory.first_bound)
         if not (rows < running_rows).all() and sorted(rows.tolist()) != list(range(len(rows))):
             raise InvalidInput(
-                f"shield: begin in row {rows.max()}, but the batch has {running_rows} rows; to enlarge it, begin in"
-                " all of its rows at once"
+                f"shield: begin in row {rows.max()}, but the batch has {running_rows} rows; to enlarge the batch,"
+                " begin in all rows of the larger batch at once"
             )
         refuse_untold(worlds, self.vehicles, "shield")
         possible = self.members_of(worlds) if possible is None else possible
@@ -233,7 +234,7 @@ class StepShield:
         Args:
             worlds: n worlds at the alert.
             rows: rows of the batch in which the episodes start, [n].
-            policy: the proposing policy; for several vehicles, vehicle index -> policy; None: no policy.
+            policy: the proposing policy, or vehicle index -> policy for several vehicles; None: no policy.
             possible: the M possible worlds of each world, [n * M].
 
         """
@@ -249,8 +250,8 @@ class StepShield:
             policies = policy if isinstance(policy, Mapping) else dict.fromkeys(vehicles[:1], policy)
             if set(policies) != set(vehicles):
                 raise InvalidInput(
-                    f"shield: policy: has vehicles {sorted(policies)}; must have exactly the shielded vehicles,"
-                    f" {list(vehicles)}"
+                    f"shield: policy: is for the vehicles {sorted(policies)}; must be for exactly the shielded"
+                    f" vehicles, {list(vehicles)}"
                 )
             drivers = {i: policies[i] for i in vehicles}
             actions = rolled_out(worlds, drivers, self.scenario, self.vehicle, self._width)
@@ -271,7 +272,7 @@ class StepShield:
         )  # fmt: skip
 
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
-        """Return the possible worlds and the commands of the unshielded vehicles, as a problem of ``engine.profiles``.
+        """Return the possible worlds and the unshielded vehicles' commands, prepared for ``engine.profiles``.
 
         ``members`` is the number of possible worlds of each world. Raises ``InvalidInput`` if the commands are not
         fixed at the alert. With several possible worlds, it is also raised if the first decision in one of them is not
@@ -279,7 +280,9 @@ class StepShield:
         """
         vehicles, horizon_s = self.vehicles, self.scenario.horizon_s
         if members > 1 and self.cap is not None:
-            raise InvalidInput(f"shield: cap = {self.cap!r}: must be None with {members} possible worlds")
+            raise InvalidInput(
+                f"shield: cap = {self.cap!r}: must be None, because each world has {members} possible worlds"
+            )
         latest = possible.vehicles.latency_s[:, list(vehicles)].min(axis=1).max()
         if members > 1 and not latest < horizon_s:
             raise InvalidInput(
@@ -305,10 +308,10 @@ class StepShield:
 
         Args:
             possible: the M possible worlds of each world at the alert.
-            problem: the same worlds as a problem of ``engine.profiles``.
+            problem: the same worlds, prepared for the functions of ``engine.profiles``.
             rows: rows of the batch in which the episodes start.
             plan: the first plans, [n, L] or [n, L, K].
-            harm: harm of the first plans in the worst possible world, [n] m2/s2.
+            harm: largest harm of each first plan over the possible worlds, [n] m2/s2.
 
         """
         return harm, None
@@ -330,8 +333,8 @@ class StepShield:
                 with the prediction.
             only: whether to decide in each world, [n]; other worlds stay unchanged. None: decide in all worlds whose
                 episode has not ended.
-            proposer: the policies. If no other plan certifies a proposal, they are simulated from this decision on, and
-                their actions are tried as a plan. None: no such simulation.
+            proposer: the proposing policies. If no other plan certifies a proposal, these policies are simulated from
+                this decision on, and the resulting actions are tried as a plan. None: no policy is simulated.
 
         Returns the decision with the actions to apply. ``memory`` then contains the predicted next state.
 
@@ -384,7 +387,7 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the final decision, given a decision that keeps the budget in every possible world.
+        """Return the final decision, given a decision that stays within the budget in every possible world.
 
         This class returns ``decision`` unchanged; a subclass may replace more actions.
 
@@ -392,8 +395,8 @@ class StepShield:
             now: the episodes before the decision.
             memory: memory before the decision, with the old plan.
             budget: largest harm that is accepted in each episode, [n] m2/s2.
-            decision: the decision that keeps the budget.
-            asked: whether to decide in each world, [n].
+            decision: the decision that stays within the budget.
+            asked: whether a decision is needed in each world, [n].
 
         """
         return decision
@@ -402,7 +405,7 @@ class StepShield:
         """Return the observed worlds ``seen`` [n, columns] in a form that can be compared with the prediction.
 
         The prediction may have a column for the gap to an obstacle ahead. In worlds without an obstacle this gap is
-        infinite; it is replaced by the predicted gap. Nothing else is changed.
+        infinite; it is replaced by the predicted gap. All other numbers stay the same.
         """
         running = self.memory.running
         assert running is not None
@@ -416,9 +419,9 @@ class StepShield:
     def expects(self, seen: Floats) -> Bools:
         """Return whether each observed world in ``seen`` [n, columns] agrees with the prediction, [n].
 
-        With one possible world, the observed and the predicted world must be equal to the bit. With several, each
-        observed number must lie within the range of the predictions. After an impact in any possible world, every
-        finite number is accepted.
+        With one possible world, the observed and the predicted world must be equal to the bit. With several possible
+        worlds, each observed number must lie within the range of the predictions. After an impact in any possible
+        world, every finite number is accepted.
         """
         running = self.memory.running
         assert running is not None

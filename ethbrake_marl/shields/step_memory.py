@@ -39,9 +39,9 @@ class StepMemory(NamedTuple):
     def put(self, rows: Ints, begun: StepMemory) -> StepMemory:
         """Return this memory with new episodes in the rows with the indices ``rows``.
 
-        ``begun`` is the memory of the new episodes, in the order of ``rows``; only ``begun.enclosure`` is for the whole
-        batch. If there are at least as many new as present episodes, they replace the whole batch. Episode numbers
-        continue.
+        ``begun`` is the memory of the new episodes, in the order of ``rows``; only ``begun.enclosure`` contains all
+        rows of the batch. If there are at least as many new as present episodes, the new episodes replace the whole
+        batch. Episode numbers continue.
         """
         old, new = self.running, begun.running
         assert new is not None

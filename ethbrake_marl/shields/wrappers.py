@@ -1,4 +1,4 @@
-"""Shield wrappers for every kind of environment: each puts a guard into the engine, which reports in the infos."""
+"""Shield wrappers for every kind of environment: each wrapper puts a guard into the engine."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     Args:
         env: ``eb.parallel_env(...)`` with one learner (in mode ``step`` one or more), or a wrapper around it.
         policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. It proposes actions that the
-            caller leaves out. Where it does less harm than E-V2X-BM, its harm is the bound (the harm that the episode
-            will not exceed). Mode ``episode`` needs a policy.
+            caller leaves out. In worlds where the policy does less harm than E-V2X-BM, its harm is the bound (the harm
+            that the episode will not exceed). Mode ``episode`` needs a policy.
         agents: names of the shielded learners, which must be all learners; None: all learners.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
@@ -87,8 +87,8 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
             self.attached.close()
             raise InvalidInput(
                 f"HybridShield: agents = {asked}: must be all learners, {self.shielded}, since the bound holds only if"
-                " every other vehicle follows a script; leave a vehicle out of learners=[...] of the environment to"
-                " give it a script"
+                " every other vehicle follows a script; to give a vehicle a script, leave it out of learners=[...] when"
+                " you make the environment"
             )
 
     def reset(
@@ -119,7 +119,7 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
 
 def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, **settings: Any) -> Any:
-    """Return a shielded environment in which the agents act in turn (AEC), front to rear.
+    """Return a shielded environment in which the agents act one after the other (AEC), front to rear.
 
     ``env`` is a parallel environment, because the shield needs the actions of all agents at once. ``args`` and
     ``settings`` are further arguments of ``HybridShield``.
@@ -177,7 +177,7 @@ class ShieldedEnv(
         """Advance by one time step; the shield certifies or replaces the action [1].
 
         Returns the values that the wrapped environment returns, with the intervention penalty subtracted from the
-        reward. If ``CostEnv`` is wrapped, they include its cost.
+        reward. If the environment contains a ``CostEnv``, these values include the cost.
         """
         self.attached.check_open()
         observation, reward, *others = self.env.step(action)
@@ -250,15 +250,16 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             vector environment, or a Stable-Baselines3 ``VecEnv``. If inner wrappers change actions, the shield
             certifies the changed action. ``env`` may also be an agent or a team; ``options`` must then contain
             ``scenario``, the scenario in which actions are certified.
-        policy: policy that proposes the actions that the caller leaves out. Where it does less harm than E-V2X-BM, its
-            harm is the bound (the harm that the episode will not exceed). It may be None, except in mode ``episode``.
-        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``, or the mode of an extension if
-            only that mode has the ``options``.
+        policy: policy that proposes the actions that the caller leaves out. In worlds where the policy does less harm
+            than E-V2X-BM, its harm is the bound (the harm that the episode will not exceed). It may be None, except in
+            mode ``episode``.
+        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if only the mode of an
+            extension has the ``options``, None means this mode.
         options: further keywords of ``ShieldOptions``.
 
-    Returns a ``HybridShield`` (for AEC, an environment with agents in turn around it), a ``ShieldedEnv``, a
-    ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. For an agent or a team, returns the shielded agent or team. Raises
-    ``InvalidInput`` for any other object, and for invalid arguments.
+    Returns a ``HybridShield`` (for AEC, an AEC environment around a ``HybridShield``), a ``ShieldedEnv``, a
+    ``ShieldedVectorEnv`` or a ``ShieldedVecEnv``. If ``env`` is an agent or a team, returns this agent or team behind a
+    shield. Raises ``InvalidInput`` for any other object, and for invalid arguments.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
@@ -273,7 +274,7 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             raise InvalidInput(f"shield: agent {env.name!r} already has a shield")
         if policy is not None or "scenario" not in options:
             raise InvalidInput(
-                f"shield: agent {env.name!r}: pass scenario= (the scenario for certification) and no policy="
+                f"shield: agent {env.name!r}: pass scenario= (in which actions are certified), and leave out policy="
             )
         return shielded(env, load_scenario(settings.pop("scenario")), **settings)
     if isinstance(env, AECEnv):
@@ -282,8 +283,8 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
             inside = inside.env
         if not isinstance(inside, ParallelEnv):
             raise InvalidInput(
-                f"shield: in {inside} the agents act in turn; shield the parallel environment inside it:"
-                " eb.shielded_aec(parallel)"
+                f"shield: in {inside} the agents act one after the other; shield the parallel environment inside it"
+                " with eb.shielded_aec(parallel)"
             )
         return shielded_aec(inside, policy, **settings)
     if isinstance(env, VectorEnv):

@@ -65,7 +65,7 @@ SPECS: dict[str, Callable[[], object]] = {
     "agent 'coast:1': coast takes no argument": lambda: make_agent("coast:1"),
     "agent 'full_brake@': a path must follow '@'": lambda: make_agent("full_brake@"),
     "agent 'coast@runs/x': coast takes no policy": lambda: make_agent("coast@runs/x"),
-    "agent 'ladder': is the name of a group of agents; must be a single agent": lambda: make_agent("ladder"),
+    "agent 'ladder': is the name of a group of agents; write the name of one agent": lambda: make_agent("ladder"),
     "agent 'constant': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent("constant"),
     "agent 'constant:fast': constant needs a finite deceleration in m/s2 after the colon": lambda: make_agent(
         "constant:fast"
@@ -179,8 +179,8 @@ FAILED: dict[str, Callable[[], object]] = {
     "agent 'own', world 4, vehicle_2 at 0.50 s: command -99 m/s2; must be in [-7, 7]": lambda: evaluated(
         Own(lambda worlds: np.where(np.arange(worlds.n) == 4, -99.0, 0.0))
     ),
-    "agent 'own', world 0, step 1 (0.50 s): observations of shape (12, 27): gave a tuple of 2; must": lambda: evaluated(
-        policy(lambda n: (np.zeros((n, 1)), None))
+    "agent 'own', world 0, step 1 (0.50 s): observations of shape (12, 27): returned a tuple of 2 values": lambda: (
+        evaluated(policy(lambda n: (np.zeros((n, 1)), None)))
     ),
 }
 
@@ -197,14 +197,18 @@ def test_agent__fails_with_its_world_and_step(message: str) -> None:
         (lambda n: np.zeros((n, 2)), 0, "; must be one number per world, shape (12, 1)"),
         (lambda n: np.zeros(n), 0, "; must be one number per world, shape (12, 1)"),
         (lambda n: np.zeros((n, 1))[:5], 5, "; must be one number per world, shape (12, 1)"),
-        (lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None], 3, "; its action is nan; must be in [-1, 1]"),
-        (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, "; its action is 1.5; must be in [-1, 1]; clip=True"),
+        (
+            lambda n: np.where(np.arange(n) == 3, np.nan, -1.0)[:, None],
+            3,
+            "; the action of this world is nan; must be in [-1, 1]",
+        ),
+        (lambda n: 1.5 * np.eye(n)[:, 2:3], 2, "; the action of this world is 1.5; must be in [-1, 1]; clip=True"),
     ],
     ids=["two columns", "no column", "too few", "nan", "beyond 1"],
 )
 def test_policy__fails_with_its_world_and_step(answer: Callable[[int], Any], world: int, reason: str) -> None:
     shape = answer(12).shape
-    told = f"gave float64 of shape {shape} for observations of shape (12, 27){reason}"
+    told = f"returned float64 of shape {shape} for observations of shape (12, 27){reason}"
     with refused(f"agent 'own', world {world}, step 1 (0.50 s): {told}", AgentFailed):
         evaluated(policy(answer))
 
@@ -355,7 +359,7 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
 
     with refused("learned: shape of actions = (12, 2): must be (12, 1), one action per world"):
         LearnedAgent(Fixed()).act(WORLDS, 1)
-    with refused("predict on 27 features: a state array has shape (1, 8) for two worlds and (1, 8) for three"):
+    with refused("predict fails for 27 features: a state array has shape (1, 8) for two worlds and (1, 8) for three"):
         eb.policy_agent(Shared())
     states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
     with refused("initial_state(12): state: ndarray of shape (3,); its first axis must be the 12 worlds", AgentFailed):
@@ -398,5 +402,5 @@ def test_model_of_stable_baselines3__was_trained_on_the_features_that_it_is_give
     with refused("the policy takes observations of shape (28,), but this observation has 27 features; pass scenario"):
         eb.policy_agent(numbered, scenario=PAIR)
     stated = PPO("MlpPolicy", eb.make_sb3_vec_env(PAIR, 2, appended="state")).policy
-    with refused("agent 'ActorCriticPolicy': appended = 'state': pass scenario=, the scenario of the training"):
+    with refused("agent 'ActorCriticPolicy': appended = 'state': pass scenario=, the training scenario"):
         eb.policy_agent(stated, appended="state")

@@ -242,7 +242,7 @@ def test_copies_that_observe_different_features__are_refused():
         ("Turned", lambda: vec_env.VecMonitor(Turned(eb.make_sb3_vec_env("paper-random", 2)))),
         ("VecFrameStack", lambda: vec_env.VecFrameStack(eb.make_sb3_vec_env("paper-random", 2), 1)),
         ("FlatVec", lambda: FlatVec([gym_env])),
-        ("VecNormalize inside another one", lambda: vec_env.VecNormalize(vec_env.VecNormalize(dummy(Titled)))),
+        ("VecNormalize inside another VecNormalize", lambda: vec_env.VecNormalize(vec_env.VecNormalize(dummy(Titled)))),
         ("OwnEnv", OwnEnv),
         ("Outside", Outside),
         ("PendulumEnv", lambda: gymnasium.make("Pendulum-v1")),
@@ -317,7 +317,7 @@ def test_who_knows_better__drives_by_it_all_the_same():
 )
 def test_action_space__is_checked_with_clip_too(space, clip):
     policy = Spaced(space)
-    with pytest.raises(InvalidInput, match=r"gives actions in .*; must be"):
+    with pytest.raises(InvalidInput, match=r"actions of the policy are in .*; must be"):
         eb.policy_agent(policy, clip=clip)
     assert eb.policy_agent(policy, clip=clip, ignore_wrappers=True).name == "Spaced"
 

@@ -225,7 +225,7 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
         (
             "worst = 3\n",
             "--agents bad.py:worst",
-            "file 'bad.py': 'worst' is not a function; name the function that makes the agent",
+            "file 'bad.py': 'worst' is not a function; write FILE.py:FUNCTION, where FUNCTION makes the agent",
         ),
         ("", "--set measures=injur", "unknown measure 'injur'; did you mean 'injury'?"),
         (

@@ -244,7 +244,8 @@ def test_dqn__of_a_file_says_what_its_indices_mean(tmp_path: Any) -> None:
     model.save(tmp_path / "dqn.zip")
     loaded = DQN.load(tmp_path / "dqn.zip")
     with pytest.raises(
-        InvalidInput, match=r"gives actions in Discrete\(9\); must be a number in \[-1, 1\]; pass actions=9 if"
+        InvalidInput,
+        match=r"actions of the policy are in Discrete\(9\); must be a number in \[-1, 1\]; pass actions=9 if",
     ):
         eb.policy_agent(loaded)
     with pytest.raises(InvalidInput, match=r"in Discrete\(9\); must be an index from 0 to 4 \(actions=5\)"):
@@ -265,7 +266,7 @@ def test_dqn__of_two_learners_and_of_supersuit_drives() -> None:
 def test_copies__with_other_numbers_of_actions_are_refused() -> None:
     model = small(make_vec_env("EthBrake-v0", n_envs=2, env_kwargs={"actions": 9}))
     model.get_env().envs[1] = gymnasium.make("EthBrake-v0", actions=17)
-    with pytest.raises(InvalidInput, match="the copies of the model's environment have different actions"):
+    with pytest.raises(InvalidInput, match="the copies of the model's environment have different numbers of actions"):
         eb.policy_agent(model)
 
 
@@ -281,10 +282,13 @@ def test_function__of_indices_drives(shape: tuple[int, ...]) -> None:
 @pytest.mark.parametrize(
     ("gives", "message"),
     [
-        (lambda n: np.full(n, 9), r"world 0, step 1 \(0.50 s\): .* its index is 9; must be a whole number"),
-        (lambda n: np.full(n, -1), "its index is -1"),
-        (lambda n: np.full(n, 2.0), "gave float64 of shape"),
-        (lambda n: np.full(n, True), "gave bool of shape"),
+        (
+            lambda n: np.full(n, 9),
+            r"world 0, step 1 \(0.50 s\): .* the index of this world is 9; must be a whole number",
+        ),
+        (lambda n: np.full(n, -1), "the index of this world is -1"),
+        (lambda n: np.full(n, 2.0), "returned float64 of shape"),
+        (lambda n: np.full(n, True), "returned bool of shape"),
         (lambda n: np.full(n + 1, 2), r"from 0 to 8 per world with actions=9, shape \(3,\) or \(3, 1\)"),
         (lambda n: np.full((n, 2), 2), "with actions=9, shape"),
     ],

@@ -363,7 +363,9 @@ def test_team__drives_a_line_of_its_length_and_vehicles_of_its_own(team: RunDire
         load_team(team.path, FOUR)
     with refused("team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has no learner"):
         load_team(team.path, PAIR.with_learners([]))
-    with refused("team: has one policy for each learner; give the path of one, for instance team/policy/vehicle_2"):
+    with refused(
+        "team: has one policy for each learner; give the path of one of them, for instance team/policy/vehicle_2"
+    ):
         load_policy(TEAM.parent)
     with refused(
         "team: this team can drive vehicle_2, vehicle_3, but scenario 'cooperation-3-pair' has learner vehicle_1"

@@ -168,8 +168,8 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score(
     (action,) = onnx_of(policy).run(["action"], {"observation": seen})
     np.testing.assert_allclose(action, policy(seen), rtol=0.0, atol=1e-5)
     for wrong, why in (
-        ({"output": "clip", "choices": None}, "among: must have output choice"),
-        ({"among": (spec,)}, "and policies without among"),
+        ({"output": "clip", "choices": None}, "among: can only be given if output is 'choice'"),
+        ({"among": (spec,)}, "and only for policies without among"),
         (
             {"among": (squashed.model_copy(update={"observation_size": 26}),)},
             r"among\[0\]: observation_size and action_size are",
@@ -367,33 +367,33 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
     "future_version": (_edit(format_version=6), r"manifest.json: format_version: must be 2, 3, 4 or 5"),
     "version_of_several_networks": (
         _edit(format_version=3),
-        r"manifest.json: format_version = 3: must be 2 with networks = 1 and output clip",
+        r"manifest.json: format_version = 3: must be 2 with networks = 1 and output = 'clip'",
     ),
     "several_networks_in_an_old_version": (
         _edit(network__networks=2, network__gate_hidden=[4], network__value_hidden=[]),
-        r"manifest.json: format_version = 2: must be 3 with networks = 2 and output clip",
+        r"manifest.json: format_version = 2: must be 3 with networks = 2 and output = 'clip'",
     ),
     "several_networks_without_a_gate": (
         _edit(format_version=3, network__networks=2, network__value_hidden=[]),
-        r"manifest.json: network: gate_hidden = \[\]: must be given with several networks",
+        r"manifest.json: network: gate_hidden = \[\]: must have a layer if networks is above 1",
     ),
     "gate_of_one_network": (_edit(network__gate_hidden=[4]), r"manifest.json: network: gate_hidden = \[4\]: must be"),
     "critic_beside_several_networks": (
         _edit(format_version=3, network__networks=2, network__gate_hidden=[4]),
-        r"manifest.json: network: value_hidden = \[5\]: must be empty with several networks",
+        r"manifest.json: network: value_hidden = \[5\]: must be empty if networks is above 1",
     ),
     "choice_among_nothing": (
         _edit(format_version=4, network__output="choice", network__value_hidden=[]),
-        r"manifest.json: network: choices = None: must be a number with output choice",
+        r"manifest.json: network: choices = None: must be a number if output is 'choice'",
     ),
     "choices_that_nobody_takes": (_edit(network__choices=9), r"manifest.json: network: choices = 9: must be a number"),
     "critic_beside_choices": (
         _edit(format_version=4, network__output="choice", network__choices=9),
-        r"manifest.json: network: output = 'choice': must have one network, no critic",
+        r"manifest.json: network: output = 'choice': networks must be 1, value_hidden empty",
     ),
     "choices_in_an_old_version": (
         _edit(network__output="choice", network__choices=9, network__value_hidden=[]),
-        r"manifest.json: format_version = 2: must be 4 with networks = 1 and output choice",
+        r"manifest.json: format_version = 2: must be 4 with networks = 1 and output = 'choice'",
     ),
     "too_many_networks": (_edit(network__networks=17), r"manifest.json: network.networks"),
     "networks_without_their_tensors": (

@@ -33,7 +33,7 @@ def actor() -> Actor:
 POLICIES: dict[str, Callable[[], object]] = {
     "/dev/zero: is not a folder; give the folder of a policy bundle (manifest.json": lambda: load_policy("/dev/zero"),
     "nothing: is not a folder; give the folder of a policy bundle (manifest.json": lambda: load_policy("nothing"),
-    "policy = None: must be the path of a run or of a policy bundle": lambda: load_policy(None),
+    "policy = None: must be the path of a training run or of a policy bundle": lambda: load_policy(None),
     "observation: is float32 of shape (3, 5); must be float32 of shape (n, 4)": lambda: actor()(
         np.zeros((3, 5), np.float32)
     ),

@@ -52,12 +52,12 @@ def team() -> StepShield:
 
 STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: vehicle = 9: must be an index from 0 to 2": lambda: StepShield(PAPER, 9),
-    "shield: allowance = -1.0: must be a number, at least 0 m2/s2": lambda: StepShield(PAPER, 1, allowance=-1.0),
+    "shield: allowance = -1.0: must be a number of at least 0 m2/s2": lambda: StepShield(PAPER, 1, allowance=-1.0),
     "shield: decide() was called before any episode began; call begin first": lambda: StepShield(PAPER, 1).decide(
         np.zeros(3)
     ),
     "shield: shape of proposed = (3,): must be (5,)": lambda: started().decide(np.zeros(3)),
-    "shield: begin in row 7, but the batch has 5 rows; to enlarge it, begin in all of its rows at once": lambda: (
+    "shield: begin in row 7, but the batch has 5 rows; to enlarge the batch, begin in all rows": lambda: (
         started().begin(WORLDS.take([0, 1]), np.array([3, 7]))
     ),
     "certify: shape of proposed = (2,), of backup.harm = (5,), of budget = (5,): must be (5,), (5,)": lambda: certify(
@@ -75,14 +75,12 @@ STEP_SHIELD: dict[str, Callable[[], object]] = {
     "shield: shape of plan = (1, 81): must be (1, at least 75, 2)": lambda: plan_harm(
         team().memory.running, np.zeros((1, 81))
     ),
-    "shield: vehicle = (2, 1): several indices must be in increasing order, each once": lambda: StepShield(
-        PAIR, (2, 1)
-    ),
+    "shield: vehicle = (2, 1): must have each index once, in increasing order": lambda: StepShield(PAIR, (2, 1)),
     "shield: vehicle = (): must be an index from 0 to 2": lambda: StepShield(PAIR, ()),
-    "shield: cap = 'baseline': must be None with 5 possible worlds": lambda: StepShield(PAPER, 1, cap="baseline").begin(
-        WORLDS.take([0]), np.arange(1), BRAKE, possible=WORLDS
-    ),
-    "shield: policy: has vehicles [1]; must have exactly the shielded vehicles, [1, 2]": lambda: StepShield(
+    "shield: cap = 'baseline': must be None, because each world has 5": lambda: StepShield(
+        PAPER, 1, cap="baseline"
+    ).begin(WORLDS.take([0]), np.arange(1), BRAKE, possible=WORLDS),
+    "shield: policy: is for the vehicles [1]; must be for exactly the shielded vehicles, [1, 2]": lambda: StepShield(
         PAIR, (1, 2)
     ).begin(PAIR.sample(1, 0).worlds, np.arange(1), COAST),
     "shield: told: has 2 worlds, but an episode begins in row 4; must have a world for every": lambda: drive(
@@ -91,7 +89,7 @@ STEP_SHIELD: dict[str, Callable[[], object]] = {
     "review: the shield has no log; make it with logging=True, and run episodes behind it": lambda: review(
         drive(WORLDS, ShieldedDriver(COAST, PAPER), PAPER, 1).guarded.shield, COAST, WORLDS
     ),
-    "review: worlds: has 5 worlds; must be the 1 of the shield's last episodes": lambda: review(
+    "review: worlds: has 5 worlds; must be the 1 world of the shield's last episodes": lambda: review(
         drive(WORLDS.take([0]), ShieldedDriver(COAST, PAPER, logging=True), PAPER, 1).guarded.shield, COAST, WORLDS
     ),
 }
@@ -108,7 +106,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     "step: told = 3: must be a Worlds object (the worlds at the alert) or None": lambda: ShieldedDriver(
         COAST, PAPER, told=3
     ),
-    "shield: mode = 'episode': use HybridAgent, the agent of this mode": lambda: ShieldedDriver(
+    "shield: mode = 'episode': has an agent of its own; use HybridAgent": lambda: ShieldedDriver(
         COAST, PAPER, mode="episode"
     ),
     "agent 'coast+step' drives vehicle_2, but vehicle_3 of scenario 'cooperation-3-pair'": lambda: drive(
@@ -119,7 +117,9 @@ AGENTS: dict[str, Callable[[], object]] = {
     ),
     "e_v2x_bm: mode = 'couple': must be 'coupled' or 'pairwise'": lambda: HybridAgent(BRAKE, PAPER, bound="couple"),
     "harm_count 'both': must be 'first' or 'total'": lambda: HybridAgent(BRAKE, PAPER, harm_count="both"),
-    "shield: agent 'coast': pass scenario= (the scenario for certification) and no policy=": lambda: eb.shield(COAST),
+    "shield: agent 'coast': pass scenario= (in which actions are certified), and leave out policy=": lambda: eb.shield(
+        COAST
+    ),
     "shield: agent 'coast+step' already has a shield": lambda: eb.shield(
         make_agent("coast+step", scenario=PAPER), scenario=PAPER
     ),
@@ -138,10 +138,10 @@ OPTIONS: dict[str, Callable[[], object]] = {
         mode="step", bound="pairwise"
     ),
     "shield: cap = 'mine': must be baseline or None": lambda: ShieldOptions(cap="mine"),
-    "shield: intervention_penalty = -1.0: must be a number, at least 0": lambda: ShieldOptions(
+    "shield: intervention_penalty = -1.0: must be a number of at least 0": lambda: ShieldOptions(
         intervention_penalty=-1.0
     ),
-    "shield: intervention_penalty = nan: must be a number, at least 0": lambda: ShieldOptions(
+    "shield: intervention_penalty = nan: must be a number of at least 0": lambda: ShieldOptions(
         intervention_penalty=float("nan")
     ),
 }
@@ -180,7 +180,7 @@ AROUND: dict[str, Callable[[], object]] = {
     "HybridShield: ethbrake_v0: must be an environment made by eb.parallel_env; eb.shield(env) chooses": lambda: (
         HybridShield(aec_env(), mode="step")
     ),
-    "shield: in BaseWrapper<ethbrake_v0> the agents act in turn; shield the parallel": lambda: eb.shield(
+    "shield: in BaseWrapper<ethbrake_v0> the agents act one after the other; shield the parallel": lambda: eb.shield(
         BaseWrapper(aec_env())
     ),
     "shield: None: must be an agent, a team, or an environment made by eb.parallel_env, eb.env": lambda: eb.shield(
@@ -231,7 +231,7 @@ def test_second_shield__is_refused_because_a_bound_holds_for_one_alone(interface
 @pytest.mark.parametrize(
     ("actions", "message"),
     [
-        ({}, "shield: an action is missing, and no policy can propose it; pass an action or policy="),
+        ({}, "shield: an action is missing, and no policy can propose it; pass the action, or make the shield with"),
         ([0.0], "step: actions = [0.0]: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}"),
         ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full"),
         ({"vehicle_2": np.array([1.5])}, "action of vehicle_2: 1.5; must be from -1 (full braking) to 1 (full"),

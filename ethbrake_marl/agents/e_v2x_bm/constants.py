@@ -33,7 +33,7 @@ _DIGIT = 1_000.0  # base in which ``_course`` encodes the number of impacts of e
 
 
 class Line(NamedTuple):
-    """One world in which decelerations of one vehicle are simulated, as tables of ``physics.rows``.
+    """One world, as tables of ``physics.rows``, in which constant decelerations of one vehicle are simulated.
 
     A table has a row for each quantity and a column for each vehicle, front to rear. With an obstacle ahead, column 0
     is the obstacle.
@@ -104,7 +104,8 @@ def make_line(
 def share_start(line: Line) -> int:
     """Simulate in ``line.shared`` until the controlled vehicle's command takes effect; return a status.
 
-    ``line.clock`` receives this time. The status is ``FLAG.DONE``, or the code of the physics check that failed.
+    ``line.clock`` receives the time until the command takes effect, s. The status is ``FLAG.DONE``, or the code of the
+    physics check that failed.
     """
     table, clock = line.shared, line.clock
     copy_table(line.start, table)
@@ -132,8 +133,8 @@ def simulate(line: Line, samples: Samples, first: int, end: int, bound: float) -
         samples: samples with the decelerations in ``at``; the other columns receive the results.
         first: index of the first sample to simulate.
         end: index after the last sample to simulate.
-        bound: harm at which a simulation stops, m2/s2. If it stops, the sample's harm is at least ``bound``, and its
-            other columns are meaningless.
+        bound: harm at which a simulation stops, m2/s2. The harm of a sample whose simulation was stopped is at least
+            ``bound``, and the sample's other numbers are meaningless.
 
     Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
@@ -209,18 +210,19 @@ def will_stay_apart(table: Floats) -> bool:
     """Return whether it is certain that no pair has another impact while the present commands last.
 
     ``table`` is the table of one world (``physics.rows``). The result is False if a command is not yet in full effect,
-    or if a vehicle drives or moves backward. Otherwise every vehicle keeps its acceleration until it stands, and
+    or if a vehicle drives or moves backward. Otherwise every vehicle keeps its acceleration until it is at rest, and
     vehicles that press against each other have the same acceleration.
 
     Let a pair of a front vehicle f and a rear vehicle r have the gap g, the closing speed w, the speeds v_f and v_r,
     and the decelerations d_f and d_r. The pair has no impact under any of these conditions:
 
-    * Vehicle r stands, or both vehicles move as one body.
-    * ``w <= 0`` and ``d_r >= d_f``. Then w stays at most 0 until r stands.
-    * All of the following hold, with margins for rounding. The stopping point of r is behind the stopping point of f:
-      ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``. The vehicles do not touch, or they separate. If r closes in and brakes
-      harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``. (If r brakes less hard, the gap is
-      smallest now or at the end, because it is a concave function of time until f stands, and decreases afterwards.)
+    * Vehicle r is at rest, or both vehicles move as one body.
+    * ``w <= 0`` and ``d_r >= d_f``, so w stays at most 0 until r is at rest.
+    * Three conditions hold together, with margins for rounding. First, the vehicles do not touch, or they separate.
+      Second, the stopping point of r is behind the stopping point of f: ``g + v_f^2 / (2 d_f) > v_r^2 / (2 d_r)``.
+      Third, if r closes in and brakes harder than f, the smallest gap is positive: ``w^2 < 2 (d_r - d_f) g``. (If r
+      brakes less hard, the gap is smallest now or at the end, because the gap is a concave function of time until f is
+      at rest, and decreases afterwards.)
     """
     vehicles, hardest = table.shape[1], 0.0
     if pieces_to_come(table):
@@ -268,7 +270,7 @@ def _way_to_stop(speed: float, acceleration: float) -> float:
 
 @compiled(within=True)
 def _course(line: Line) -> float:
-    """Return a number that encodes the numbers of impacts of each pair, and with the obstacle, in ``line.table``."""
+    """Return a code of how many impacts each pair, and Vehicle 1 with the obstacle, have had in ``line.table``."""
     course, digit, table = 0.0, 1.0, line.table
     for p in range(line.vehicles, table.shape[1] - 1):
         course += table[ROW.COUNT, p] * digit

@@ -1,6 +1,6 @@
 """First contact of a single pair in closed form, and the decelerations that avoid it.
 
-The symbols for a pair follow; docs/internals/proofs/constant-deceleration.md derives every formula.
+The table defines the symbols for a pair. docs/internals/proofs/constant-deceleration.md derives every formula.
 
 =============  ===============================================================
 l, f           leader (front vehicle), follower (rear vehicle)
@@ -144,8 +144,8 @@ def contact_leader_first(gap: float, v_l: float, a_l: float, v_f: float, a_f: fl
 def contact_before_leader_brakes(gap: float, w: float, a_f: float, lead: float) -> float:
     """Return the squared closing speed if a braking follower meets a leader that still coasts; else -1. [m2/s2]
 
-    The pair meets at the time ``2 gap / (w + sqrt(w^2 - 2 a_f gap)) <= lead``. A touch without impact is ignored,
-    because the pair then separates again.
+    The pair meets at the time ``2 gap / (w + sqrt(w^2 - 2 a_f gap))``, if this time is at most ``lead``. A touch
+    without impact is ignored, because the pair then separates again.
 
     Args:
         gap: gap at the start, m.
@@ -281,7 +281,7 @@ def least_to_spare_front(gap: float, v_l: float, a_l: float, onset_l: float, v_f
 
 @compiled
 def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: float) -> float:
-    """Return the largest deceleration of the leader that avoids an impact; inf: all do, -inf: none does. [m/s2]
+    """Return the leader's largest deceleration that avoids an impact; inf if all do, -inf if none does. [m/s2]
 
     This is the case of ``most_to_spare_rear`` in which the leader brakes first, from the start on.
 
@@ -309,7 +309,7 @@ def most_ahead_of_coasting(gap: float, v_l: float, v_f: float, a_f: float, tau: 
 
 @compiled
 def most_to_spare_rear(gap: float, v_l: float, onset_l: float, v_f: float, a_f: float, onset_f: float) -> float:
-    """Return the leader's largest constant deceleration that avoids an impact; inf: all do, -inf: none does. [m/s2]
+    """Return the leader's largest constant deceleration that avoids an impact; inf if all do, -inf if none does. [m/s2]
 
     With a smaller deceleration the leader is further ahead at any time, so every smaller deceleration avoids the impact
     as well. If the follower brakes first, the motion until the leader's onset is computed first, because it does not

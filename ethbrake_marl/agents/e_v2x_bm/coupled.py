@@ -59,11 +59,11 @@ def optimise_coupled(
     """Return the constant deceleration of ``vehicle`` with the least simulated harm until ``horizon_s``.
 
     The closed form (``optimise_pairwise``) may find an interval of decelerations that avoid both neighbours. If the
-    middle of this interval does no harm in the simulation, it is the result. Otherwise an even grid of decelerations,
-    and the breakpoints of the closed form, are simulated. The harm may jump where the number of impacts changes. These
-    jumps and the best local minima are located to 1e-9 m/s2; at a jump the result lies on the side of less harm. Of
-    decelerations with equal harm, those with the least harm under the other count remain, and the middle one of them is
-    the result. The result of a world does not depend on the other worlds of the batch.
+    middle of this interval does no harm in the simulation, the middle is the result. Otherwise an even grid of
+    decelerations, and the breakpoints of the closed form, are simulated. The harm may jump where the number of impacts
+    changes. These jumps and the best local minima are located to 1e-9 m/s2; at a jump the result lies on the side of
+    less harm. Among decelerations with equal harm, those with the least harm under the other harm count remain, and the
+    middle one of these is the result. The result of a world does not depend on the other worlds of the batch.
 
     Args:
         worlds: n worlds of N vehicles.
@@ -102,11 +102,12 @@ def optimise_coupled(
 def _minimise(
     worlds: Worlds, told: Worlds, command: Floats, vehicle: int, rows: Ints, harm_count: HarmCount, horizon_s: float
 ) -> Floats:
-    """Search for the best deceleration in m worlds; return it, its harm and its harm under the other count, [3, m].
+    """Return the best deceleration found in m worlds, its harm, and its harm under the other harm count, [3, m].
 
     Args:
         worlds: n worlds.
-        told: the same worlds for the closed form, with the capacities of other vehicles set to their braking commands.
+        told: the same worlds for the closed form, in which the braking capacity of each other vehicle is replaced by
+            the deceleration that it commands.
         command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's command is ignored.
         vehicle: index of the controlled vehicle, from 0.
         rows: indices of the worlds to search, [m].
@@ -154,10 +155,10 @@ def _search_worlds(
 ) -> None:  # fmt: skip
     """Search for the best deceleration of ``vehicle`` (index) in the worlds with the indices ``rows`` [m].
 
-    ``found`` [3, m] receives the deceleration, its harm, and its harm under the other count. ``status`` [m] receives
-    ``FLAG.DONE``, or the code of the physics check that failed. ``capacity`` [n, N] are braking capacities (m/s2),
-    ``onset`` [n, N] times until a vehicle may brake (s). The other arguments are those of ``make_line``, for n worlds
-    along a new first axis.
+    ``found`` [3, m] receives the deceleration, its harm, and its harm under the other harm count. ``status`` [m]
+    receives ``FLAG.DONE``, or the code of the physics check that failed. ``capacity`` [n, N] are braking capacities
+    (m/s2), ``onset`` [n, N] times until a vehicle may brake (s). The other arguments have the same meaning as in
+    ``make_line``, with a new first axis for n worlds.
     """
     room, at, best = make_room(), np.empty(CANDIDATES), np.empty(3)
     for m in range(rows.shape[0]):
@@ -179,9 +180,9 @@ class EV2XBM:
     """Agent that brakes with the constant deceleration of least harm, called a*.
 
     Args:
-        mode: ``coupled`` minimises the harm in the engine's physics. It assumes that the other vehicles follow their
-            scripts, and that vehicles without a script (learners) brake fully. ``pairwise`` is the paper's closed form,
-            which assumes that all other vehicles brake fully and that impacts change no speed.
+        mode: ``coupled`` minimises the harm in the engine's physics. In this mode the agent assumes that the other
+            vehicles follow their scripts, and that vehicles without a script (learners) brake fully. ``pairwise`` is
+            the paper's closed form, which assumes that all other vehicles brake fully and that impacts change no speed.
         harm_count: harm that mode ``coupled`` minimises: ``first`` (each pair's first impact) or ``total`` (all).
         horizon_s: end of the simulations in mode ``coupled``, s since the alert.
 
@@ -214,7 +215,7 @@ class EV2XBM:
             return {"deceleration_mps2": closed.deceleration_mps2, "predicted_harm": closed.harm}
 
         def is_fixed(script: Script) -> bool:
-            """Return whether the script's command is fixed at the alert, whatever ``vehicle`` chooses."""
+            """Return whether the script's command is fixed at the alert and does not depend on ``vehicle``."""
             chooses_first = isinstance(script, EV2XBM) and (script._mode == "pairwise" or vehicle not in scripts)
             return is_state_free(script) or chooses_first
 

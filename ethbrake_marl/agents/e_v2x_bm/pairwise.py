@@ -49,8 +49,8 @@ def early_breakpoints(gap: float, w: float, onset_l: float, onset_f: float) -> t
 
     - Kink, at ``2 (w lead - gap) / lead^2``: the pair meets exactly when the leader begins to brake.
     - Jump, at ``w^2 / (2 gap)``: with a smaller deceleration the follower strikes the coasting leader lightly. With a
-      larger one it does not reach the coasting leader, and may strike harder once the leader brakes. The result is the
-      deceleration just below the jump that gives the lightest impact.
+      larger deceleration the follower does not reach the coasting leader, but may strike the leader harder once the
+      leader brakes. The returned deceleration lies just below the jump, where the impact is lightest.
 
     Args:
         gap: gap at the present time, m.
@@ -94,11 +94,11 @@ def rear_harm(a: float, i: int, gap: Floats, speed: Floats, capacity: Floats, on
 def find_breakpoints(
     at: Floats, i: int, gap: Floats, speed: Floats, capacity: Floats, onset: Floats
 ) -> tuple[float, float]:
-    """Write the decelerations of vehicle ``i`` at which its harm may be least to ``at`` [6], all in [0, capacity].
+    """Write to ``at`` [6] the decelerations in [0, capacity] of vehicle ``i`` at which its harm may be least, m/s2.
 
-    Returns the smallest deceleration without an impact in front, and the largest without an impact behind, both m/s2
-    and possibly infinite. ``gap`` [P] m, ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and ``onset``
-    [N] s (time until each vehicle may brake) describe the world.
+    Returns the smallest deceleration without an impact in front, and the largest deceleration without an impact behind,
+    in m/s2; each may be infinite. ``gap`` [P] m, ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and
+    ``onset`` [N] s (time until each vehicle may brake) describe the world.
     """
     low, high = 0.0, math.inf
     at[:] = 0.0
@@ -125,8 +125,8 @@ def minimise_over(
     """Return the deceleration of least predicted harm of vehicle ``i``, and this harm (m2/s2).
 
     Only the candidates ``at`` [6] (m/s2) are compared. If several candidates have the least harm, the middle between
-    the smallest and the largest of them is returned, provided that it has the least harm as well. ``gap`` [P] m,
-    ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may
+    the smallest and the largest of them is returned, provided that the middle has the least harm as well. ``gap`` [P]
+    m, ``speed`` [N] m/s, the braking capacities ``capacity`` [N] m/s2 and ``onset`` [N] s (time until each vehicle may
     brake) describe the world.
     """
     best, first, last = math.inf, 0.0, 0.0

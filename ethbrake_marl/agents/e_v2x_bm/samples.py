@@ -141,8 +141,8 @@ def find_minima(samples: Samples, n: int, depth: Floats, places: Ints) -> None:
 def choose(samples: Samples, n: int, room: Floats) -> float:
     """Return the deceleration of least harm among the first ``n`` samples, m/s2.
 
-    Of samples with equal harm, those with the least ``other`` harm remain; the middle one of them is returned. ``room``
-    [n or more] is a workspace. The function is faster if the samples are sorted.
+    Among samples with equal harm, those with the least ``other`` harm remain; the middle one of these is returned.
+    ``room`` [n or more] is a workspace. The function is faster if the samples are sorted.
     """
     least, rest = least_harm(samples, n) + TIE, math.inf
     for k in range(n):

@@ -1,7 +1,8 @@
 """The coupled search for the best constant deceleration in one world, in five steps. Compiled.
 
-The steps are an even grid, a finer grid, borders, local minima, and a step away from jumps. docs/evaluate.md gives
-the reasons for these steps.
+The search simulates an even grid of decelerations, then a finer grid, then decelerations around borders (where the
+number of impacts changes) and around local minima. Finally it moves the result away from jumps of the harm.
+docs/evaluate.md gives the reasons for these steps.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ def search_line(line: Line, room: Room, breakpoints: Floats, capacity: float, ou
         room: workspace.
         breakpoints: decelerations that are simulated in addition to an even grid, [CANDIDATES] m/s2.
         capacity: braking capacity of the vehicle, m/s2.
-        out: receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2), [3].
+        out: receives the deceleration (m/s2), its harm, and its harm under the other harm count (m2/s2), [3].
 
     Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
@@ -179,7 +180,7 @@ def _put_in_order(places: Ints, n: int) -> None:
 
 @compiled(apart=True, bare=True)
 def locate_borders(line: Line, room: Room) -> int:
-    """Step 3: locate borders (decelerations at which the number of impacts changes) where harm may be less.
+    """Step 3: locate borders (decelerations at which the number of impacts changes) that may have less harm.
 
     Between two borders the harm is smooth, so harm that falls towards a border is least directly at the border. Each
     border is enclosed between two samples 1e-9 m/s2 apart. ``room.two`` receives all samples. Returns a status:
@@ -253,14 +254,14 @@ def narrow_minima(line: Line, room: Room) -> int:
 def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, to: int) -> int:
     """Narrow an interval around a local minimum of the harm to 1e-9 m/s2; return a status.
 
-    Each round divides the intervals on both sides of the minimum in three.
+    Each round divides the intervals on both sides of the minimum into three parts.
 
     Args:
         line: the world.
         few: workspace.
         low: lower end of the interval, m/s2.
         high: upper end of the interval, m/s2.
-        found: samples; sample ``to`` is the minimum in the interval, and is replaced by samples with less harm.
+        found: samples; sample ``to`` has the least harm so far in the interval, and is replaced if less harm is found.
         to: index of the sample of the minimum.
 
     """
@@ -289,7 +290,7 @@ def _narrow(line: Line, few: Samples, low: float, high: float, found: Samples, t
 
 @compiled(apart=True, bare=True)
 def step_back(line: Line, around: Samples, best: float, capacity: float, out: Floats) -> int:
-    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move it away from the jump, to less harm.
+    """Step 5: if ``best`` lies within 1e-9 m/s2 of a jump of the harm, move it away from the jump, towards less harm.
 
     The engine simulates the same motion step by step, with other rounding errors. Directly at a jump, rounding errors
     would decide between less and more harm.
@@ -299,7 +300,7 @@ def step_back(line: Line, around: Samples, best: float, capacity: float, out: Fl
         around: workspace.
         best: best deceleration found, m/s2.
         capacity: braking capacity of the vehicle, m/s2.
-        out: receives the deceleration (m/s2), its harm, and its harm under the other count (m2/s2), [3].
+        out: receives the deceleration (m/s2), its harm, and its harm under the other harm count (m2/s2), [3].
 
     Returns a status: ``FLAG.DONE``, or the code of the physics check that failed.
 
