@@ -25,7 +25,7 @@ class RobustMode(IntEnum):
 
 
 class RobustGuard(StepGuard):
-    """Guard of mode ``robust``: in each step of a running engine, a ``RobustShield`` decides which actions are applied."""
+    """Guard of mode ``robust``: in each step of the engine, a ``RobustShield`` decides which actions are applied."""
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of a step as a mapping. ``members`` is the number of possible worlds that are certified for
