@@ -49,7 +49,7 @@ class State(NamedTuple):
 
     @property
     def ledger(self) -> Ledger:
-        """Harm and number of impacts of the episodes so far, by pair of vehicles (a copy)."""
+        """Harm and number of impacts of each pair of vehicles since the episodes began (a copy)."""
         packed, column = self.packed, self.packed.column
         params = packed.params
         weight = params[:, column.harm_weight : column.own_latency]
@@ -72,8 +72,8 @@ class State(NamedTuple):
     def join(states: list[State]) -> State:
         """Return one state with the rows of several states, one after the other.
 
-        All states must come from one engine. Raises ``InvalidInput`` if this engine has a guard, because memories of
-        guards cannot be joined.
+        All states must come from one engine. Raises ``InvalidInput`` if the engine has a guard (shield), because
+        memories of guards cannot be joined.
         """
         if states[0].guarded is not None:
             raise InvalidInput("moments: their engine has a shield, whose memory cannot be joined; remove the shield")

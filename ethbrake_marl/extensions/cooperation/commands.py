@@ -61,8 +61,8 @@ def ablate_command(
     The command first prints how long it will take. It writes ablation.html, ablation.md, ablation.csv, ablation.json
     and three figures. After an interruption, repeat the command to continue.
 
-    With --sweep, one level is trained with several values of one key. The two figures of a sweep show harm against
-    these values.
+    With --sweep, the levels are copies of one scenario with different values of one key. The two figures of a sweep
+    show harm against these values.
     """
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.cooperation.ablation import HOW_MEASURED, ablation_cost, run_ablation

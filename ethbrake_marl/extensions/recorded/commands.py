@@ -55,8 +55,8 @@ def from_data_command(
 ) -> None:
     """Create a scenario from recorded traffic: highD, exiD, NGSIM, OpenACC, or a table of trajectories.
 
-    Vehicles that follow each other in a lane become rows of the scenario. A row has the speeds of the vehicles, and the
-    gaps between them from bumper to bumper.
+    Each row of the scenario comes from vehicles that follow each other in a lane at one moment. The row contains their
+    speeds and the gaps between them from bumper to bumper.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.extensions.recorded.scenario import scenario_from_data

@@ -1,6 +1,7 @@
-"""Distributions that are fitted to recorded rows.
+"""Distributions that are fitted to recorded rows of gaps and speeds.
 
-They are independent distributions of the time gaps, of the mean speed of a row, and of the deviations from the mean.
+The distributions are independent: one of the time gaps, one of the mean speed of a row, and one of the deviations of
+the vehicles' speeds from this mean.
 """
 
 from __future__ import annotations

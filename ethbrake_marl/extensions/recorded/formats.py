@@ -107,8 +107,8 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
     Args:
         name: name of the format.
         columns: for the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. Each value
-            except the last is the name of a column. ``time=t/1000`` means that the times are in 1/1000 s. ``units`` is
-            ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
+            except the last is the name of a column. ``time=t/1000`` means that the column ``t`` contains times in
+            1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
 
     Raises ``InvalidInput`` for missing, repeated and unknown keys, and for unknown units.
 
