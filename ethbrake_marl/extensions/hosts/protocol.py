@@ -125,7 +125,7 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present time, gaps and speeds, and impacts since the last call if the host resolves them."""
+        """Return the present time, gaps, speeds, and (if the host resolves impacts) the impacts since the last call."""
 
     def apply(self, command: HostCommand) -> None:
         """Move all vehicles by one step with the accelerations of ``command``."""
@@ -175,7 +175,7 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
         host: the host, whose vehicles are at the alert.
         agent: agent or team for the learners, as returned by ``make_agent``, with or without a shield. It is not
             changed.
-        scenario: the scenario. Its scripts drive all other vehicles, and agents know these scripts.
+        scenario: the scenario. Its scripts drive all vehicles that do not learn, and agents know these scripts.
         worlds: the worlds at the alert. The host must have the gaps and speeds of these worlds.
 
     Returns the outcome of the episodes, and a mask of the worlds in which the motion differed from the prediction of a
@@ -227,7 +227,7 @@ class _Grid:
 
 
 class _Run:
-    """Running episodes in a host. The arguments are those of ``drive_host``; ``team`` has the agent of each learner."""
+    """Running episodes in a host. Arguments are as in ``drive_host``; ``team`` has the agent of each learner."""
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -650,7 +650,7 @@ def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) 
 
 
 def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
-    """Return the vehicles of the worlds with all latencies rounded up to multiples of ``dt`` (s)."""
+    """Return the vehicles' parameters with all latencies rounded up to multiples of the step length ``dt`` (s)."""
 
     def up(seconds: Floats) -> Floats:
         return np.ceil(seconds / dt - SNAP) * dt

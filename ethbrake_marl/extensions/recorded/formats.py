@@ -43,7 +43,7 @@ class Format(NamedTuple):
 
     @property
     def gaps(self) -> bool:
-        """Whether the files contain gaps instead of positions and lengths. An empty cell then means "not measured"."""
+        """Whether files contain gaps instead of positions and lengths; an empty cell then means "not measured"."""
         return "gap" in self.columns
 
     @property

@@ -235,7 +235,7 @@ def _measured(cell: str) -> float:
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number of a name: 1 for the first name, 2 for the next one. Raise ``ValueError`` for an empty name."""
+    """Return the number of a name: new names get the numbers 1, 2, 3, ... Raise ``ValueError`` for an empty name."""
     if not (name := cell.strip()):
         raise ValueError
     return names.setdefault(name, len(names) + 1.0)
