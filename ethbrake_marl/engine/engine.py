@@ -192,7 +192,7 @@ class Engine:
         reward_vector: RewardVector | None = None,
     ) -> None:
         if not n >= 1:
-            raise InvalidInput(f"engine: n = {n}: must be at least 1 world")
+            raise InvalidInput(f"engine: n = {n}: the number of worlds must be at least 1")
         self.scenario, self.n = scenario, n
         self.learners = tuple(learners)
         self.scripts = dict(scripts)
@@ -205,7 +205,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(
-                f"engine: deciders = {self.deciders}: must be vehicle indices from 0 to {scenario.vehicles - 1}"
+                f"engine: deciders = {self.deciders}: all must be vehicle indices from 0 to {scenario.vehicles - 1}"
             )
         self._terms = Terms(reward, scenario, self.learners or self.deciders, reward_vector)
         self.reward, self.components = self._terms.params, self._terms.components  # components of the vector reward
@@ -673,7 +673,7 @@ class Engine:
         depend on more than the state.
         """
         if self.reward.shaping > 0.0:
-            raise InvalidInput(f"branches: the reward has shaping = {self.reward.shaping:g}; it must be 0 for branches")
+            raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; it must be 0 to branch")
         n = len(state.motion)
         roster = Roster(n, self.seed, None)
         roster.warns = False

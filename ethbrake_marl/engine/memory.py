@@ -72,11 +72,9 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
     def check(array: Any) -> Any:
         shape = tuple(getattr(array, "shape", ()))
         if not shape or shape[0] != n:
-            raise InvalidInput(
-                f"{what}: {type(array).__name__} of shape {shape}; its first axis must be the {n} worlds"
-            )
+            raise InvalidInput(f"{what}: {type(array).__name__} of shape {shape}; arrays must have length {n} (worlds)")
         if array.dtype.hasobject:
-            raise InvalidInput(f"{what}: an array of objects; it must contain numbers, booleans or texts")
+            raise InvalidInput(f"{what}: contains an array of objects; arrays must contain numbers, booleans or texts")
         return array
 
     parts = [memory]
@@ -84,7 +82,7 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
         if isinstance(part, Mapping):
             for key in part:
                 if not (isinstance(key, str) and key.isidentifier()):
-                    raise InvalidInput(f"{what}: key {key!r}; must be a name, for instance 'asked_s'")
+                    raise InvalidInput(f"{what}: key {key!r}: must be an identifier, for instance 'asked_s'")
             parts += part.values()
         elif isinstance(part, tuple | list):
             parts += part

@@ -213,7 +213,7 @@ class ProfileProblem(NamedTuple):
             profiles.ends[:, -1] == self.last_step
         ).all()
         if not ordered:
-            raise InvalidInput("profiles: phases must end in order, and the last phase must end at the last step")
+            raise InvalidInput("profiles: phases must end one after the other, the last one at the last step")
 
 
 def profile_problem(

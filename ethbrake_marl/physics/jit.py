@@ -246,7 +246,7 @@ def load_kernel(name: str) -> bytes | None:
 
 
 def keep_kernel(name: str, content: bytes) -> None:
-    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails, as on a full disk."""
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails (full disk)."""
     folder = cache_folder()
     try:
         handle, part = tempfile.mkstemp(dir=folder, prefix=".")
@@ -297,7 +297,7 @@ def digest_of_sources(source: Path) -> str:
         written_s = file.stat().st_mtime
         if written_s > time.time():
             warnings.warn(
-                f"{_PACKAGE}: dates of files lie in the future, so each process compiles the kernels again; correct the"
+                f"{_PACKAGE}: files have dates in the future, so each process compiles the kernels again; correct the"
                 " clock of this machine, or the dates (find FOLDER -exec touch {} +)",
                 stacklevel=2,
             )

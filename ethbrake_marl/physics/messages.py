@@ -187,7 +187,7 @@ def _known_pieces(messages: Floats, time: Floats, vehicles: int, receiver: int, 
 
 
 class Told(NamedTuple):
-    """Newest states of all vehicles that one vehicle has received by message or by sight.
+    """Newest states of all vehicles, as one vehicle has received them by message or by sight.
 
     Arrays are [n, N] unless stated otherwise, with column j for vehicle j. They are views of the message columns.
     """
@@ -306,7 +306,7 @@ class Messages(NamedTuple):
         return known
 
     def intents(self, vehicle: int) -> Floats:
-        """Return the newest intent of each vehicle that ``vehicle`` has received, [n, N] m/s2; 0 without contents."""
+        """Return the newest intent of each vehicle that ``vehicle`` has received, [n, N] m/s2; 0 if unknown."""
         n, N = len(self.columns), self.vehicles
         if not self.says_contents:
             return np.zeros((n, N))
@@ -315,7 +315,7 @@ class Messages(NamedTuple):
         return np.where(periodic, self.columns[:, messages : messages + N], self.columns[:, at : at + N])
 
     def with_intents(self, intents_mps2: Floats) -> Floats:
-        """Return the columns with the present intents set to ``intents_mps2`` [n, N]; unchanged without contents."""
+        """Return the columns with ``intents_mps2`` [n, N] as present intents; unchanged if they have no intents."""
         if not self.says_contents:
             return self.columns
         columns, at = self.columns.copy(), intent_at(self.vehicles)
@@ -443,7 +443,7 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Begin the messages of one world at the alert. Updates the rows ``state`` and ``params``.
+    """Begin the messages of one world at the alert, in the rows ``state`` and ``params``.
 
     The function sets the place of each vehicle along the road, stores the first sample of all states, and lets each
     vehicle measure the vehicles in sight.

@@ -117,7 +117,7 @@ def exchange_at_sample(
 def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
     """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
-    Before, the command u is limited so that the speed does not go beyond standstill or the speed limit. The distance is
+    First, the command u is limited so that the speed does not go beyond standstill or the speed limit. The distance is
     computed as h times the mean of the speeds at the start and the end of the step, which is the same for constant u.
     Brakes act against the motion.
 

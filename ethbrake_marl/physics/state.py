@@ -114,7 +114,7 @@ class Vehicles:
 
     @staticmethod
     def known_at_once(latency_s: Floats) -> Floats:
-        """Return ``known_from_s`` [n, N, N] without a channel, from the latencies [n, N] s.
+        """Return the field ``known_from_s`` [n, N, N] of vehicles without a V2X channel, from their latencies [n, N] s.
 
         Vehicle i acts on news of every vehicle from its own latency on. The result is a read-only view of
         ``latency_s``; its last axis has stride 0, so it takes no memory.
@@ -352,7 +352,7 @@ class Worlds:
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
             raise InvalidInput(
-                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} brakes in pieces (profile), and"
+                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} follows a braking profile, and"
                 " the result would not be exact; use a constant command"
             )
         if slow.any():

@@ -167,7 +167,9 @@ def find_equilibria(
     if not 0.0 <= tolerance < math.inf:
         raise InvalidInput(f"tolerance = {tolerance!r}: the tolerance must be a finite number of m2/s2, at least 0")
     if not scenario.learners:
-        raise InvalidInput(f"scenario {scenario.name!r}: has no learner; give at least one vehicle the role learner")
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: the scenario has no learner; give at least one vehicle the role learner"
+        )
     task, declared = (
         Task(scenario, scenario.learners, harm_count),
         scenario.objective if objective is None else objective,

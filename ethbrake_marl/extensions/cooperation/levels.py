@@ -111,7 +111,7 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
         ]
         levels.append(Level(scenario, same[0] if same else None))
     if len(levels) < 2:
-        raise InvalidInput(f"levels: only {count_of(len(levels), 'level')}; give at least two levels to compare")
+        raise InvalidInput(f"levels: {count_of(len(levels), 'level')} given; give at least two levels to compare")
     return levels
 
 
@@ -134,7 +134,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     if not scenario:
         key = values[0].key
         raise InvalidInput(
-            f"--sweep {key}: is a key of a recipe, but must be a key of a scenario; to vary a recipe, use"
+            f"--sweep {key}: the key belongs to a recipe, but must be a key of a scenario; to vary a recipe, use"
             " ethbrake study sweep"
         )
     key, path = scenario[0].key, scenario[0].path
@@ -148,7 +148,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     for recipe in recipes if path[0] == "objective" else ():
         if recipe.reward.objective is not None:
             raise InvalidInput(
-                f"--sweep {key}: has no effect, because recipe {recipe.name!r} has its own objective"
+                f"--sweep {key}: the sweep has no effect, because recipe {recipe.name!r} has its own objective"
                 " (reward.objective); give a recipe without an objective"
             )
     each_value = [value._replace(key=key) for value in values]
@@ -337,7 +337,7 @@ def plan_ablation(
     elif len(names) == 1:
         compared = sweep_levels(names[0], sweep, changed.scenario, changed_recipes)
     else:
-        raise InvalidInput(f"levels: {len(names)} levels; a sweep needs exactly one level")
+        raise InvalidInput(f"levels: {len(names)} levels given; a sweep needs exactly one level")
     plan = Plan(
         levels=tuple(compared),
         recipes=changed_recipes,
@@ -352,7 +352,7 @@ def plan_ablation(
         raise InvalidInput(f"recipes {', '.join(called)}: two recipes have the same name; give each recipe once")
     if plan.shield not in (None, "step"):
         raise InvalidInput(
-            f"shield {plan.shield!r}: must be step, because the other shields can control one vehicle only"
+            f"shield {plan.shield!r}: the shield must be 'step', because other shields can control only one vehicle"
         )
     if plan.search_episodes > plan.episodes:
         raise InvalidInput(

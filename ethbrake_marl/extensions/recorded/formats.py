@@ -133,7 +133,7 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
         settings["time"] = column
         if not 0.0 < second < math.inf:
             raise InvalidInput(
-                f"columns: time = .../{divisor}: the number after / must be the number of time units in a second"
+                f"columns: time = .../{divisor}: the number after / must say how many time units a second has"
             )
     return Format(
         "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[key] for key, role in _ROLES.items()},

@@ -78,7 +78,7 @@ def scenario_from_data(
     if entry.hertz:
         check_every(every_s, entry, entry.title)
     if not 0.0 < every_s < math.inf:
-        raise InvalidInput(f"every = {every_s:g} s: the time between two rows must be above 0")
+        raise InvalidInput(f"every = {every_s:g} s: the time between two moments must be above 0")
     if base.members or base.table is not None:
         raise InvalidInput(f"based_on = {based_on!r}: must be a scenario without a mixture and without a table")
     vehicles = base.vehicles
