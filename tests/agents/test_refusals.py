@@ -145,7 +145,7 @@ OWN: dict[str, Callable[[], object]] = {
     "the closed form of E-V2X-BM and planner: brakes of world 0 build up (brake_rate_mps3": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), SLOW
     ),
-    "the closed form of E-V2X-BM and planner: a vehicle of world 0 brakes in pieces (profile)": lambda: evaluated(
+    "the closed form of E-V2X-BM and planner: a vehicle of world 0 follows a braking profile": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), PIECES
     ),
 }
