@@ -48,8 +48,8 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
     line = build(Document(document.file, content, document.lines))
     if "vehicle_types" in content:
         raise InvalidInput(
-            f"{where}: cannot be combined with vehicle_types; set vehicles: {line.vehicles + 1} and declare the last"
-            " vehicle like the others"
+            f"{where}: cannot be combined with vehicle_types; instead of the follower, declare a further vehicle"
+            f" (vehicles: {line.vehicles + 1})"
         )
     N, own = line.vehicles, {"braking_capacity_mps2": follower.braking_capacity_mps2, "latency_s": follower.latency_s}
     for key, rule in QUANTITY.declared.items():

@@ -137,14 +137,14 @@ def test_ignored_row__of_an_automatic_reset_may_hold_anything() -> None:
 # What is refused.
 
 BAD: list[tuple[Any, str]] = [
-    (9, "9; with actions=9 an index is needed, a whole number from 0 to 8"),
-    (-1, "-1; with actions=9"),
-    (2**40, "1099511627776; with"),
-    (10**30, "1000000000000000000000000000000; with"),
-    (0.5, r"0\.5; with actions=9"),
-    (3.0, r"[03]\.0; with actions=9"),
-    (np.float32(-1.0), r"-1\.0; with"),
-    (np.nan, "nan; with"),
+    (9, "9: with actions=9, an action must be an index, a whole number from 0 to 8"),
+    (-1, "-1: with actions=9"),
+    (2**40, "1099511627776: with"),
+    (10**30, "1000000000000000000000000000000: with"),
+    (0.5, r"0\.5: with actions=9"),
+    (3.0, r"[03]\.0: with actions=9"),
+    (np.float32(-1.0), r"-1\.0: with"),
+    (np.nan, "nan: with"),
     (True, "is a boolean; with"),
     ("full", "is not a number; with"),
     (np.ma.masked, "is masked; with"),
