@@ -300,7 +300,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
     Args:
         out: output of the command.
-        moving: number of such worlds for each agent with a shield, by name.
+        moving: number of worlds in which some vehicle still moves, by name of each agent with a shield.
         worlds: number of all worlds.
         horizon_s: time of the horizon (s).
 

@@ -93,11 +93,11 @@ def make_sb3_vec_env(
 class EthBrakeVecEnv(Begun, VecEnv):
     """``VecEnv`` whose rows are learners: row ``k * L + l`` is learner l of L (front to rear) in world k.
 
-    The rows of a world end together. Each new episode takes the next world of one stream. At the end of an episode, the
-    infos of its rows contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
-    steps ``l``, and ``t``, which is always 0), and all infos of the other environments. At other steps the infos
-    contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on the whole
-    environment.
+    The episodes in the rows of one world end together. Each new episode takes the next world of one stream. At the end
+    of an episode, the infos of its rows contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return
+    ``r``, number of steps ``l``, and ``t``, which is always 0), and all infos of the other environments. At other steps
+    the infos contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on
+    the whole environment.
 
     Args:
         engine: the engine of the worlds; ``make_sb3_vec_env`` builds it.

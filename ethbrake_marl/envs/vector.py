@@ -87,7 +87,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     """Many worlds of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``).
 
     After ``reset(seed=s)``, row k is world k of seed s. Each new episode takes the next world of this seed. All
-    returned arrays are new.
+    returned arrays are new objects, which later steps do not change.
 
     Args:
         num_envs: number of worlds that are simulated together, at least 1.

@@ -479,7 +479,9 @@ def register_feature(
     unknown: float = 0.0,
     reads: Sequence[Piece] | None = None,
 ) -> None:
-    """Register a feature, so that an ``observation:`` list can contain it. The function's docstring is its meaning.
+    """Register a feature, so that an ``observation:`` list can contain it.
+
+    The docstring of ``function`` becomes the meaning of the feature.
 
     An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``. The entry
     point names a ``Part``, which contains all arguments but ``name``.
@@ -493,8 +495,9 @@ def register_feature(
         name: name of the feature, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. An
             observation lists a feature of the vehicle itself as ``name``, a feature of a neighbour as ``front_1.name``.
         function: ``function(worlds, vehicle)``, or ``function(worlds, vehicle, neighbour)`` for a feature of a
-            neighbour. It returns the value in each world, [n], in ``unit``. Index 0 is the front vehicle. The function
-            must work for any number of vehicles and must not depend on anything but its arguments.
+            neighbour. The function returns the value of the feature in each world, [n], in ``unit``. Index 0 is the
+            front vehicle. The function must work for any number of vehicles and must not depend on anything but its
+            arguments.
         unit: unit of the value.
         scale: number above 0; the observed number is ``clip(value / scale, low, high)``.
         low: smallest observed number.
@@ -502,9 +505,9 @@ def register_feature(
         of: vehicle that the feature describes: ``own``, the observer itself; ``neighbour``, a neighbour. The value for
             a neighbour is observed only if the vehicle knows the neighbour.
         unknown: value for an unknown neighbour, in ``unit``; must be 0 if ``of`` is ``own``.
-        reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``); if some of them
-            are unknown, the value is ``unknown``. None: not specified; the feature then cannot be used in a scenario
-            whose messages leave out some data.
+        reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``); if the observer
+            does not know all these data, the feature has the value ``unknown``. None: not specified; the feature then
+            cannot be used in a scenario whose messages leave out some data.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:

@@ -107,8 +107,9 @@ class Ledger:
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
         """Return the harm that each vehicle bears, [n, N] m2/s2.
 
-        A vehicle bears its share (``split``) of the harm of the pair in front and of the pair behind. Vehicle 1 also
-        bears the harm of impacts with the obstacle. ``harm_count``: ``"first"``, first-impact harm, or ``"total"``.
+        A vehicle bears its share (``split``) of the harm of impacts with the vehicle in front and with the vehicle
+        behind. Vehicle 1 also bears the harm of impacts with the obstacle. ``harm_count``: ``"first"``, first-impact
+        harm, or ``"total"``.
         """
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)

@@ -180,7 +180,7 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
     """Return the change during a step of the amount that each vehicle should minimise, [n, N].
 
     For an objective that is a weighted sum of the vehicles' harm, the change is the weighted sum of their harm in the
-    step. For any other objective it is the amount after the step minus the amount before the step.
+    step. For any other objective the change is the amount after the step minus the amount before the step.
 
     Args:
         before: harm before the step.

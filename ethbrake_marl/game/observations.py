@@ -167,7 +167,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return the fields (front, rear, role, obstacle, contact) of the specification with the features ``names``."""
+    """Return the fields (front, rear, role, obstacle, contact) of a specification that has the features ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}

@@ -65,7 +65,8 @@ class RewardParams(FileModel):
 
     Args:
         harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
-            module ``game.rewards`` has their formulas. If another term has a weight, harm must be given explicitly.
+            module ``game.rewards`` has their formulas. If another weight is given, the weight of harm must be given,
+            too.
         harm_count: ``first``: the term harm counts first-impact harm; ``total``: it counts total harm.
         objective: objective of all vehicles, or a list with one per vehicle; None: the objective of the scenario.
         shaping_discount: discount in the shaping term, in (0, 1]; it should equal the learner's own discount.

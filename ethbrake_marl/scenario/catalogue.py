@@ -86,7 +86,7 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
     A ``Scenario`` is returned unchanged. The docstring of ``scenario_path`` explains how the file is found.
 
     Raises ``UnknownName`` with a suggestion for an unknown name. Raises ``InvalidInput``, which names file, line, key
-    and value, if the file is not a valid scenario or its ``name`` differs from the file's name.
+    and value, if the file is not a valid scenario, or if its key ``name`` differs from the name of the file.
     """
     if isinstance(scenario, Scenario):
         return scenario

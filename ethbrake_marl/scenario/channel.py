@@ -19,7 +19,7 @@ Before this time it has neither received the message of Vehicle 1 nor seen the v
 state of vehicle j from ``max(latency_i, tau_ij)`` on. If j is a direct neighbour in sight, it knows this state from
 ``max(latency_i, hop_ij)`` on if that time is earlier. If a vehicle observes another vehicle's latency, it observes the
 *own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper`` a vehicle knows
-everything from its own latency on.
+everything as soon as its own latency has elapsed.
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
 periodic``, a message is sent in every period T and may be lost by the same Gilbert-Elliott channel; vehicle i then
@@ -62,7 +62,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class Equipage(FileModel):
-    """V2X equipment of one vehicle or of a type of vehicles."""
+    """V2X equipment of one vehicle, or of all vehicles of one type."""
 
     sends: bool = Field(default=True, description="whether the vehicle sends messages")
     hears: Hears = Field(
@@ -412,7 +412,7 @@ class V2X(FileModel):
         Args:
             worlds: worlds without a channel, at the alert (time 0).
             u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
-            key: seed of the later message losses of each world, [n] in [0, 1).
+            key: seed of the losses of all messages after the first one, a number in [0, 1) for each world, [n].
             time_step_s: time between two decisions (s); vehicles sample their states at each decision.
             equipped: V2X equipment, one row per world or one row for all worlds.
 
@@ -454,8 +454,8 @@ class V2X(FileModel):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    ``k >= m`` holds exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This is the inverse distribution function of the
-    stationary Gilbert-Elliott channel. k is computed without logarithms, so every machine gets the same k.
+    ``k >= m`` holds exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the inverse distribution function of
+    the stationary Gilbert-Elliott channel. k is computed without logarithms, so every machine gets the same k.
 
     Args:
         u: uniform numbers in [0, 1).

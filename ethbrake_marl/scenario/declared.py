@@ -454,7 +454,7 @@ class ScenarioFields(FileModel):
         return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of a quantity for each vehicle, pair or world, whether declared or derived.
+        """Return (smallest, largest) value of a declared or derived quantity for each vehicle, pair or world.
 
         Args:
             field: key of a quantity that every world has: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...

@@ -17,8 +17,8 @@ class Follower(FileModel):
     """An additional vehicle behind the last vehicle, at the same speed, which brakes fully after its latency.
 
     The default latency (0.75 s) and braking capacity (0.774 g) are those of the competent driver in UN Regulation 157.
-    The default time gap (0.6 s) is our choice. The follower's brakes act at once; the driver of the regulation has a
-    build-up time. Its mass equals the mass of the last vehicle.
+    The default time gap (0.6 s) is our choice. The follower's brakes act at once, but the regulation's driver needs
+    some time to build up the braking force. Its mass equals the mass of the last vehicle.
     """
 
     time_gap_s: float = Field(

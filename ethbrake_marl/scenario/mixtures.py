@@ -42,8 +42,8 @@ def build_members(
 
     Keys next to ``mixture`` replace the same keys in every listed scenario. A key for which all scenarios have the same
     value is added to the document. If the list is invalid, the document is returned unchanged, without scenarios, and
-    the schema rejects it later. Raises ``InvalidInput`` naming the invalid scenario, or the key in which two scenarios
-    must not differ.
+    the schema rejects it later. Raises ``InvalidInput`` naming the invalid scenario, or the key that must have the same
+    value in all scenarios but has not.
 
     Args:
         document: parsed file with a key ``mixture``.

@@ -136,7 +136,7 @@ QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
     "[1, -1] is not a list of two numbers in [0, 3600]": lambda: given(
         roles="{vehicle_1: {profile: [[0, 3], [1, -1]]}, vehicle_2: learner}"
     ),
-    "line 13: roles.vehicle_1 = {profile: [[0, 3]], coast: 1}: must be learner, a script": lambda: given(
+    "line 13: roles.vehicle_1 = {profile: [[0, 3]], coast: 1}: must be learner, the name of a script": lambda: given(
         roles="{vehicle_1: {profile: [[0, 3]], coast: 1}, vehicle_2: learner}"
     ),
     "line 13: roles.vehicle_3 = e_v2x_bm: with early_impacts: reject, a script must be full_brake": lambda: given(
