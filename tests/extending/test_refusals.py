@@ -213,8 +213,11 @@ def started(reward: dict[str, Any]) -> Any:
             None,
             "its function returned object of shape (); must return numbers of shape (2,), one per world or (2, 3), one",
         ),
-        (lambda step: np.full(len(step.time_s), np.nan), "is nan in world 0; must be finite"),
-        (lambda step: np.full(step.speeds_mps.shape, np.inf), "is inf for vehicle_1 in world 0; must be finite"),
+        (lambda step: np.full(len(step.time_s), np.nan), "its value is nan in world 0; must be finite"),
+        (
+            lambda step: np.full(step.speeds_mps.shape, np.inf),
+            "its value is inf for vehicle_1 in world 0; must be finite",
+        ),
         (lambda step: step.speed_mps, "its function fails: AttributeError: 'StepOutcome' object has no attribute"),
         (lambda step: step.speeds_mps.fill(0.0), "its function fails: ValueError: assignment destination is read-only"),
     ],
