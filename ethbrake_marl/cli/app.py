@@ -72,9 +72,9 @@ def main() -> None:
 def run_command(arguments: Sequence[str]) -> int:
     """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    The status is 0 for success. For invalid input, wrong usage or a file error it is 2, and the reason is printed in
-    one line on stderr. It is 1 if the reader of the output has closed the pipe. Other errors are defects of the program
-    and are raised.
+    The status is 0 for success. The status is 2 for invalid input, wrong usage or a file error; the reason is then
+    printed in one line on stderr. The status is 1 if the reader of the output has closed the pipe. Other errors are
+    defects of the program and are raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -206,7 +206,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
     Args:
         name: name of the command; ``GROUP.NAME`` for a command inside an existing group of commands.
-        command: a function such as ``app.command`` of Typer takes, or a ``Typer`` object with several commands.
+        command: a function that Typer's ``app.command`` accepts, or a ``Typer`` object with several commands.
         epilog: text at the end of the help page, if ``command`` is a function.
 
     """
@@ -256,7 +256,7 @@ class Installed(TyperCommand):
     def get_short_help_str(self, limit: int = 45) -> str:
         """Return the description of the command in the list of commands, of at most ``limit`` characters.
 
-        For a command of another package this is the name of the package, so the package need not be imported.
+        A command of another package is described by the name of the package, so that the package need not be imported.
         """
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 

@@ -97,7 +97,7 @@ class Out:
     Args:
         as_json: whether to print results as JSON.
         force: whether to replace existing files.
-        remains: end of the message after Ctrl-C, which says what has been written.
+        remains: text about the files that remain after Ctrl-C, for the end of the message.
 
     """
 
@@ -171,7 +171,7 @@ class Out:
         Args:
             path: path of the file; None: no file was requested, and nothing is checked.
             endings: allowed endings of the name, such as ``.csv``; without endings, all are allowed.
-            what: name of the content, for the error message.
+            what: name of the file's content, for the error message.
 
         """
         if path is None:
@@ -185,7 +185,7 @@ class Out:
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
         """Write ``content`` to a file, completely or not at all, and print ``WHAT: PATH`` on stderr.
 
-        ``what``: word for the content; None: print nothing.
+        ``what``: word for the content, printed as WHAT; None: print nothing.
         """
         from ethbrake_marl.files.store import write_output
 
@@ -207,7 +207,7 @@ class Out:
             name: name of the task; a task ``TASK: STAGE`` has the same bar as ``TASK``.
             done: number of units that are done.
             total: number of all units.
-            harm: latest result, shown after the name.
+            harm: latest harm, shown after the name of the task.
             note: message to print once, above the bars.
 
         """

@@ -219,7 +219,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
     Args:
         training: whether to call also ``ethbrake run``, which needs torch.
-        run_alone: True: call only one command, which compiles nearly all kernels of ``ethbrake run``.
+        run_alone: True: call only the single command that compiles nearly all kernels of ``ethbrake run``.
 
     """
     if is_temporary(cache_folder()):

@@ -104,11 +104,11 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    `ethbrake agent list` shows all agents; ladder stands for all agents from coast to best_harm. A name can be followed
-    by +search and by one shield, +episode or +step; for instance full_brake+step or ppo@PATH+search+episode, where
-    PATH is a run or a policy bundle. The shield +robust needs an uncertainty, which can be set only in Python;
-    +robust:estimated does not need one. With --set harm_count=total, agents minimise total harm instead of first-impact
-    harm. --set measures=injury,my_file.py:worst adds these measures to the results.
+    `ethbrake agent list` shows all agents; the name ladder means all agents from coast to best_harm in this list. A
+    name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
+    ppo@PATH+search+episode, where PATH is a run or a policy bundle. The shield +robust needs an uncertainty, which can
+    be set only in Python; +robust:estimated does not need one. With --set harm_count=total, agents minimise total harm
+    instead of first-impact harm. --set measures=injury,my_file.py:worst adds these measures to the results.
     """
     from ethbrake_marl.agents.spec import split_specs
 
@@ -120,11 +120,13 @@ def evaluate_command(
             other = {"--per-world": per_world, "--report": report, "--jobs": jobs, "--ray": ray}
             for option in (name for name, value in other.items() if value):
                 raise InvalidInput(
-                    f"{option}: is impossible for {scenario}, a group of {len(group)} scenarios; give one of them"
+                    f"{option}: cannot be used with {scenario}, a group of {len(group)} scenarios; name a single"
+                    " scenario"
                 )
             if chosen.measures:
                 raise InvalidInput(
-                    f"--set measures: is impossible for {scenario}, a group of {len(group)} scenarios; give one of them"
+                    f"--set measures: cannot be used with {scenario}, a group of {len(group)} scenarios; name a single"
+                    " scenario"
                 )
             _evaluate_group(out, output, [_task_of(name, chosen) for name in group], agents, episodes, seed)
             return
@@ -298,7 +300,7 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 
     Args:
         out: output of the command.
-        moving: number of such worlds for each agent with a shield, by name.
+        moving: number of worlds in which some vehicle still moves, by name of each agent with a shield.
         worlds: number of all worlds.
         horizon_s: time of the horizon (s).
 
@@ -314,12 +316,12 @@ def _tell_horizon(out: Out, moving: Mapping[str, int], worlds: int, horizon_s: f
 def _moving(rows: Sequence[evaluation.SummaryRow]) -> dict[str, int]:
     """Return in how many worlds some vehicle still moves at the horizon, by name of each agent behind a shield.
 
-    ``rows``: rows of the results table.
+    ``rows``: rows of the results table, one per agent.
     """
     return {row.agent: row.horizon_ends for row in rows if row.policy_share is not None}
 
 
-_FILE = typer.Argument(metavar="RESULTS.json", help="results.json of evaluate or run, or output of evaluate --json.")
+_FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of evaluate or run, or output of --json.")
 
 
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
@@ -362,10 +364,10 @@ def shield_command(
     """Compare agents without and behind the shield.
 
     Each agent is run in the same worlds without a shield, in episode mode and in step mode. A team of several learners
-    is run without a shield, in step mode, and in step mode with caps. Give the agents without a shield. The shield
-    bounds first-impact harm, or total harm with --set harm_count=total. For each decision that step mode replaced, the
-    table shows whether the replacement was needed (harm would have been higher without it), harmless (equal) or costly
-    (lower).
+    is run without a shield, in step mode, and in step mode with caps. Name the agents without a shield: full_brake, not
+    full_brake+step. The shield bounds first-impact harm, or total harm with --set harm_count=total. For each decision
+    that step mode replaced, the table shows whether the replacement was needed (harm would have been higher without
+    it), harmless (equal) or costly (lower).
     """
     with Out(as_json=as_json) as out:
         task = read_task(scenario, settings)

@@ -225,8 +225,8 @@ def _sentences(scenario: scenarios.Scenario) -> Iterator[str]:
 def _refused(scenario: scenarios.Scenario, sample: scenarios.Sample | None = None) -> str:
     """Return how many draws were rejected for an early impact, as a text ``: 3 of 203 draws (1.5 %)``.
 
-    The text is empty for a scenario without a table. With a table it matters, because rejections change how often each
-    row occurs. ``sample``: worlds to count in; None: draw 200 worlds.
+    The text is empty for a scenario without a table. With a table the number of rejections matters, because rejections
+    change how often each row occurs. ``sample``: worlds to count in; None: draw 200 worlds.
     """
     if all(each.table is None for each in scenario.members or (scenario,)):
         return ""
@@ -279,9 +279,9 @@ def _news_in_words(scenario: scenarios.Scenario) -> str:
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
 def scenario_new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new scenario and of its file.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new scenario; its file is NAME.yaml.")],
     based_on: Annotated[
-        str, typer.Option(metavar="NAME|PATH", help="Scenario whose values the new one gets.")
+        str, typer.Option(metavar="NAME|PATH", help="Scenario from which the new scenario takes its values.")
     ] = "paper-random",
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the new file.")] = Path(),
     force: ForceOption = False,
@@ -395,7 +395,7 @@ agent_group = typer.Typer(
 def agent_list(as_json: JsonOption = False) -> None:
     """List all agents, what they do and what they know.
 
-    A name with + is appended to the name of an agent, for instance full_brake+step: first +search, then one shield.
+    A name that begins with + is appended to the name of an agent, as in full_brake+step; +search comes before a shield.
     """
     with Out(as_json=as_json) as out:
         from ethbrake_marl.agents.protocol import Knowledge

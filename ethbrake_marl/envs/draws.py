@@ -27,7 +27,7 @@ def describe_worlds(engine: Engine) -> Columns:
 
     There is one column for each quantity of a world at the alert, with the same name as in a table of initial states.
     For worlds that were drawn, a mixture adds the column ``scenario``, and vehicle types add ``vehicle_2_type`` and so
-    on. ``world_seed`` and ``world`` are the same as in the infos.
+    on. The columns ``world_seed`` and ``world`` contain the same numbers as the infos of these names.
 
     Raises ``InvalidInput`` in two cases: the caller had passed the worlds, and the environment was then restored from a
     snapshot, which does not contain them; or the physics failed before the first decision of a world, so that another
@@ -55,7 +55,7 @@ def describe_worlds(engine: Engine) -> Columns:
 
 
 def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
-    """Draw the worlds with the numbers ``numbers`` in the training stream again, and return them in this order.
+    """Draw the worlds of the training stream with these ``numbers`` again, and return them in the order of ``numbers``.
 
     Raises ``InvalidInput`` if a drawn world differs from the running world, because the physics failed in the drawn
     world before its first decision.
@@ -77,7 +77,8 @@ def _drawn_again(engine: Engine, numbers: Ints) -> Sample:
     if not same.all():
         k = int(rows[np.argmin(same)])
         raise InvalidInput(
-            f"describe_worlds: row {k} is unknown, because the physics failed in world {engine.roster.numbers[k]} of"
-            f" seed {engine.roster.seed} before its first decision, and another world replaced it; call reset"
+            f"describe_worlds: the random draw of row {k} is unknown, because the physics failed in world"
+            f" {engine.roster.numbers[k]} of seed {engine.roster.seed} before its first decision, and another world"
+            " replaced it; call reset"
         )
     return sample

@@ -87,7 +87,8 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
 
     - Observation: the features of ``ObservationSpec``, float32 [F].
     - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
-    - End: it is *terminated* when all vehicles are at rest and no command would move one, *truncated* at the horizon.
+    - End: an episode is *terminated* when all vehicles are at rest and no command would move one, *truncated* at the
+    horizon.
     - Infos and options of ``reset``: docs/environments.md.
 
     Args:
@@ -96,7 +97,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
         learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
             of the scenario.
         reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that the learner observes; None: ``observation_for(scenario)``.
+        observation: features that the learner observes; None: the observation of the scenario (``observation_for``).
         actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
             of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
         reward_vector: None: a reward is a number. ``vehicles``: a reward is an array [N], minus the harm that each

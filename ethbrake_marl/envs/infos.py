@@ -7,8 +7,9 @@
 - ``first_impact_harm``, ``total_harm``: harm that the vehicle has borne so far (m2/s2).
 - ``world_first_impact_harm``, ``world_total_harm``: harm of the whole line so far (m2/s2).
 - ``collided``: whether an impact has happened in this world.
-- ``cost``: harm that the last step added to the line (m2/s2), in the count of the reward; 0 after a reset.
-- ``reward_NAME``: each term of the last step's reward before its weight; 0 after a reset.
+- ``cost``: harm that the last step added to the line (m2/s2), first-impact or total harm as in the reward; 0 after a
+  reset.
+- ``reward_NAME``: value of each term of the last step's reward before weighting; 0 after a reset.
 - ``world_seed``, ``world``: seed and number of the world; the number is -1 for a world that the caller passed.
 - ``known_from_s`` [N], with a ``v2x`` channel: time from which the vehicle acts on news of each vehicle (s; infinite:
   never). Its entry for the vehicle itself is the vehicle's latency.
@@ -126,7 +127,7 @@ class Report(NamedTuple):
         return cls(values, cost, terms, engine.roster.seed, world, known, age, shield_columns(engine, rows))
 
     def columns(self) -> dict[str, Floats]:
-        """Return the infos in ``COLUMNS`` by name, each [n, N]."""
+        """Return the values of the infos listed in ``COLUMNS``, by name, [n, N] each."""
         return {name: self.values[:, :, c] for c, name in enumerate(COLUMNS)}
 
     def plain_infos(self, vehicles: Ints) -> list[dict[str, Any]]:
@@ -205,7 +206,7 @@ class Report(NamedTuple):
 
 @compiled
 def _report_rows(state: Floats, params: Floats, wanted: Floats, out: Floats) -> None:
-    """Write the infos in ``COLUMNS`` to ``out``.
+    """Write the values of the infos listed in ``COLUMNS`` to ``out``.
 
     Args:
         state: packed states of the worlds (``physics.columns``), which contain motion and harm.
@@ -303,7 +304,7 @@ class Begun:
             options: the options; None: there are no options.
 
         Raises ``InvalidInput`` for a seed that is not a whole number >= 0, for an invalid initial state or listed
-        world, and if both are passed. The environment is then unchanged.
+        world, and if both are passed. After such an error the environment is unchanged.
 
         """
         named = None if seed is None else chosen_seed(seed)

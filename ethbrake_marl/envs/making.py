@@ -78,7 +78,7 @@ def make_engine(
         observation: features that every vehicle observes, or a mapping from a vehicle's name to its features; None: the
             observation of the scenario.
         seed: seed of the stream of worlds.
-        reward_vector: components of a vector reward, which the result of a step has as ``vector`` in addition to
+        reward_vector: components of a vector reward, which the result of a step contains as ``vector``, next to
             ``reward``; None: there is no vector reward.
 
     >>> import ethbrake_marl as eb

@@ -1,4 +1,4 @@
-"""Environments for PettingZoo: all vehicles of one world are agents, which act in parallel or in turn (AEC)."""
+"""Environments for PettingZoo: the vehicles of a world are agents that act in parallel, or one after another (AEC)."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ class Ordered(SeededInside, OrderEnforcingWrapper):  # type: ignore[misc]  # Pet
 
 
 class InTurns(SeededInside, parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo is untyped
-    """PettingZoo's wrapper from parallel to AEC, which in addition checks each action in the turn of its agent.
+    """PettingZoo's wrapper from parallel to AEC, which also checks the action of an agent when it is the agent's turn.
 
-    After an invalid action, it is still the turn of the same agent, which can act again.
+    After an invalid action the same agent can act again.
     """
 
     @classmethod
@@ -129,7 +129,8 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
     - Action: each learner needs an action in each step, an array [1] in [-1, 1]. -1 brakes with full capacity, 0
       coasts, +1 drives with full capacity. Actions of vehicles with scripts are ignored; ``infos[agent]`` contains the
       commands of their scripts.
-    - End: all agents end together, *terminated* when all vehicles are at rest and no command would move one,
+    - End: the episodes of all agents end together. They are *terminated* when all vehicles are at rest and no command
+    would move one,
       *truncated* at the horizon.
     - ``state()`` returns the full state of the line, for central critics.
 
@@ -329,7 +330,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the environment in which agents act in turn (AEC), from front to rear.
+    """Return the environment in which agents act one after another, from front to rear (AEC).
 
     ``scenario`` and ``settings`` are the arguments of ``parallel_env``.
 
@@ -344,9 +345,9 @@ def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[s
 
 
 def env(scenario: AnyScenario = "paper-random", **settings: Any) -> AECEnv[str, Observations, NDArray[Any]]:
-    """Return the environment in which agents act in turn (AEC), the same as ``raw_env``.
+    """Return the environment in which agents act one after another (AEC), the same as ``raw_env``.
 
-    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. Invalid actions are neither clipped nor do they
-    end the episode: they raise ``InvalidInput``, and it is still the turn of the same agent.
+    ``scenario`` and ``settings`` are the arguments of ``parallel_env``. An invalid action raises ``InvalidInput``. The
+    episode goes on, and the same agent can act again.
     """
     return raw_env(scenario, **settings)

@@ -34,7 +34,7 @@ LATE_S = 3.0  # longest latency that is considered when the length of road is ch
 
 
 class View(NamedTuple):
-    """Stretch of road in a picture. Positions are relative to Vehicle 1's front at the alert."""
+    """The part of the road that a picture shows. Positions are relative to Vehicle 1's front at the alert."""
 
     left_m: float  # position of the left end (m)
     right_m: float  # position of the right end (m)
@@ -192,7 +192,7 @@ _BRAKE, _DRIVE, _FLASH, _SHIELD = "#c1121f", "#2a7f3f", "#ffd60a", "#6a3d9a"
 
 
 class _Pen:
-    """Pen that draws shapes ``_FINE`` times as large as in the final picture, so that edges are smooth later.
+    """Pen that draws shapes ``_FINE`` times as large as in the final picture; reducing the picture makes edges smooth.
 
     All coordinates are in pixels of the final picture.
     """
@@ -249,7 +249,7 @@ def _draw_vehicle(pen: _Pen, scene: Scene, i: int) -> None:
 
 
 def _draw_panel(pen: _Pen, scene: Scene, i: int) -> None:
-    """Draw the panel of vehicle ``i``. Its bar shows the command: to the left braking, to the right driving."""
+    """Draw the panel of vehicle ``i``; its bar extends to the left for braking, to the right for driving."""
     left, width = _panel(scene, i)
     pen.box(left, _PANEL_TOP, left + 20, _PANEL_TOP + 18, vehicle_colour(i))
     middle, half, top = left + width / 2, width / 2, _PANEL_TOP + 62
@@ -365,7 +365,7 @@ def _marks(scene: Scene, every_m: float) -> list[float]:
 
 
 def _spacing(scene: Scene) -> float:
-    """Return a distance (m) between labelled marks on the road with which at most about a dozen marks are in view."""
+    """Return a distance (m) between labelled marks on the road, so large that at most about 12 marks are in view."""
     width = scene.view.right_m - scene.view.left_m
     return next((every for every in (5.0, 10.0, 20.0, 50.0, 100.0, 200.0) if width <= 12 * every), 500.0)
 

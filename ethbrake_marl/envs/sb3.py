@@ -59,15 +59,15 @@ def make_sb3_vec_env(
         seed: seed of the stream of worlds; None: a random seed.
         learners: vehicles that learn, by name (``vehicle_2``) or index (0 = front); None: the learners of the scenario.
         reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that the learners observe; None: ``observation_for(scenario)``.
-        horizon_is_end: report no truncation at the horizon, so that the algorithm does not add an estimated value of
-            the time after the horizon. Such an estimate can grow without limit, because harm after the horizon is not
-            counted (docs/train.md). False: ``TimeLimit.truncated`` marks episodes that ended at the horizon.
+        observation: features that the learners observe; None: the observation of the scenario (``observation_for``).
+        horizon_is_end: True: report no truncation at the horizon, so that the algorithm does not add an estimated value
+            of the time after the horizon. Such an estimate can grow without limit, because harm after the horizon is
+            not counted (docs/train.md). False: ``TimeLimit.truncated`` is true for episodes that ended at the horizon.
         appended: numbers to append to each observation. ``number``: the number of the learner among the learners (0 =
             foremost). ``state``: the full state of the line (``game.full_state.full_state``), for a central critic.
             None: no numbers.
-        step_infos: fill the infos in every step, as the other environments do, instead of at the end of an episode
-            only. This is slower.
+        step_infos: True: fill the infos in every step, as the other environments do; False: only at the end of an
+            episode. This is slower.
         render_mode: ``rgb_array`` or None. ``render`` and ``VecVideoRecorder`` show all worlds side by side.
         actions: None: an action is a number in [-1, 1]. A whole number K of at least 2: an action is the index of one
             of K evenly spaced numbers, from 0 (full braking capacity) to K - 1 (full driving capacity).
@@ -93,19 +93,19 @@ def make_sb3_vec_env(
 class EthBrakeVecEnv(Begun, VecEnv):
     """``VecEnv`` whose rows are learners: row ``k * L + l`` is learner l of L (front to rear) in world k.
 
-    The rows of a world end together. Each new episode takes the next world of one stream. At the end of an episode, the
-    infos of its rows contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return ``r``, number of
-    steps ``l``, and ``t``, which is always 0), and all infos of the other environments. At other steps the infos
-    contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on the whole
-    environment.
+    The episodes in the rows of one world end together. Each new episode takes the next world of one stream. At the end
+    of an episode, the infos of its rows contain ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return
+    ``r``, number of steps ``l``, and ``t``, which is always 0), and all infos of the other environments. At other steps
+    the infos contain only the infos of a shield, unless ``step_infos`` is true. ``get_attr`` and ``env_method`` act on
+    the whole environment.
 
     Args:
         engine: the engine of the worlds; ``make_sb3_vec_env`` builds it.
         seed: seed of the stream of worlds.
-        horizon_is_end: report no truncation at the horizon; see ``make_sb3_vec_env``.
+        horizon_is_end: whether to report no truncation at the horizon; see ``make_sb3_vec_env``.
         appended: numbers to append to each observation: ``number``, the number of the learner among the learners, or
             ``state``, the full state of the line. None: no numbers.
-        step_infos: fill the infos in every step, instead of at the end of an episode only.
+        step_infos: True: fill the infos in every step; False: only at the end of an episode.
         render_mode: ``rgb_array`` or None.
         actions: number of discrete actions; None: an action is a number in [-1, 1].
 
@@ -157,7 +157,7 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seed of the worlds from the next reset on, and return the seed, once per row.
 
-        ``seed`` is the seed; None: a random seed. All rows have the same seed, because they share one stream of worlds.
+        If ``seed`` is None, the seed is random. All rows have the same seed, because they share one stream of worlds.
         """
         self._set_seed(chosen_seed(seed))
         self._goes_on = False
@@ -166,8 +166,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
     def reset(self) -> Observations:
         """Start an episode in every world, and return the observations, float32 [rows, F].
 
-        Use ``seed`` and ``set_options`` before to choose the worlds. Options apply to one reset only. Invalid options
-        raise ``InvalidInput``, and are then forgotten.
+        To choose the worlds, call ``seed`` or ``set_options`` before. Options apply to one reset only. Invalid options
+        raise ``InvalidInput``, and the next reset ignores them.
         """
         try:
             worlds = self._read_options()
@@ -358,8 +358,8 @@ class EthBrakeVecEnv(Begun, VecEnv):
             )
             if start is None or (k % width and bytes_of(start) != bytes_of(starts[-1])):
                 raise InvalidInput(
-                    f"set_options: row {k} has {row!r}; either all rows or no rows may have an {INITIAL_STATE}, and all"
-                    " rows of a world must have the same one"
+                    f"set_options: row {k} has {row!r}; give {INITIAL_STATE} in all rows or in none, and the same state"
+                    " in all rows of a world"
                 )
             starts += [] if k % width else [start]
         return Worlds.concatenate(starts)

@@ -126,8 +126,8 @@ class Trace:
     Args:
         engine: engine to record, from its next reset on.
         whole: record all steps of the episode (for engines with one world). If false, record the latest step only.
-        alert: worlds at the alert of an engine that is at its first decision, to record the running episodes. None:
-            recording starts at the next reset.
+        alert: worlds at the alert; given if the engine has just reached its first decision, so that the running
+            episodes are recorded. None: recording starts at the next reset.
 
     """
 
@@ -172,8 +172,8 @@ class Trace:
     def stepped(self, memory: Memory, before: Engine, after: Engine) -> Memory:
         """Return the recorded motions after a step.
 
-        With ``whole``, these are all motions so far, with the last one closed, and the motion of the step. Otherwise
-        they are the motion of the step only.
+        If ``whole`` is true, the result contains all motions so far (the last of them closed) and the motion of the
+        step. Otherwise only the motion of the step is returned.
 
         Args:
             memory: the motions recorded so far.

@@ -38,8 +38,8 @@ from ethbrake_marl.physics.state import Bools, Floats
 class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]]):
     """Wrapper whose ``step`` also returns a cost: observation, reward, cost, terminated, truncated, info.
 
-    OmniSafe expects this format of Safety-Gymnasium. The cost is the harm that the step added to the line (m2/s2), in
-    the count of the reward (first impacts or all impacts).
+    OmniSafe expects this format of Safety-Gymnasium. The cost is the harm that the step added to the line (m2/s2),
+    first-impact or total harm as in the reward.
 
     Args:
         env: an ``EthBrakeEnv``, possibly inside wrappers that pass on its infos.
@@ -73,7 +73,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
         observation, reward, terminated, truncated, info = self.env.step(action)
         if isinstance(reward, np.ndarray) and reward.ndim:
             raise InvalidInput(
-                "CostEnv: the reward of the environment is a vector: must be a number; wrap the environment in"
+                "CostEnv: the reward of the environment is a vector, but must be a number; wrap the environment in"
                 " mo_gymnasium's LinearReward first"
             )
         if "cost" not in info:
@@ -87,7 +87,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     """Many worlds of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``).
 
     After ``reset(seed=s)``, row k is world k of seed s. Each new episode takes the next world of this seed. All
-    returned arrays are new.
+    returned arrays are new objects, which later steps do not change.
 
     Args:
         num_envs: number of worlds that are simulated together, at least 1.
@@ -96,7 +96,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
         learners: the vehicle that learns, by name (``vehicle_2``) or index (0 = front), in a list; None: the learner
             of the scenario.
         reward: reward of a step (``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``).
-        observation: features that the learner observes; None: ``observation_for(scenario)``.
+        observation: features that the learner observes; None: the observation of the scenario (``observation_for``).
         autoreset_mode: Gymnasium's autoreset mode, which says what happens when an episode ends. ``NextStep``
             (default): the step returns the last observation, and the next step resets the world, ignores its action and
             returns the reward 0. ``SameStep``: the step resets the world and returns the first observation of the new
@@ -215,7 +215,7 @@ class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], 
     def _fill_ignored(self, actions: NDArray[Any], before: Bools) -> NDArray[Any]:
         """Return the actions, with 0 for the worlds whose actions are ignored.
 
-        In mode ``NextStep``, these are the worlds whose episodes had already ended before the step (mask ``before``
+        In mode ``NextStep``, actions are ignored in worlds whose episodes had ended before the step (mask ``before``
         [n]).
         """
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP or not before.any():

@@ -66,14 +66,16 @@ def check_arrays(found: Mapping[str, ArrayHeader], wanted: Sequence[ArrayRow], w
     Args:
         found: headers of the arrays in a file, by name.
         wanted: required names, types and shapes.
-        word: word for an array in error messages.
+        word: word that error messages use for an array.
 
     """
     names = {row.name for row in wanted}
     for name in sorted(names - found.keys()):
         raise ValueError(f"{word} {name!r} is missing")
     for name in sorted(found.keys() - names):
-        raise ValueError(f"{word} {name!r} must not be in this file; it must have {', '.join(sorted(names))}")
+        raise ValueError(
+            f"{word} {name!r} must not be in this file; the file must have only {', '.join(sorted(names))}"
+        )
     lengths: dict[str, int] = {}
     for row in wanted:
         header = found[row.name]
@@ -97,10 +99,12 @@ def safetensors_headers(data: bytes) -> dict[str, ArrayHeader]:
     """
     length = int.from_bytes(data[:8], "little")
     if not 2 <= length <= min(len(data) - 8, HEADER_LIMIT_BYTES):
-        raise ValueError(f"not a safetensors file (a header of {length} bytes in a file of {len(data)} bytes)")
+        raise ValueError(
+            f"not a safetensors file: a header of {length} bytes is not possible in a file of {len(data)} bytes"
+        )
     table = parse_strict_json(data[8 : 8 + length])
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
-        raise ValueError("not a safetensors file (the header is not a JSON object of tensors)")
+        raise ValueError("not a safetensors file: its header is not a JSON object of tensors")
     return {name: ArrayHeader(str(entry.get("dtype")), _lengths(entry.get("shape"))) for name, entry in table.items()}
 
 
@@ -112,8 +116,9 @@ def _lengths(shape: object) -> tuple[int, ...]:
 class ArrayArchive:
     """An ``.npz`` archive in memory, whose headers have been read and checked.
 
-    Accepted are archives such as ``numpy.savez`` and ``numpy.savez_compressed`` write: on one disk, without comment and
-    encryption, stored or deflated, with different names. Raises ``ValueError`` for any other data.
+    An archive must be of the kind that ``numpy.savez`` and ``numpy.savez_compressed`` write: a single file without
+    comment and encryption, whose arrays are stored or deflated and have different names. Raises ``ValueError`` for any
+    other data.
 
     Args:
         data: bytes of the archive.
@@ -166,7 +171,8 @@ class ArrayArchive:
         size = start + math.prod(header.shape) * np.dtype(header.dtype).itemsize
         if member.file_size != size:
             raise ValueError(
-                f"array {name!r} has {member.file_size:,} bytes; {header.dtype} {list(header.shape)} needs {size:,}"
+                f"array {name!r} has {member.file_size:,} bytes, but {header.dtype} {list(header.shape)} needs"
+                f" {size:,} bytes"
             )
         self.headers[name], self._starts[name] = header, start
 
@@ -188,27 +194,28 @@ def _npy_header(name: str, beginning: bytes) -> tuple[ArrayHeader, int]:
     if dtype[1:] not in ("b1", "f4", "f8", "i4", "i8", "u1", "u2", "u4", "u8"):
         raise ValueError(f"array {name!r}: has type {dtype}; must be a boolean, integer or floating-point type")
     if _SHAPE.fullmatch(shape) is None:
-        raise ValueError(f"array {name!r}: ({shape:.60}) is not a valid shape")
+        raise ValueError(f"array {name!r}: has the invalid shape ({shape:.60})")
     return ArrayHeader(dtype, tuple(int(each) for each in shape.split(",") if each.strip())), 10 + length
 
 
 def _check_directory(data: bytes) -> None:
     """Raise ``ValueError`` unless ``data`` ends like a simple zip archive with a small directory.
 
-    The check comes first because a zip reader creates an object for every entry of the directory.
+    Call this function before opening the archive, because a zip reader creates an object for every entry of the
+    directory.
     """
     if len(data) < 22 or data[-22:-18] != b"PK\x05\x06":
         raise ValueError("not a plain .npz archive")
     disk, first_disk, here, members, size, start, comment = struct.unpack("<4H2LH", data[-18:])
     if disk or first_disk or comment or here != members or data[-42:-38] == b"PK\x06\x07":
-        raise ValueError("not a plain .npz archive (it has several disks or a comment, or is a zip64 archive)")
+        raise ValueError("not a plain .npz archive: it has several disks or a comment, or is a zip64 archive")
     if members > _MEMBERS_LIMIT or size > _DIRECTORY_LIMIT_BYTES or start + size != len(data) - 22:
-        raise ValueError(f"not a plain .npz archive (its directory has {members} members in {size:,} bytes)")
+        raise ValueError(f"not a plain .npz archive: its directory has {members} entries in {size:,} bytes")
 
 
 @contextmanager
 def _damage() -> Iterator[None]:
-    """Context manager: raise ``ValueError`` for an error of the zip reader in the block."""
+    """Context manager: convert an error of the zip reader inside the block to ``ValueError``."""
     try:
         yield
     except (zipfile.BadZipFile, zlib.error, struct.error, EOFError, OSError, RuntimeError, OverflowError) as error:

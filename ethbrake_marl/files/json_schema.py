@@ -11,7 +11,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 class FileSchema(GenerateJsonSchema):
-    """JSON Schema generator for files in which ``null`` is not a value: unused keys are left out."""
+    """JSON Schema generator for files in which no value may be ``null``: a key without a value is left out."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
         """Return the JSON schema of an optional value, without ``null``. Pydantic calls this method."""

@@ -59,7 +59,7 @@ def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
 
     Args:
         at: path of the value (keys and indices) inside the checked field; ``()``: the field itself.
-        value: the invalid value, shown in the message; ``UNSHOWN``: do not show a value.
+        value: the invalid value, which the message shows; ``UNSHOWN``: the message shows no value.
         right: what would be valid, for example ``must be above 0``.
 
     """
@@ -82,7 +82,7 @@ class Wording:
 
     Args:
         model: pydantic model of the file.
-        needed: text that says what must be written for any missing key.
+        needed: text that says what must be written if a required key is missing, the same for all keys.
 
     """
 
@@ -90,7 +90,7 @@ class Wording:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Return the names of the keys that are allowed at the end of ``path`` (keys and indices inside the file)."""
+        """Return the names of the keys that are allowed in place of the last key of ``path`` (keys and indices)."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -187,7 +187,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """The first mistake that pydantic found in data from a program; ``str`` gives ``place: right``."""
+    """The first mistake that pydantic found in data from a program; as text, its place and what would be valid."""
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value

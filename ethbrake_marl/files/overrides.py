@@ -53,7 +53,7 @@ class Override:
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Apply settings to a copy of ``content``; return only the changed top-level keys, with their new values.
+        """Apply settings to a copy of ``content``, and return the changed top-level keys with their new values.
 
         For ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting ``reward.harm=2`` the result is
         ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` if a path leads into a value that is neither a mapping nor
@@ -86,6 +86,6 @@ def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
         entries[int(key)] = _placed(entries[int(key)], rest, override)
         return entries
     raise InvalidInput(
-        f"--set {override.key}: {key!r} cannot be set, because {flow_text(part, 60)} is neither a mapping nor a list;"
-        " set the whole value"
+        f"--set {override.key}: {key!r} cannot be set inside {flow_text(part, 60)}, which is neither a mapping nor a"
+        f" list; leave out the key {key!r}"
     )

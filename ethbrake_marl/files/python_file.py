@@ -33,7 +33,9 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     """
     _, module = _run_file(Path(path), f"file {path!r}")
     if not hasattr(module, name):
-        raise InvalidInput(f"file {path!r}: does not define {name!r}; after the colon, give a name that it defines")
+        raise InvalidInput(
+            f"file {path!r}: does not define {name!r}; write FILE.py:NAME with a name that the file defines"
+        )
     if reads is not None and Path(reads).is_file():
         _READ.setdefault(Path(reads).name, set()).add(file_sha256(Path(reads)))
     return getattr(module, name)

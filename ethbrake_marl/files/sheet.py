@@ -183,8 +183,8 @@ class Sheet:
     def rich(self, width: int = WIDE) -> RenderableType:
         """Return the table, with the note below, as an object of ``rich`` for a terminal of ``width`` characters.
 
-        In a cell, all lines of text after the first are dim. Columns marked ``wide`` are omitted if ``width`` is below
-        ``WIDE``.
+        In a cell with several lines of text, all but the first line are dim. Columns marked ``wide`` are omitted if
+        ``width`` is below ``WIDE``.
         """
         from rich import box
         from rich.console import Group
@@ -338,8 +338,9 @@ def parquet_file(
 ) -> Iterator[Callable[..., None]]:
     """Context manager: yield a function ``add(columns)`` that appends rows to a new Parquet file.
 
-    ``columns`` maps column names to arrays of equal length; ``add(columns, together=True)`` writes them as one row
-    group. The file appears only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not installed.
+    ``columns`` maps column names to arrays of equal length; ``add(columns, together=True)`` writes these rows as one
+    row group. The file appears only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
+    installed.
 
     Args:
         path: path of the new file.

@@ -196,7 +196,7 @@ def _folder_to_disk(path: Path) -> None:
 
 
 def _umask() -> int:
-    """Return the permission bits that this process removes from new files."""
+    """Return the umask: the permission bits that this process removes from new files."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -38,7 +38,7 @@ def checked_action(action: ArrayLike, shape: tuple[int, ...], names: str, count:
     good = (number >= -LARGEST) & (number <= LARGEST)
     if not good.all():
         raise InvalidInput(
-            f"action of {names}: {float(number[~good].flat[0])!r}; must be from -1 (full braking) to 1 (full driving)"
+            f"action of {names} = {float(number[~good].flat[0])!r}: must be from -1 (full braking) to 1 (full driving)"
         )
     return number.reshape(shape).clip(-1.0, 1.0)
 

@@ -1,4 +1,4 @@
-"""Contact features: a vehicle forecasts its next impacts for three own commands, full braking, coasting, full driving.
+"""Contact features: a vehicle forecasts its next impacts for its own full braking, coasting and full driving.
 
 A forecast covers only the vehicles that the observer knows. The observer's own command starts after its latency. The
 other vehicles continue with their observed commands, with two exceptions. A vehicle without a command in force is
@@ -56,7 +56,8 @@ def observe_contacts(
         observers: indices of the observing vehicles.
         time_step: time between two decisions, s.
         commands: commands to forecast, as indices into CONTACT_COMMANDS.
-        features: scaling, [3, 30], or [3, 42] with contact_far: rows 1 / scale, low and high, one column per feature.
+        features: scaling of the features, [3, 30], or [3, 42] with the group contact_far: rows 1 / scale, low and high,
+            one column per feature.
         out: result, [n, observers, features]; columns of commands that are not forecast are not changed.
         failed: set to True for each world in which a check of the kernel failed, [n].
 
@@ -99,17 +100,17 @@ def observe_contacts(
 
 @compiled
 def _place_known(table: Floats, state: Floats, params: Floats, k: int, i: int, at: int) -> tuple[int, int]:
-    """Write the vehicles that a vehicle knows into a table; return the first and last column that it knows.
+    """Write the vehicles that vehicle ``i`` knows into ``table``; return the first and last column of a known vehicle.
 
-    A vehicle is placed far away if it is unknown, or if some of its data that a forecast needs are unknown. The column
-    of a known obstacle counts as known.
+    A vehicle is placed far away if it is unknown, or if some of its data that a forecast needs are unknown. A known
+    obstacle counts as a known vehicle.
 
     Args:
         table: table to fill, in the layout of ``physics.rows``, [rows, N + at].
         state: state rows of the worlds, [n, S], in the layout of ``physics.columns``.
         params: parameter rows of the worlds, in the same layout.
         k: index of the world.
-        i: index of the vehicle.
+        i: index of the observing vehicle.
         at: 1 if the worlds have an obstacle, which then has column 0 of the table; otherwise 0.
 
     """
@@ -161,11 +162,11 @@ def _write_features(
     decision step belongs to this step, as in the engine.
 
     Args:
-        table: the world after the forecast, in the layout of ``physics.rows``.
+        table: one world after the forecast, in the layout of ``physics.rows``.
         found: next impact of each pair, the result of ``forecast_contacts``.
         own: column of the observing vehicle.
-        first: first column that the vehicle knows.
-        last: last column that the vehicle knows.
+        first: first column of a vehicle that the observer knows.
+        last: last column of a vehicle that the observer knows.
         time_step: time between two decisions, s.
         value: result, one number per feature.
 

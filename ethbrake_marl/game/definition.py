@@ -14,7 +14,7 @@ class Drawn(Protocol):
 
     @property
     def worlds(self) -> Worlds:
-        """The n drawn worlds at the alert (time 0)."""
+        """The drawn worlds at the alert (time 0), n of them."""
 
 
 class Game(Protocol):
@@ -54,7 +54,7 @@ class Game(Protocol):
 
     @property
     def observation(self) -> Any:
-        """Features that vehicles observe: one list, or lists by vehicle name; None: see ``observations_of``."""
+        """Features that vehicles observe: one list for all, or lists by vehicle name; None: the default features."""
 
     @property
     def has_obstacle(self) -> bool:
@@ -62,14 +62,14 @@ class Game(Protocol):
 
     @property
     def by_link(self) -> bool:
-        """Whether vehicles get news over links with their own delays and losses, not from their own latency on."""
+        """Whether links have delays and losses of their own; if not, a vehicle knows everything after its latency."""
 
     @property
     def builds_up(self) -> bool:
         """Whether the brakes of some vehicle may build up gradually instead of acting at once."""
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Literal["list", "training"] = "list") -> Drawn:
-        """Draw worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
+        """Draw worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
 
         ``channel``: ``"list"`` (worlds for evaluation) or ``"training"``, two independent lists.
         """

@@ -46,5 +46,5 @@ def checked_indices(indices: ArrayLike, count: int, names: str) -> Ints:
     good = (numbers >= 0) & (numbers < count) & (np.floor(numbers) == numbers)
     wrong = numbers[~good] if not good.all() else numbers[numbers.dtype.kind not in "iu"]
     if wrong.size:
-        raise InvalidInput(f"action of {names}: {wrong.ravel().tolist()[0]!r}; {right}")
+        raise InvalidInput(f"action of {names} = {wrong.ravel().tolist()[0]!r}: {right}")
     return numbers.astype(np.int64)

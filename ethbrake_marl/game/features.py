@@ -155,7 +155,7 @@ _SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 @dataclass(frozen=True, slots=True)
 class RegisteredFeature:
-    """A feature that a function of its own computes: a registered feature, or a built-in one outside the groups."""
+    """A feature with its own function: a registered feature, or a built-in feature that belongs to no group."""
 
     feature: Feature  # name, unit, scale, bounds and meaning of the feature
     function: Callable[..., Floats]  # (worlds, vehicle) or (worlds, vehicle, neighbour) -> value, [n]
@@ -179,7 +179,8 @@ class RegisteredFeature:
             worlds: worlds in which to compute the feature, n of them.
             vehicle: index of the observing vehicle, from 0.
             neighbour: index of the neighbour; None for a feature of the vehicle itself.
-            counts: worlds in which the value is used, a mask [n] or one truth value; in all others it is ``unknown``.
+            counts: worlds in which the function's value is used, a mask [n] or one truth value; in all other worlds the
+                feature has the value ``unknown``.
             steps: number of steps so far, [n], for error messages; None: unknown.
 
         """
@@ -196,7 +197,7 @@ class RegisteredFeature:
             world = int(np.argmin(np.isfinite(values)))
             step = "" if steps is None else f" after step {int(steps[world])}"
             raise InvalidInput(
-                f"feature {name!r}: is {values[world]} for vehicle_{vehicle + 1} in world {world} at"
+                f"feature {name!r}: its value is {values[world]} for vehicle_{vehicle + 1} in world {world} at"
                 f" {worlds.time_s[world]:g} s{step}; must be finite"
             )
         return self.scaled(values)
@@ -363,7 +364,7 @@ _BUILT_IN: dict[str, RegisteredFeature] = {
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
-    """Return the full names of the features in a list of groups and single features, in order.
+    """Return the full names of the features that a list of groups and single features contains, in its order.
 
     The result for ``["own", "front_1.gap"]`` is ``("own.speed", ..., "front_1.gap")``. Raises ``UnknownName`` with a
     suggestion for an unknown name, and ``InvalidInput`` if ``listed`` is not a list, is empty, or has a feature twice.
@@ -478,22 +479,25 @@ def register_feature(
     unknown: float = 0.0,
     reads: Sequence[Piece] | None = None,
 ) -> None:
-    """Register a feature, so that an ``observation:`` list can contain it. The function's docstring is its meaning.
+    """Register a feature, so that an ``observation:`` list can contain it.
+
+    The docstring of ``function`` becomes the meaning of the feature.
 
     An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``. The entry
-    point names a ``Part`` with the arguments after ``name``.
+    point names a ``Part``, which contains all arguments but ``name``.
 
-    The channel does not restrict a feature of kind ``own``: its function can read data of other vehicles that no
-    message has delivered. Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is
-    in use. Raises ``InvalidInput`` for invalid arguments, and if the function, called for a few test worlds, fails or
+    The channel does not restrict a feature with ``of="own"``: the function can read data of other vehicles that no
+    message contained. Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is in
+    use. Raises ``InvalidInput`` for invalid arguments, and if the function, called for a few test worlds, fails or
     returns a wrong shape or a number that is not finite.
 
     Args:
         name: name of the feature, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. An
             observation lists a feature of the vehicle itself as ``name``, a feature of a neighbour as ``front_1.name``.
         function: ``function(worlds, vehicle)``, or ``function(worlds, vehicle, neighbour)`` for a feature of a
-            neighbour. It returns the value in each world, [n], in ``unit``. Index 0 is the front vehicle. The function
-            must work for any number of vehicles and must not depend on anything but its arguments.
+            neighbour. The function returns the value of the feature in each world, [n], in ``unit``. Index 0 is the
+            front vehicle. The function must work for any number of vehicles and must not depend on anything but its
+            arguments.
         unit: unit of the value.
         scale: number above 0; the observed number is ``clip(value / scale, low, high)``.
         low: smallest observed number.
@@ -501,9 +505,9 @@ def register_feature(
         of: vehicle that the feature describes: ``own``, the observer itself; ``neighbour``, a neighbour. The value for
             a neighbour is observed only if the vehicle knows the neighbour.
         unknown: value for an unknown neighbour, in ``unit``; must be 0 if ``of`` is ``own``.
-        reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``); if some of them
-            are unknown, the value is ``unknown``. None: not specified; a scenario whose messages do not contain all
-            data then rejects the feature.
+        reads: data in the neighbour's messages that the function needs (the names in ``v2x: tells``); if the observer
+            does not know all these data, the feature has the value ``unknown``. None: not specified; the feature then
+            cannot be used in a scenario whose messages leave out some data.
 
     """
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
@@ -515,14 +519,14 @@ def register_feature(
     _check_numbers(name, scale=scale, low=low, high=high, unknown=unknown)
     if of not in get_args(Of) or (of == "own" and unknown != 0.0):
         raise InvalidInput(
-            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: of must be own or neighbour; with own, unknown must"
-            " be 0"
+            f"feature {name!r}: of = {of!r}, unknown = {unknown:g}: of must be 'own' or 'neighbour'; if of is 'own',"
+            " unknown must be 0"
         )
 
     if reads is not None and not (of == "neighbour" and not isinstance(reads, str) and set(reads) <= set(PIECES)):
         raise InvalidInput(
-            f"feature {name!r}: reads = {reads!r}: must be a list of names from {', '.join(PIECES)}; only a feature of"
-            " a neighbour can have reads"
+            f"feature {name!r}: reads = {reads!r}: must be a list of names from {', '.join(PIECES)}, and can be given"
+            " only for a feature of a neighbour"
         )
 
     feature = Feature(name, str(unit), float(scale), float(low), float(high), " ".join(str(function.__doc__).split()))

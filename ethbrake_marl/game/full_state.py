@@ -32,8 +32,8 @@ _PAIR_FEATURES = tuple(replace(f, meaning=_PAIR_MEANING[f.name]) for f in GROUPS
 def state_features(scenario: Game) -> tuple[Feature, ...]:
     """Return the features of the full state in order: own features of each vehicle, features of each pair, and time.
 
-    The features of a pair are its gap and its hit flag. If there is an obstacle ahead of Vehicle 1, the gap and hit
-    flag of Vehicle 1 and the obstacle come last.
+    The features of a pair are its gap and its hit flag (1 after an impact of the pair, otherwise 0). If there is an
+    obstacle ahead of Vehicle 1, the gap and hit flag of Vehicle 1 and the obstacle come last.
     """
     vehicles = [replace(f, name=f"{name}.{f.name}") for name in scenario.vehicle_names for f in GROUPS.own]
     pairs = [replace(f, name=f"pair_{p}.{f.name}") for p in range(1, scenario.vehicles) for f in _PAIR_FEATURES]
@@ -73,7 +73,7 @@ def row_features(own: tuple[Feature, ...], appended: Appended | None, scenario: 
 
     """
     if appended not in (None, *get_args(Appended)):
-        raise InvalidInput(f"appended = {appended!r}: must be {' or '.join(get_args(Appended))}, or None")
+        raise InvalidInput(f"appended = {appended!r}: must be {', '.join(map(repr, get_args(Appended)))} or None")
     if appended is None:
         return own
     if appended == "state":

@@ -33,7 +33,7 @@ HARM_COUNTS: tuple[HarmCount, ...] = get_args(HarmCount)
 def check_harm_count(harm_count: str) -> None:
     """Raise ``InvalidInput`` unless ``harm_count`` is ``"first"`` or ``"total"``."""
     if harm_count not in HARM_COUNTS:
-        raise InvalidInput(f"harm_count {harm_count!r}: must be {' or '.join(repr(known) for known in HARM_COUNTS)}")
+        raise InvalidInput(f"harm_count = {harm_count!r}: must be {' or '.join(repr(known) for known in HARM_COUNTS)}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class Ledger:
         )
 
     def add(self, impacts: Impacts) -> Ledger:
-        """Return the ledger after adding the ``impacts`` of the next segment of the same episodes."""
+        """Return the ledger after adding the ``impacts`` of the next interval of time of the same episodes."""
         return Ledger(
             self.first_impact_harm + impacts.first_impact_harm,
             self.total_harm + impacts.total_harm,
@@ -107,8 +107,9 @@ class Ledger:
     def vehicle_harm(self, harm_count: HarmCount) -> Floats:
         """Return the harm that each vehicle bears, [n, N] m2/s2.
 
-        A vehicle bears its share (``split``) of the harm of the pair in front and of the pair behind. Vehicle 1 also
-        bears the harm of impacts with the obstacle. ``harm_count``: ``"first"``, first-impact harm, or ``"total"``.
+        A vehicle bears its share (``split``) of the harm of impacts with the vehicle in front and with the vehicle
+        behind. Vehicle 1 also bears the harm of impacts with the obstacle. ``harm_count``: ``"first"``, first-impact
+        harm, or ``"total"``.
         """
         harm = split(self.pair_harm(harm_count), self.mass_t)
         harm[:, 0] += self.obstacle_harm(harm_count)
@@ -117,9 +118,9 @@ class Ledger:
     def speed_changes(self, harm_count: HarmCount) -> tuple[Floats, Floats]:
         """Return the changes of speed of each vehicle by impacts at its front and at its rear, [n, N] m/s each.
 
-        They are computed from the harm of the pair, on the assumption that a single impact of these two vehicles caused
-        all of it. The result is exact for a first impact without a third vehicle. If ``"total"`` counts several impacts
-        of a pair, the result is larger than the change of speed in the hardest impact. ``harm_count``: ``"first"``,
+        The changes are computed from the harm of the pair, as if a single impact of these two vehicles had caused all
+        of it. The result is exact for a first impact without a third vehicle. If ``"total"`` counts several impacts of
+        a pair, the result is larger than the change of speed in the hardest impact. ``harm_count``: ``"first"``,
         first-impact harm, or ``"total"``, total harm.
         """
         with_obstacle = np.concatenate([self.obstacle_harm(harm_count)[:, np.newaxis], self.pair_harm(harm_count)], 1)
@@ -206,7 +207,7 @@ def front_share(harm: float, front_mass: float, rear_mass: float) -> float:
 
 @compiled
 def _powers(shares: Floats, exponent: float) -> Floats:
-    """Return ``min(x^exponent, 1)`` for each x >= 0 in ``shares`` [k], [k]; it is the same on every processor."""
+    """Return ``min(x^exponent, 1)`` for each x >= 0 in ``shares``, [k], with the same bits on every processor."""
     result = np.zeros(len(shares))
     for i in range(len(shares)):
         if shares[i] > 0.0:

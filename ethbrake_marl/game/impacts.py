@@ -1,4 +1,4 @@
-"""``EpisodeImpacts``: every impact of a batch of episodes, the input of measures by impacts."""
+"""``EpisodeImpacts``: every impact of a batch of episodes, from which measures can be computed."""
 
 from __future__ import annotations
 

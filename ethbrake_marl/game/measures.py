@@ -39,7 +39,7 @@ MeasureFunction = Callable[[Any], Any]  # maps a ``StepOutcome`` or ``EpisodeImp
 
 @dataclass(frozen=True, slots=True)
 class NamedMeasure:
-    """A measure that evaluations can show and rewards can count under its name."""
+    """A measure that evaluations can show, and that rewards can use as a term, under its name."""
 
     name: str  # name of the measure, and key of its weight in a reward
     meaning: str  # what it measures, in words
@@ -52,7 +52,7 @@ class NamedMeasure:
     def built_in(self, step: StepOutcome, params: Any) -> Floats:
         """Return the value of a built-in measure in one step, [n] or [n, N].
 
-        ``params``: the ``RewardParams`` whose fields ``settings`` are passed to the function.
+        ``params``: the reward; its fields named in ``settings`` are passed to the measure's function.
         """
         assert self.function is not None
         value: Floats = self.function(step, *(getattr(params, name) for name in self.settings))
@@ -81,7 +81,9 @@ class NamedMeasure:
             whose = "".join(f" for vehicle_{i + 1}" for i in vehicle)
             when = "" if steps is None else f" at step {steps[world]}"
             number = value[(world, *vehicle)]
-            raise InvalidInput(f"measure {self.name!r}: is {number}{whose} in world {world}{when}; must be finite")
+            raise InvalidInput(
+                f"measure {self.name!r}: its value is {number}{whose} in world {world}{when}; must be finite"
+            )
         if self.form not in ("", form := _form(value)):
             raise InvalidInput(f"{what}: its function returned {form}, but {self.form} when it was registered")
         return value
@@ -89,8 +91,8 @@ class NamedMeasure:
     def _numbers(self, given: StepOutcome | EpisodeImpacts, what: str) -> Any:
         """Call the measure's function and return its result, [n] or [n, N]; raise ``InvalidInput`` if it is unusable.
 
-        Numbers are converted to float64; truth values of a measure by impacts are not converted. Values per learner are
-        completed with 0 for the other vehicles. ``what``: how error messages name the measure.
+        Numbers are converted to float64; truth values are not converted if ``by`` is ``"impacts"``. Values per learner
+        are completed with 0 for the other vehicles. ``what``: how error messages name the measure.
         """
         assert self.function is not None
         learners = given.learners if isinstance(given, StepOutcome) else None
@@ -118,10 +120,10 @@ class NamedMeasure:
         return whole
 
     def change(self, before: EpisodeImpacts, after: EpisodeImpacts, steps: Ints) -> Floats:
-        """Return the change of a measure by impacts from ``before`` to ``after``, [n] or [n, N].
+        """Return how much the value of this measure (``by="impacts"``) has changed, [n] or [n, N].
 
-        ``before`` and ``after``: impacts of the same episodes at two times. ``steps``: number of steps so far, [n], for
-        error messages.
+        ``before`` and ``after``: impacts of the same episodes up to an earlier and a later time. ``steps``: number of
+        steps so far, [n], for error messages.
         """
         if len(before.rows.world) == len(after.rows.world):
             return np.zeros(after.worlds.speeds_mps.shape[: 2 if self.form.endswith("vehicle") else 1])
@@ -145,8 +147,8 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
             ``metric_NAME`` in results, and ``reward_NAME`` in the infos of a step.
         function: function of an ``EpisodeImpacts`` (``by="impacts"``) or a ``StepOutcome`` (``by="step"``). It returns
             one number per world [n] or per vehicle [n, N]; with ``by="step"`` also one per learner [n, L]. It must work
-            for any number of vehicles. Its docstring describes the measure. Evaluations show truth values of a measure
-            by impacts as a rate.
+            for any number of vehicles. Its docstring describes the measure. If a measure with ``by="impacts"`` returns
+            truth values, evaluations show the share of worlds or vehicles with the value True.
         unit: unit of the numbers.
         by: what the measure is computed from: ``impacts`` or ``step``.
 
@@ -156,14 +158,14 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
 
 def _add(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
-    """Add a measure that evaluations do not show by themselves. The arguments are those of ``register_measure``."""
+    """Add a measure that evaluations show on request only. The arguments are those of ``register_measure``."""
     if not isinstance(name, str) or _NAME.fullmatch(name) is None:
         raise InvalidInput(
             f"measure {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, begin with a letter, and not"
             " end in _interval, _low, _high, or _ and a number"
         )
     if by not in get_args(By):
-        raise InvalidInput(f"measure {name!r}: by = {by!r}: must be {' or '.join(get_args(By))}")
+        raise InvalidInput(f"measure {name!r}: by = {by!r}: must be {' or '.join(map(repr, get_args(By)))}")
     if not callable(function) or not (function.__doc__ or "").strip():
         raise InvalidInput(f"measure {name!r}: must be a function with a docstring that describes the measure")
     if name in (*SETTINGS, *BUILT_IN):

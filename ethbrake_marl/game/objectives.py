@@ -15,8 +15,8 @@ mass-weighted       ``N sum_j m_j H_j / sum_j m_j``: the harm of a heavy vehicle
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j`` with one weight per vehicle (0, or 1e-6 to 1e6), for example its
                     number of occupants
 preference          the formula of ``weighted``, with the weights ``harm_weight`` that the scenario declares
-injury:curve        expected injuries in 1,000 lines; a vehicle's injury risk is the larger one of its two pairs
-                    (``Ledger.speed_changes``)
+injury:curve        expected injuries in 1,000 lines; a vehicle's injury risk is the larger one of the risks by impacts
+                    at its front and at its rear (``Ledger.speed_changes``)
 ==================  ================================================================================================
 """
 
@@ -180,7 +180,7 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
     """Return the change during a step of the amount that each vehicle should minimise, [n, N].
 
     For an objective that is a weighted sum of the vehicles' harm, the change is the weighted sum of their harm in the
-    step. For any other objective it is the amount after the step minus the amount before the step.
+    step. For any other objective the change is the amount after the step minus the amount before the step.
 
     Args:
         before: harm before the step.
@@ -198,7 +198,7 @@ def added_harm(before: Ledger, after: Ledger, harm_count: HarmCount, objectives:
 
 
 def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, bool]:
-    """Return the weights of the vehicles' harm in an objective, [n, N], and whether it is a maximum instead of a sum.
+    """Return the weights of the vehicles' harm in an objective, [n, N], and whether the objective is a maximum.
 
     Args:
         objective: the objective.
@@ -220,7 +220,7 @@ def aim_of(objective: Objective, line: Weighed, vehicle: int) -> tuple[Floats, b
 
 
 def standard_objectives() -> tuple[str, ...]:
-    """Return the names of the built-in objectives that every scenario can use, and of loaded registered objectives."""
+    """Return the names of the objectives that every scenario can use: built-in ones, and loaded registered ones."""
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
@@ -344,8 +344,9 @@ def _social_weights(angle_deg: float) -> tuple[float, float]:
 def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
     """Return the expected injuries in 1,000 lines, [n], summed over the vehicles; the same for every ``vehicle``.
 
-    For a vehicle that is hit at both sides, the larger of the two risks counts. The larger change of speed may have the
-    smaller risk, so with it another impact could lower the number of injuries.
+    For a vehicle that is hit at both sides, the larger of the two risks counts. The risk depends on the side, so the
+    larger change of speed may have the smaller risk. If only the risk of the larger change counted, a further impact
+    could lower the number of injuries.
     """
     del vehicle
     front, rear = harm.front_change_mps, harm.rear_change_mps
@@ -358,7 +359,7 @@ def _injured(objective: Objective, harm: HarmSoFar, vehicle: int) -> Floats:
 
 
 def weighted_harm(borne: Floats, weights: Floats) -> Floats:
-    """Return ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, summed front to rear, so it does not depend on the batch.
+    """Return ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2. The order of the sums is fixed: front to rear.
 
     ``borne``: harm H_j that each vehicle bears, [n, N] m2/s2. ``weights``: weight w_j of each vehicle, [n, N].
     """

@@ -74,13 +74,13 @@ class ObservationSpec:
             whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
             if not whole or not 0 <= count <= MOST_NEIGHBOURS:
                 raise InvalidInput(
-                    f"observation: {side} = {count!r}; must be a whole number from 0 to {MOST_NEIGHBOURS}"
+                    f"observation: {side} = {count!r}: must be a whole number from 0 to {MOST_NEIGHBOURS}"
                 )
         for name, shown in (("role", self.role), ("obstacle", self.obstacle), ("contact", self.contact)):
             if not isinstance(shown, bool):
-                raise InvalidInput(f"observation: {name} = {shown!r}; must be True or False")
+                raise InvalidInput(f"observation: {name} = {shown!r}: must be True or False")
         if self.time_step_s is not None and not 0.0 < self.time_step_s < math.inf:
-            raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}; must be a positive number of seconds")
+            raise InvalidInput(f"observation: time_step_s = {self.time_step_s!r}: must be a positive number of seconds")
         if self.chosen and _reach(self.chosen) != (self.front, self.rear, self.role, self.obstacle, self.contact):
             raise InvalidInput(
                 "observation: chosen: the other fields contradict the chosen features; use eb.choose_observation([...])"
@@ -98,12 +98,12 @@ class ObservationSpec:
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """All features of the observation, in order; their names are unique (``own.speed``, ``front_1.gap``)."""
+        """All features of the observation, in order. No name (``own.speed``, ``front_1.gap``) occurs twice."""
         return tuple(feature_named(name) for name in self.chosen) or self.whole
 
     @property
     def whole(self) -> tuple[Feature, ...]:
-        """Built-in features of every group from which the observation has at least one feature, in order."""
+        """All features of every built-in group from which the observation has at least one feature, in order."""
         groups = [("own", GROUPS.own), *((prefix, GROUPS.neighbour) for prefix, _ in self.sides)]
         groups += [("role", GROUPS.role)] if self.role else []
         groups += [("obstacle", GROUPS.obstacle)] if self.obstacle else []
@@ -155,7 +155,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
                 raise unknown_name("observation", name, known)
         chosen = listed.get("chosen", ())
         if not isinstance(chosen, list | tuple):
-            raise InvalidInput(f"observation: chosen = {chosen!r}; must be a list of features")
+            raise InvalidInput(f"observation: chosen = {chosen!r}: must be a list of features")
         spec = ObservationSpec(**{**listed, "chosen": listed_features(chosen) if chosen else ()})
     else:
         names = listed_features(listed)
@@ -167,7 +167,7 @@ def choose_observation(listed: Observation, time_step_s: float | None = None) ->
 
 
 def _reach(names: Sequence[str]) -> tuple[int, int, bool, bool, bool]:
-    """Return the fields (front, rear, role, obstacle, contact) of the specification with the features ``names``."""
+    """Return the fields (front, rear, role, obstacle, contact) of a specification that has the features ``names``."""
     sides = [side for name in names if (side := side_of(name)) is not None]
     front, rear = (max((k for at, k in sides if at == wanted), default=0) for wanted in ("front", "rear"))
     groups = {name.partition(".")[0] for name in names}
@@ -187,7 +187,7 @@ def observe(worlds: Worlds, vehicle: int, spec: ObservationSpec) -> Observations
     ``spec``: the F features to observe. Raises ``InvalidInput`` if no vehicle has this index.
     """
     if not 0 <= vehicle < worlds.N:
-        raise InvalidInput(f"observe: vehicle index {vehicle}; must be from 0 to {worlds.N - 1}")
+        raise InvalidInput(f"observe: vehicle = {vehicle}: must be an index from 0 to {worlds.N - 1}")
     packed = Packed.of(worlds)
     return spec.plan.observe(packed.state, packed.params, np.array([vehicle]))[:, 0].copy()
 
@@ -266,7 +266,7 @@ class Plan(NamedTuple):
     def _observe_present(
         self, state: Floats, params: Floats, vehicles: Ints, steps: Floats | None, *, says: bool = False
     ) -> Observations:
-        """Return the observations if the state of a known vehicle is its present state, [n, len(vehicles), F].
+        """Return the observations, [n, len(vehicles), F], for a channel that makes present states known.
 
         ``says``: whether the scenario restricts what messages contain (``v2x: tells``).
         """

@@ -1,6 +1,6 @@
 """Vector rewards: a reward has several named components, such as the harm of each vehicle, instead of one number.
 
-These components can be chosen. Their values are for one step:
+The components can be chosen from this table, which shows the value of each component in one step:
 
 ==========  ========================================================================================
 component   value

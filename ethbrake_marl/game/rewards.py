@@ -43,7 +43,7 @@ class WithoutEffect(UserWarning):
 
 
 def own_terms() -> list[str]:
-    """Return the names of the registered measures, without the built-in ones and without loading any package."""
+    """Return the names of the registered measures, without the built-in ones. No package is loaded."""
     return [name for name in MEASURES if name not in RewardParams.model_fields]
 
 
@@ -65,7 +65,8 @@ class RewardParams(FileModel):
 
     Args:
         harm, collision, risk, jerk, terminal, shaping: weights of the built-in terms, at least 0. The docstring of the
-            module ``game.rewards`` has their formulas. If another term has a weight, harm must be given explicitly.
+            module ``game.rewards`` has their formulas. If another weight is given, the weight of harm must be given,
+            too.
         harm_count: ``first``: the term harm counts first-impact harm; ``total``: it counts total harm.
         objective: objective of all vehicles, or a list with one per vehicle; None: the objective of the scenario.
         shaping_discount: discount in the shaping term, in (0, 1]; it should equal the learner's own discount.
@@ -173,7 +174,7 @@ class RewardParams(FileModel):
 
         Args:
             harm: harm of the step in m2/s2, for many worlds [n] or as one number for a single world.
-            safe_end: 1 if the episode ended without any collision in this step, else 0; in the same shape.
+            safe_end: 1 if the episode ended in this step without any collision, else 0; in the shape of ``harm``.
 
         """
         terms = {}
@@ -196,9 +197,9 @@ class RewardParams(FileModel):
     def settled(self, of_scenario: Declared, vehicles: int) -> tuple[RewardParams, tuple[Objective, ...]]:
         """Return this reward with its field ``objective`` filled in, and the parsed objective of each vehicle.
 
-        The objective is that of the reward, or of the scenario if the reward has none. If all vehicles have the
-        objective ``total``, or if harm has weight 0, the field is None and the tuple is empty. In the second case a
-        warning (``WithoutEffect``) says that an objective other than ``total`` has no effect.
+        The objective comes from the reward or, if the reward has none, from the scenario. If all vehicles have the
+        objective ``total``, or if harm has weight 0, the field is None and the tuple of parsed objectives is empty. If
+        harm has weight 0, a warning (``WithoutEffect``) says that an objective other than ``total`` has no effect.
 
         Args:
             of_scenario: objective that the scenario declares.
@@ -226,14 +227,14 @@ class RewardParams(FileModel):
         """Return the potential of the shaping term, [n] m2/s2: minus the least harm that simple braking can reach.
 
         Each learner brakes with a constant deceleration from now on, and all other vehicles brake fully. The
-        deceleration is one of nine fractions, from 0 to 1, of the learner's braking capacity. A single learner uses the
-        fraction with the least harm. Several learners begin with full braking and choose their fractions one after the
-        other, front to rear, in two rounds; they all get the same potential.
+        deceleration is a fraction of the learner's braking capacity: one of nine values from 0 to 1. A single learner
+        uses the fraction with the least harm. Several learners begin with full braking and choose their fractions one
+        after the other, front to rear, in two rounds; they all get the same potential.
 
         Args:
             worlds: n worlds of N vehicles.
             learners: indices of the learners, from 0.
-            horizon_s: end of the episode, s; harm (by ``harm_count``) up to this time is counted.
+            horizon_s: end of the episode, s; only harm up to this time is included.
 
         """
         braking = worlds.vehicles.braking_capacity_mps2
@@ -258,7 +259,7 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Return the ``RewardParams`` for a name in ``REWARDS`` or a mapping of settings; ``RewardParams`` are unchanged.
+    """Return the ``RewardParams`` for a name in ``REWARDS``, a mapping of settings, or ``RewardParams`` (unchanged).
 
     Raises ``UnknownName`` for an unknown name or setting, and ``InvalidInput`` for an invalid value.
     """

@@ -12,9 +12,9 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True)
 class StepOutcome:
-    """Result of one step in n worlds of N vehicles (P pairs), the input of measures by step. Do not change its arrays.
+    """Result of one step in n worlds of N vehicles (P pairs), from which measures can be computed.
 
-    Column 0 belongs to the front vehicle or front pair.
+    Do not change the arrays. Column 0 of an array belongs to the front vehicle or front pair.
     """
 
     first_impact_harm: Floats  # [n] first-impact harm of the line in this step, m2/s2

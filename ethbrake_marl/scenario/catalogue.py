@@ -24,7 +24,8 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios, or of the shipped recipes if ``folder`` is ``"train"``.
 
-    The folder is in the checkout or in the installed package. Raises ``InvalidInput`` if neither exists.
+    The folder is in the checkout or in the installed package. Raises ``InvalidInput`` if the folder is in neither
+    place.
     """
     checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
     if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
@@ -61,8 +62,8 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
     """Register the scenarios of a folder by name: a file ``my-name.yaml`` in it becomes ``--scenario my-name``.
 
     Subfolders are ignored. A file is checked only when it is used. Registering the same folder again changes nothing.
-    Raises ``InvalidInput`` for a folder that does not exist or has no such file, and ``AlreadyExists`` if one of its
-    names belongs to a shipped scenario or to a scenario of another registered folder.
+    Raises ``InvalidInput`` if the folder does not exist or has no ``.yaml`` file. Raises ``AlreadyExists`` if a shipped
+    scenario, or a scenario of another registered folder, has the same name as a scenario of this folder.
     """
     path = Path(folder).resolve()
     if not path.is_dir():
@@ -85,7 +86,7 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
     A ``Scenario`` is returned unchanged. The docstring of ``scenario_path`` explains how the file is found.
 
     Raises ``UnknownName`` with a suggestion for an unknown name. Raises ``InvalidInput``, which names file, line, key
-    and value, if the file is not a valid scenario or its ``name`` differs from the file's name.
+    and value, if the file is not a valid scenario, or if its key ``name`` differs from the name of the file.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -99,10 +100,10 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     """Return the path of a scenario's file. If ``name_or_path`` is a path, the file need not exist.
 
     A text that ends in ``.yaml`` or ``.yml`` is a path. Shipped and registered scenarios are found by name, such as
-    ``stress-wide``. If the name of a shipped scenario begins with the name of its folder, ``stress/wide`` means the
-    same scenario, unless a file of this name exists. Any other name, ``mine`` or ``my/folder/mine``, means the file
-    ``mine.yaml`` or ``my/folder/mine.yaml`` below ``folder``. Shipped and registered names have priority, so other
-    files cannot change the meaning of a command. Raises ``UnknownName`` with a suggestion for an unknown name.
+    ``stress-wide``. The shipped scenario ``stress-wide`` in the folder ``stress`` can also be written ``stress/wide``,
+    unless a file with this path exists. Any other name means a file below ``folder``: ``my/folder/mine`` means
+    ``my/folder/mine.yaml``. Shipped and registered names have priority, so other files cannot change the meaning of a
+    command. Raises ``UnknownName`` with a suggestion for an unknown name.
     """
     text = str(name_or_path)
     path = folder / text
@@ -130,7 +131,7 @@ BENCHMARK = (  # scenarios that ship with a table of best known harm, which the 
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios (``standards``).
+    """Return the names of the scenarios in a group: ``benchmark``, or a folder of shipped scenarios (``stress``).
 
     The result is empty for any other name.
     """
@@ -186,7 +187,7 @@ def _load(path: Path) -> Scenario:
 
 
 def _with_members(document: Document, folder: Path) -> Document:
-    """Return the document with the content of other files inserted: scenarios of a mixture, and rows of tables.
+    """Return the document with the content of the files that it names: scenarios of a mixture, and rows of tables.
 
     Paths in the document are relative to ``folder``.
     """
@@ -210,7 +211,7 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
 
     Args:
         document: file that contains the scenario, for error messages.
-        at: path of the scenario (keys and indices) inside the document; ``()``: the whole document is the scenario.
+        at: keys and indices that lead to the scenario inside the document; ``()``: the whole document is the scenario.
         content: content of the scenario.
         folder: folder to which the path of the table's file is relative.
 
@@ -232,7 +233,7 @@ def _member(name: str, where: str, i: int, folder: Path) -> dict[str, Any]:
         path = scenario_path(name, folder)
         document = read_yaml(path)
         if isinstance(document.content, dict) and "mixture" in document.content:
-            raise InvalidInput(f"{name} is a mixture itself; list its scenarios here")
+            raise InvalidInput(f"a mixture cannot contain another mixture; list the scenarios of {name} instead")
         return _load(path).declared()
     except InvalidInput as error:
         raise InvalidInput(f"{where}: mixture[{i}].scenario = {name}: {error}") from None
@@ -264,9 +265,10 @@ def check_file_name(kind: str, name: str) -> None:
 def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
     """Return the text of a commented YAML file for a new scenario ``name`` with the values of ``based_on``.
 
-    The text contains every key; a key that ``based_on`` does not use is a comment with an example. Save it as
-    ``<name>.yaml``. If ``rows_file`` is given, a table refers to this CSV file instead of containing its rows;
-    ``rows_text`` returns the content of that file. Raises ``InvalidInput`` for an invalid name or unknown ``based_on``.
+    The text contains every key; a key that ``based_on`` does not use is a comment with an example. Save the text as
+    ``<name>.yaml``. If ``rows_file`` is given, the text names this CSV file instead of containing the rows of the
+    table; ``rows_text`` returns the content of that file. Raises ``InvalidInput`` for an invalid name or unknown
+    ``based_on``.
     """
     check_file_name("scenario", name)
     base = load_scenario(based_on)
@@ -311,7 +313,7 @@ def _line(key: str, values: Mapping[str, object]) -> str:
 
 
 def _short_member(entry: dict[str, Any]) -> dict[str, Any]:
-    """Return an entry of a mixture's list; if its scenario equals a shipped one, ``scenario`` is only the name."""
+    """Return an entry of a mixture's list of scenarios; the content of a shipped scenario is replaced by its name."""
     content, name = entry["scenario"], entry["scenario"]["name"]
     as_shipped = name in _shipped_paths() and member_content(load_scenario(name)) == content
     return {**entry, "scenario": name} if as_shipped else entry

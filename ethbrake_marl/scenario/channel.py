@@ -6,17 +6,20 @@ of vehicle j from this time on, in s after the alert:
 
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act
 
-T is the message period. ``U(0, T)`` is the wait for the next message. ``k`` is the number of periods during which a
-burst of losses destroys every message; in a stationary Gilbert-Elliott channel ``P(k >= m) = (p / (p + r))
-(1 - r)^(m - 1)``. With probability ``lost`` no message ever arrives on a link. Sensors see the direct neighbours after
-a delay drawn from ``sensing_s``, called a *hop*. Vehicle i can react to the emergency from this time on:
+T is the message period, and ``U(0, T)`` the random wait for the next message. L_radio is the time of transmission,
+t_proc the time until the message is processed, and t_act the time until the brakes respond. ``k`` is the number of
+periods during which a burst of losses destroys every message. In a stationary Gilbert-Elliott channel ``P(k >= m) = (p
+/ (p + r)) (1 - r)^(m - 1)``, if in each period a burst begins with probability p and ends with probability r. With
+probability ``lost`` no message ever arrives on a link. Sensors see the direct neighbours after a delay drawn from
+``sensing_s``, called a *hop*. Vehicle i can react to the emergency from this time on:
 
     latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))
 
 Before this time it has neither received the message of Vehicle 1 nor seen the vehicle ahead brake. Vehicle i knows the
 state of vehicle j from ``max(latency_i, tau_ij)`` on. If j is a direct neighbour in sight, it knows this state from
-``max(latency_i, hop_ij)`` on if that is earlier. A latency that a vehicle observes is the own latency without delays of
-the channel. Under the preset ``paper`` a vehicle knows everything from its own latency on.
+``max(latency_i, hop_ij)`` on if that time is earlier. If a vehicle observes another vehicle's latency, it observes the
+*own* latency of that vehicle, which does not include delays of the channel. Under the preset ``paper`` a vehicle knows
+everything as soon as its own latency has elapsed.
 
 With ``persistence: first``, vehicle i knows the present state of vehicle j after the first message. With ``persistence:
 periodic``, a message is sent in every period T and may be lost by the same Gilbert-Elliott channel; vehicle i then
@@ -59,7 +62,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class Equipage(FileModel):
-    """V2X equipment of one vehicle or of a type of vehicles."""
+    """V2X equipment of one vehicle, or of all vehicles of one type."""
 
     sends: bool = Field(default=True, description="whether the vehicle sends messages")
     hears: Hears = Field(
@@ -72,7 +75,8 @@ class Equipage(FileModel):
 class Equipped(NamedTuple):
     """V2X equipment of the vehicles in n worlds.
 
-    It has a single row (n = 1) if all worlds have the same equipment, or if it is the least equipment in any world.
+    There is a single row (n = 1) if all worlds have the same equipment, or if the row is the least equipment in any
+    world.
     """
 
     sends: Bools  # [n, N] whether vehicle i sends messages
@@ -176,9 +180,10 @@ Preset = Annotated[str, AfterValidator(_known_preset), _PresetSchema]
 
 
 def _pieces(value: Any) -> Tells | None:
-    """Check the value of ``tells`` and return it in the order of ``PIECES``.
+    """Check the value of ``tells``, and return its items in the order of ``PIECES``.
 
-    ``value`` is a list of items for all vehicles, or a mapping from vehicle names to such lists.
+    ``value``: list of the items that messages contain (for all vehicles), or a mapping from vehicle names to such
+    lists.
     """
     if value is None:
         return None
@@ -322,7 +327,7 @@ class V2X(FileModel):
 
     @property
     def delays(self) -> bool:
-        """Whether the channel differs from the paper's rule in anything but the contents of messages."""
+        """Whether the channel differs from the paper's rule in other respects than the contents of messages."""
         return self.channel._replace(tells=None) != CHANNELS["paper"]
 
     @property
@@ -359,7 +364,7 @@ class V2X(FileModel):
         return PER_LINK * vehicles * vehicles
 
     def with_news(self, vehicles: Vehicles, u: Floats, equipped: Equipped) -> Vehicles:
-        """Return ``vehicles`` with the latencies and the times of first knowledge that result from the channel.
+        """Return ``vehicles`` with the latencies that the channel causes, and the times from which others are known.
 
         The previous latencies, which must not include delays of a channel, become ``own_latency_s``.
 
@@ -402,12 +407,12 @@ class V2X(FileModel):
         return heard, np.where(in_sight[channel.senses], hop, np.inf)
 
     def with_channel(self, worlds: Worlds, u: Floats, key: Floats, time_step_s: float, equipped: Equipped) -> Worlds:
-        """Return ``worlds`` with this channel: times of first knowledge, and the columns of periodic messages.
+        """Return ``worlds`` with the times from which a vehicle knows others, and with the data of periodic messages.
 
         Args:
             worlds: worlds without a channel, at the alert (time 0).
             u: uniform numbers in [0, 1) for the links, [n, N * N * PER_LINK].
-            key: seed of the later message losses of each world, [n] in [0, 1).
+            key: seed of the losses of all messages after the first one, a number in [0, 1) for each world, [n].
             time_step_s: time between two decisions (s); vehicles sample their states at each decision.
             equipped: V2X equipment, one row per world or one row for all worlds.
 
@@ -426,7 +431,7 @@ class V2X(FileModel):
         return replace(worlds, messages=messages.columns)
 
     def with_fixed_news(self, worlds: Worlds, time_step_s: float, where: str, equipped: Equipped | None) -> Worlds:
-        """Return worlds of the user with this channel; raise ``InvalidInput`` if the channel is random.
+        """Return the user's worlds with the data of this channel; raise ``InvalidInput`` if the channel is random.
 
         Args:
             worlds: worlds without a channel.
@@ -449,8 +454,8 @@ class V2X(FileModel):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Return the number k of message periods that a burst of losses lasts, in the shape of ``u``.
 
-    ``k >= m`` holds exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This is the inverse distribution function of the
-    stationary Gilbert-Elliott channel. It is computed without logarithms, so every machine gets the same k.
+    ``k >= m`` holds exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. This rule is the inverse distribution function of
+    the stationary Gilbert-Elliott channel. k is computed without logarithms, so every machine gets the same k.
 
     Args:
         u: uniform numbers in [0, 1).
@@ -471,7 +476,7 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 def link_delays(channel: Channel, u: Floats) -> Floats:
     """Return the delay tau of each link in s, [...]; infinite if no message arrives.
 
-    For the timing ``latency`` the delay is minus infinity, because only the receiver's own latency counts.
+    With the timing ``latency`` the delay is minus infinity: a vehicle knows everything after its own latency.
 
     Args:
         channel: settings of the channel.

@@ -129,7 +129,7 @@ def _check_speeds(scenario: ScenarioFields) -> None:
 
 
 def _check_derived(scenario: ScenarioFields) -> None:
-    """Raise an error if a gap that follows from a time gap, or a distance that follows from a margin, is too large."""
+    """Raise an error if a gap (from a time gap) or the distance of the obstacle (from a margin) is too large."""
     largest = QUANTITY.usual["gaps_m"].high
     for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
         right = f"gives gaps up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"

@@ -204,7 +204,7 @@ class ScenarioFields(FileModel):
     @field_validator("types")
     @classmethod
     def _types(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that every entry names declared types, and that a list has one entry per vehicle."""
+        """Check that each entry of ``types`` names declared types, and that a list has one entry per vehicle."""
         if not {"vehicles", "vehicle_types"} <= info.data.keys():
             return value
         vehicles, kinds = info.data["vehicles"], info.data["vehicle_types"]
@@ -225,7 +225,7 @@ class ScenarioFields(FileModel):
     @field_validator("table")
     @classmethod
     def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Check that every column of the table is known for this number of vehicles, and its numbers are in range."""
+        """Check that each column of the table fits this number of vehicles, and that its numbers are in range."""
         if value is None or "vehicles" not in info.data:
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
@@ -407,8 +407,8 @@ class ScenarioFields(FileModel):
         """Return the declarations of a quantity by vehicle type, one mapping for each vehicle, pair or world.
 
         An example is ``({0: 2.0, 1: 9.5}, ...)`` for ``mass_t``. The keys of a mapping are the indices of the vehicle's
-        possible types; without vehicle types the only key is 0. For a type that does not declare the quantity, the
-        value is the declaration outside the types. Raises the same errors as ``quantities``.
+        possible types; without vehicle types the only key is 0. If a vehicle type does not declare the quantity, the
+        mapping has the scenario's general declaration for this type. Raises the same errors as ``quantities``.
         """
         line = self.types_of_line
         if line is None or field not in QUANTITY.of_a_type:
@@ -454,7 +454,7 @@ class ScenarioFields(FileModel):
         return tuple(self.table_entries.get((field, i), entry) for i, entry in enumerate(entries))
 
     def bounds(self, field: str, *, dry: bool = False) -> tuple[tuple[float, float], ...]:
-        """Return (smallest, largest) value of a quantity for each vehicle, pair or world, whether declared or derived.
+        """Return (smallest, largest) value of a declared or derived quantity for each vehicle, pair or world.
 
         Args:
             field: key of a quantity that every world has: ``gaps_m``, ``speeds_mps``, ``mass_t``, ...
@@ -481,8 +481,8 @@ def world_quantities(scenario: ScenarioFields, declared: Callable[[str], Floats]
     """Return every quantity of k worlds by key, [k, entries] each, computed from the declared quantities.
 
     Derived quantities are ``speed = line speed + own deviation``, ``gap = time gap x speed of the pair's rear vehicle``
-    and ``latency = own latency + time of the alert``. All increase with the declared quantities, so bounds of declared
-    values give bounds of derived values.
+    and ``latency = own latency + time of the alert``. The derived quantities increase with the declared ones, so bounds
+    of declared quantities give bounds of derived ones.
 
     Args:
         scenario: the scenario that declares the quantities.
@@ -517,9 +517,9 @@ def obstacle_gap(
 ) -> Floats | None:
     """Return the distance from Vehicle 1 to the obstacle ahead in k worlds, [k] m; None without an obstacle.
 
-    The distance is either declared itself or results from a declared margin, the distance from the point where Vehicle
-    1 stops by full braking to the obstacle: ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``, with speed v_1,
-    latency tau_1 and braking capacity a_1 of Vehicle 1 (for brakes that act at once).
+    A scenario declares this distance, or a margin: the distance from the point where Vehicle 1 stops by full braking to
+    the obstacle. In the second case ``distance = margin + v_1 tau_1 + v_1^2 / (2 a_1)``. Vehicle 1 has the speed v_1,
+    the latency tau_1 and the braking capacity a_1, and its brakes act at once.
 
     Args:
         scenario: the scenario that declares the obstacle.
@@ -537,7 +537,7 @@ def obstacle_gap(
 
 
 def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
-    """Return a function that maps a key to the smallest and largest value for each vehicle or pair, [2, entries]."""
+    """Return a function from a quantity's key to its smallest and largest value per vehicle or pair, [2, entries]."""
     return lambda key: np.array(scenario.supports(key)).T
 
 

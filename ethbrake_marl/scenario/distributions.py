@@ -229,7 +229,7 @@ class TableColumn:
 
     @property
     def middle(self) -> TableColumn:
-        """A column with a single row: the weighted median of this column."""
+        """A column with a single row, which contains the weighted median of this column."""
         order = np.argsort(self.rows, kind="stable")
         shares = np.cumsum(np.diff(self.cumulative, prepend=0.0)[order])
         return replace(self, rows=self.rows[order][[np.searchsorted(shares, 0.5)]], cumulative=np.ones(1))

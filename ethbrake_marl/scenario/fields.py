@@ -41,7 +41,7 @@ Place = tuple[tuple[int, ...], int]  # a stream of uniform numbers and a column 
 
 @dataclass(frozen=True, slots=True)
 class QuantityRule:
-    """Meaning, unit and allowed range of a quantity, and the place of its random number."""
+    """Meaning, unit and allowed range of a quantity, and which random number draws it."""
 
     name: str  # key of the quantity in a scenario, and name of the field of Worlds or Vehicles
     unit: str  # unit, a key of UNITS; "" for a plain number
@@ -83,7 +83,7 @@ class QuantityRule:
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return the place of the uniform number that draws entry ``index`` (from 0): (stream, column)."""
+        """Return which uniform number draws entry ``index`` (from 0), as (stream, column)."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
@@ -101,8 +101,8 @@ class QuantityRule:
     def of(self, worlds: Worlds) -> Floats:
         """Return the values of this quantity in ``worlds``, [n, entries]: one entry per vehicle, pair or world.
 
-        If every world has a friction, capacities are the declared ones, not limited by the friction. The distance to
-        the obstacle is NaN in a world without an obstacle.
+        If every world has a friction, the returned capacities are the declared ones, not limited by the friction. The
+        distance to the obstacle is NaN in a world without an obstacle.
         """
         of_vehicles = hasattr(worlds.vehicles, self.name)
         values: Floats = getattr(worlds.vehicles if of_vehicles else worlds, self.name)

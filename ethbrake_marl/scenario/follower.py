@@ -17,8 +17,8 @@ class Follower(FileModel):
     """An additional vehicle behind the last vehicle, at the same speed, which brakes fully after its latency.
 
     The default latency (0.75 s) and braking capacity (0.774 g) are those of the competent driver in UN Regulation 157.
-    The default time gap (0.6 s) is our choice. The follower's brakes act at once; the driver of the regulation has a
-    build-up time. Its mass equals the mass of the last vehicle.
+    The default time gap (0.6 s) is our choice. The follower's brakes act at once, but the regulation's driver needs
+    some time to build up the braking force. Its mass equals the mass of the last vehicle.
     """
 
     time_gap_s: float = Field(
@@ -48,8 +48,8 @@ def with_follower(document: Document, build: Callable[[Document], Any]) -> Docum
     line = build(Document(document.file, content, document.lines))
     if "vehicle_types" in content:
         raise InvalidInput(
-            f"{where}: cannot be combined with vehicle_types; set vehicles: {line.vehicles + 1} and declare the last"
-            " vehicle like the others"
+            f"{where}: cannot be combined with vehicle_types; instead of the follower, declare a further vehicle"
+            f" (vehicles: {line.vehicles + 1})"
         )
     N, own = line.vehicles, {"braking_capacity_mps2": follower.braking_capacity_mps2, "latency_s": follower.latency_s}
     for key, rule in QUANTITY.declared.items():

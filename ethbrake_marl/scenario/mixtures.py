@@ -42,8 +42,8 @@ def build_members(
 
     Keys next to ``mixture`` replace the same keys in every listed scenario. A key for which all scenarios have the same
     value is added to the document. If the list is invalid, the document is returned unchanged, without scenarios, and
-    the schema rejects it later. Raises ``InvalidInput`` naming the invalid scenario, or the key in which two scenarios
-    must not differ.
+    the schema rejects it later. Raises ``InvalidInput`` naming the invalid scenario, or the key that must have the same
+    value in all scenarios but has not.
 
     Args:
         document: parsed file with a key ``mixture``.
@@ -72,7 +72,8 @@ def _is_whole(entry: Any) -> bool:
 def member_content(member: ScenarioFields) -> dict[str, Any]:
     """Return everything that determines the worlds of one scenario of a mixture, as plain data.
 
-    The result has the declared values and the shared settings, without title, description and source.
+    The result has the declared values, and the settings that all scenarios of a mixture share. It has no title,
+    description or source.
     """
     declared = member.model_dump(mode="json", exclude_unset=True, exclude_none=True, exclude=set(WORDS))
     return {**declared, **member.model_dump(mode="json", include=set(_SHARED), exclude_none=True)}
@@ -111,7 +112,9 @@ def _check_members(document: Document, members: Sequence[ScenarioFields]) -> Non
         )
     for k, member in enumerate(members):
         if member.members:
-            raise InvalidInput(f"{where}[{k}]: {member.name} is a mixture itself; list its scenarios here")
+            raise InvalidInput(
+                f"{where}[{k}]: a mixture cannot contain another mixture; list the scenarios of {member.name} instead"
+            )
         if member.name in [other.name for other in members[:k]]:
             raise InvalidInput(
                 f"{where}[{k}]: {member.name} is listed twice; list it once, with the sum of its weights"

@@ -30,7 +30,7 @@ _UNUSED = 0.5  # value of uniform numbers without effect
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Coordinates of the unit cube of a scenario: name and place of each random number that a world is drawn from."""
+    """Coordinates of the unit cube of a scenario: name, stream and column of each random number that draws a world."""
 
     scenario: ScenarioFields  # the scenario whose worlds the points of the cube determine
     names: tuple[str, ...]  # name of each coordinate, such as ``mass_t of vehicle_1``
@@ -58,7 +58,7 @@ class Ranges:
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return the place of the uniform number of every random quantity: name -> (stream, column)."""
+    """Return which uniform number draws each random quantity: name -> (stream, column)."""
     used: list[str] = []
 
     def note(key: str) -> Floats:
@@ -79,7 +79,7 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return the places of the uniform numbers of vehicle types and loads: name -> (stream, column).
+    """Return which uniform numbers draw vehicle types and loads: name -> (stream, column).
 
     Numbers without effect are left out: a type if only one is possible, a load if no quantity depends on it.
     """

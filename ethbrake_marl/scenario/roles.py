@@ -52,8 +52,8 @@ class ScriptSpec(NamedTuple):
             )
         if match["name"].endswith(".py") or ".py:" in spec:
             raise InvalidInput(
-                f"agent {spec!r}: is a function in a Python file; a scenario cannot use one, only the option --agents"
-                " can. To use it in a scenario, register it under a name in a package that you install"
+                f"agent {spec!r}: is a function in a Python file, which a scenario cannot use (the option --agents can)"
+                "; to use the function in a scenario, register it as an agent in a package that you install"
             )
         return ScriptSpec(match["name"], match["argument"])
 
@@ -108,10 +108,10 @@ class ScriptSpec(NamedTuple):
     ) -> Floats | None:
         """Return the command (m/s2, negative for braking) of a script that does not need the state.
 
-        The result has the shape of ``braking_capacity_mps2``. It is -capacity for ``full_brake``, 0 for ``coast``, -a
-        for ``constant:a``, the command of the first piece for a ``profile``, and None for any other script. Raises
-        ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or a forward acceleration its
-        driving capacity (checked only if ``driving_capacity_mps2`` is given).
+        The result has the shape of ``braking_capacity_mps2``. The command is minus the braking capacity for
+        ``full_brake``, 0 for ``coast``, -a for ``constant:a``, the first command for a ``profile``, and None for any
+        other script. Raises ``InvalidInput`` if a deceleration exceeds the braking capacity of a vehicle, or a forward
+        acceleration its driving capacity (checked only if ``driving_capacity_mps2`` is given).
         """
         capacity = np.asarray(braking_capacity_mps2, dtype=np.float64)
         if not self.is_state_free():
@@ -132,12 +132,12 @@ class ScriptSpec(NamedTuple):
 
 
 def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
-    """Return the pieces of a ``profile``, ((start in s, deceleration in m/s2), ...); raise ``InvalidInput`` if invalid.
+    """Return the intervals of a ``profile``, ((start in s, deceleration in m/s2), ...), or raise ``InvalidInput``.
 
     ``given``: unchecked value from a file; it should be a list ``[[start, deceleration], ...]``.
     """
     right = (
-        f"a profile must be a list of 1 to {MOST_PIECES} pieces [start in s after the latency, deceleration in m/s2],"
+        f"a profile must be a list of 1 to {MOST_PIECES} pairs [start in s after the latency, deceleration in m/s2],"
         " such as [[0, 3], [1, 7]]"
     )
     if not isinstance(given, list | tuple) or not 1 <= len(given) <= MOST_PIECES:
@@ -145,7 +145,7 @@ def checked_pieces(given: object) -> tuple[tuple[float, float], ...]:
     for piece in given:
         numbers = isinstance(piece, list | tuple) and len(piece) == 2
         if not numbers or not all(type(each) in (int, float) and 0.0 <= each <= 3600.0 for each in piece):
-            raise InvalidInput(f"{right}; a piece must be two numbers in [0, 3600], which {piece!r:.60} is not")
+            raise InvalidInput(f"{right}; {piece!r:.60} is not a list of two numbers in [0, 3600]")
     if given[0][0] != 0.0 or not all(one[0] < other[0] for one, other in pairwise(given)):
         raise InvalidInput(f"{right}; the first start must be 0, and the starts must increase")
     return tuple((float(begins), float(braking)) for begins, braking in given)
@@ -160,7 +160,7 @@ def _role_text(role: object) -> object:
         return role
     try:
         if set(role) != {_PROFILE}:
-            raise InvalidInput("must be learner, a script, or {profile: [[0, 3], [1, 7]]} without other keys")
+            raise InvalidInput("must be learner, the name of a script, or a mapping like {profile: [[0, 3], [1, 7]]}")
         pieces = checked_pieces(role[_PROFILE])
     except InvalidInput as error:
         refuse((), role, str(error))

@@ -1,4 +1,4 @@
-"""``Sample``: worlds drawn from a scenario, with their numbers in the list, vehicle types, scenarios and recordings."""
+"""``Sample``: drawn worlds, with their numbers in the list of worlds, vehicle types, scenarios and recordings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def clusters_of(kinds: Mapping[str, _Texts], index: Ints) -> _Texts | None:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Worlds at the alert (time 0), with their numbers in the list.
+    """Worlds at the alert (time 0), with their numbers in the list of worlds.
 
     >>> import ethbrake_marl as eb
     >>> sample = eb.load_scenario("paper-random").sample(2, seed=7)
@@ -61,7 +61,7 @@ class Sample:
         return f"Sample({self.worlds!r}, {numbers}, {self.rejected:,} rejected)"
 
     def take(self, rows: ArrayLike) -> Sample:
-        """Return a copy of the worlds selected by ``rows`` (indices or a mask [n]), with ``rejected`` = 0."""
+        """Return a sample of the worlds selected by ``rows`` (indices or a mask [n]); its ``rejected`` is 0."""
         some = np.asarray(rows)
         texts = (None if each is None else each[some] for each in (self.types, self.scenarios, self.recordings))
         return Sample(self.worlds.take(some), self.index[some], 0, *texts)
@@ -70,7 +70,7 @@ class Sample:
     def join(parts: Sequence[Sample], rejected: int) -> Sample:
         """Join samples into one, in the order of their world numbers.
 
-        Types must be present in all of ``parts`` or in none; the same holds for scenarios and for recordings.
+        Vehicle types must be given in all of ``parts`` or in none. The same is true for scenarios and for recordings.
         ``rejected``: number of rejected draws in the result.
         """
         index = np.concatenate([part.index for part in parts])
@@ -84,9 +84,10 @@ class Sample:
 
     @property
     def kinds(self) -> dict[str, _Texts]:
-        """Columns of text by name, [n] each: ``scenario``, ``recording``, ``vehicle_1_type`` ...; absent ones left out.
+        """Columns of text about the worlds, by name: ``scenario``, ``recording``, ``vehicle_1_type`` ..., [n] each.
 
-        ``scenario`` exists for a mixture, ``recording`` for a table with recordings, types for vehicle types.
+        The column ``scenario`` exists for a mixture, ``recording`` for a table that names recordings, and
+        ``vehicle_1_type`` and so on for a scenario with vehicle types.
         """
         columns = {} if self.scenarios is None else {"scenario": self.scenarios}
         columns |= {} if self.recordings is None else {RECORDING: self.recordings}

@@ -1,4 +1,4 @@
-"""Draw worlds from a scenario. World k of a seed is the same, bit for bit, however many worlds are drawn."""
+"""Draw worlds from a scenario. World k of a seed is the same, bit for bit, for any number of drawn worlds."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _NUMBERS_PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 
 def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-    """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
+    """Return worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
 
     World k is the same, bit for bit, for every ``n`` and ``first``. World k of a mixture is drawn from one of its
     scenarios, chosen by weight, and equals world k of that scenario under the same seed, bit for bit. Results on a
@@ -56,8 +56,8 @@ def sample(scenario: ScenarioFields, n: int, seed: int, *, first: int = 0, chann
         n: number of worlds.
         seed: seed of the list, a whole number of at least 0.
         first: number of the first world in the list, from 0.
-        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has one list of each kind, and the
-            two lists are independent.
+        channel: ``"list"`` (worlds for evaluation) or ``"training"``. Each seed has both lists, and they are
+            independent of each other.
 
     Raises ``InvalidInput`` for a negative seed or ``first``, for ``n < 1``, or if the scenario rejects early impacts
     and some world has one in each of ``MOST_ATTEMPTS`` draws.
@@ -144,7 +144,7 @@ def drawn_quantities(
 ) -> Callable[[str], Floats]:
     """Return a function that maps the key of a declared quantity to its values in n worlds, [n, entries].
 
-    The number of entries is one per vehicle, one per pair or one per world; ``QUANTITY`` defines this for each key.
+    There is one entry per vehicle, per pair or per world, as ``QUANTITY`` defines for each key.
 
     Args:
         scenario: the scenario that declares the quantities.
@@ -232,8 +232,8 @@ def early_impact(scenario: ScenarioFields, worlds: Worlds) -> Bools:
         )
         if scripted is None:
             raise InvalidInput(
-                f"scenario {scenario.name!r}: early_impacts: reject needs scripts that do not depend on the state, but"
-                f" the script {script!r} of vehicle_{i + 1} depends on it"
+                f"scenario {scenario.name!r}: with 'early_impacts: reject', no script may depend on the state, but the"
+                f" script {script!r} of vehicle_{i + 1} depends on the state"
             )
         command[:, i] = scripted
     first_action_s = worlds.first_decision_s(scenario.learners)

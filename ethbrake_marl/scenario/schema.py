@@ -35,7 +35,7 @@ class ScenarioWording(Wording):
     """Texts of the error messages about a scenario, or part of one."""
 
     def instead(self, key: str) -> str:
-        """Return a hint for an unknown key that people often try: other words for friction, and slopes.
+        """Return a hint for an unknown key that people often try: another word for friction, or the slope of the road.
 
         For any other key the hint is empty.
         """
@@ -105,10 +105,10 @@ class Scenario(ScenarioFields):
     """A line of vehicles, the distribution of each quantity, and the vehicles that learn.
 
     A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``, ``{normal: {mean, sd, low,
-    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. A single entry applies to every
-    vehicle, and each vehicle draws its own value from it. A list has one entry per vehicle, or per pair for gaps.
-    ``Scenario(...)``, ``load_scenario`` and ``replace`` raise ``InvalidInput`` for an invalid value. The message names
-    the place and the value and says what would be right.
+    high}}``, ``{lognormal: {median, sigma, low, high}}`` or ``{choice: [...]}``. A single number or distribution
+    applies to every vehicle; from a distribution, each vehicle draws its own value. A list has one entry per vehicle,
+    or per pair for gaps. ``Scenario(...)``, ``load_scenario`` and ``replace`` raise ``InvalidInput`` for an invalid
+    value. The error message names the key and the invalid value, and says what would be valid.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random").replace(mass_t=[4.5, 5.5, 40.0])
@@ -153,7 +153,7 @@ class Scenario(ScenarioFields):
         return Sheet(f"Scenario {self.name}: {self.title or 'no title'}", ("Key", "Value"), rows).html()
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Sample:
-        """Return worlds ``first`` to ``first + n - 1`` of the endless list of ``seed``.
+        """Return worlds ``first`` to ``first + n - 1`` of the endless list of worlds that belongs to ``seed``.
 
         World k of a seed is always the same, bit for bit. ``channel``: ``"list"`` (worlds for evaluation) or
         ``"training"``, two independent lists. Raises ``InvalidInput`` for an invalid number. See ``sampling.sample``.
@@ -206,8 +206,8 @@ class Scenario(ScenarioFields):
             return vehicle
         if isinstance(vehicle, bool) or not isinstance(vehicle, int | np.integer) or not 0 <= vehicle < self.vehicles:
             raise InvalidInput(
-                f"learners: {vehicle!r}: a vehicle must be a name (vehicle_1 ... vehicle_{self.vehicles}) or an index"
-                f" from 0 to {self.vehicles - 1}"
+                f"learners: {vehicle!r}: must be the name of a vehicle (vehicle_1 ... vehicle_{self.vehicles}) or its"
+                f" index (0 ... {self.vehicles - 1})"
             )
         return self.vehicle_names[vehicle]
 
@@ -246,7 +246,7 @@ def _reference(key: str) -> dict[str, Any]:
 
 
 def _range(key: str, low: float, high: float, positive: bool = False) -> dict[str, Any]:
-    """Return the JSON schema that limits a quantity, as a number or inside a distribution or list, to its range.
+    """Return the JSON schema of a quantity that allows only numbers in its range, also in distributions and lists.
 
     Args:
         key: key of the quantity.

@@ -263,7 +263,7 @@ def read_rows(file: Path, columns: object, weights: object) -> dict[str, Any]:
     """Read the rows of a scenario's table, and their weights, from a CSV file.
 
     Returns ``{"rows": [[7.0, 8.0], ...]}``, and also ``"weights": [1.0, ...]`` unless ``weights`` is None. Raises
-    ``InvalidInput`` naming file, line and column.
+    ``InvalidInput`` for an invalid file; the message names file, line and column.
 
     Args:
         file: path of the CSV file, which has a header line.
@@ -304,7 +304,8 @@ def worlds_from_table(scenario: ScenarioFields, columns: Mapping[str, ArrayLike]
     Columns of gaps and speeds are required. Optional columns are ``braking_capacity_1_mps2``,
     ``driving_capacity_1_mps2``, ``latency_1_s``, ``mass_1_t``, ``speed_limit_1_mps`` and the like for each vehicle,
     ``restitution``, and ``obstacle_gap_m`` if the scenario has an obstacle. Quantities without a column have the
-    scenario's value, which must be a fixed number. Raises ``InvalidInput`` naming the column and the row (from 0).
+    scenario's value, which must be a fixed number. Raises ``InvalidInput`` for an invalid value; the message names the
+    column and the row (from 0).
     """
     entries = _known_columns(list(columns), scenario, "initial states")
     by_entry = {
@@ -322,7 +323,8 @@ def worlds_from_state(scenario: ScenarioFields, initial_state: Mapping[str, Any]
     """Build one world (n = 1) from a state ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``.
 
     The keys are the quantities of a scenario. A single number applies to every vehicle. Quantities without a key have
-    the scenario's value, which must be a fixed number. Raises ``InvalidInput`` naming the key and the entry.
+    the scenario's value, which must be a fixed number. Raises ``InvalidInput`` for an invalid value; the message names
+    its key and its index.
     """
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"initial_state = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")

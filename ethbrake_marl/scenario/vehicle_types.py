@@ -64,7 +64,10 @@ TypeQuantity = Annotated[
 
 
 class VehicleType(FileModel):
-    """A vehicle type: weight and quantities. Quantities that it leaves out are declared outside ``vehicle_types``."""
+    """A vehicle type: its weight in the random draw, and its quantities.
+
+    Quantities that it leaves out are declared outside ``vehicle_types``.
+    """
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
     load: Quantity = Field(
@@ -125,7 +128,8 @@ class TypesOfLine:
 
     Args:
         kinds: declaration of each type, by name; the index of a type is its position in this mapping.
-        types: possible types, one entry per place or one for all; None: all types, in proportion to their weights.
+        types: possible types at each place of the line, one entry per place or one entry for all places; None: every
+            type is possible at every place, in proportion to its weight.
         vehicles: number of vehicles in the line.
 
     """

@@ -71,7 +71,7 @@ SPECS: dict[str, Callable[[], object]] = {
         "constant:fast"
     ),
     "agent 'e_v2x_bm:total': argument: must be 'coupled' or 'pairwise'": lambda: make_agent("e_v2x_bm:total"),
-    "harm_count 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
+    "harm_count = 'both': must be 'first' or 'total'": lambda: make_agent("e_v2x_bm", harm_count="both"),
     "horizon_s = 0.0: must be a positive number of seconds": lambda: make_agent("e_v2x_bm", horizon_s=0.0),
     "agent name 'mine:x': must be a plain name without argument": lambda: register_agent("mine:x", Own),
     "file 'nowhere/none.py': does not exist": lambda: make_agent("nowhere/none.py:make_agent"),
@@ -271,7 +271,7 @@ def raising(): raise KeyError("weights")"""
         ("My+File.py:make_agent:3", "the function make_agent has no parameters; leave out argument"),
         ("My+File.py:wrong", "agent 'My+File.py:wrong': 'int' is not an agent, because it has no name and no act"),
         ("My+File.py:raising", "agent 'My+File.py:raising': KeyError: 'weights' (My+File.py, line 4)"),
-        ("My+File.py:nobody", "file 'My+File.py': does not define 'nobody'; after the colon, give a name that it"),
+        ("My+File.py:nobody", "file 'My+File.py': does not define 'nobody'; write FILE.py:NAME with a name"),
     ],
 )
 def test_file_of_an_agent__is_refused(spec: str, message: str, empty_folder: Path) -> None:
@@ -290,9 +290,7 @@ def test_file_of_an_agent__is_the_same_as_long_as_the_process_lives(empty_folder
 
 def test_file_of_an_agent__is_not_run_for_a_role(empty_folder: Path) -> None:
     Path("half.py").write_text("raise SystemExit('this ran')")
-    with refused(
-        "agent 'half.py:make_agent': is a function in a Python file; a scenario cannot use one, only the option"
-    ):
+    with refused("agent 'half.py:make_agent': is a function in a Python file, which a scenario cannot use (the option"):
         PAPER.replace(roles={"vehicle_1": "half.py:make_agent"})
 
 

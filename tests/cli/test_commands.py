@@ -331,7 +331,7 @@ def test_measures__asked_for_wrongly_are_one_line(ethbrake):
     )
     check_refused(
         ethbrake("evaluate", "--scenario", "benchmark", "--set", "measures=injury"),
-        "--set measures: is impossible for benchmark, a group",
+        "--set measures: cannot be used with benchmark, a group",
     )
 
 

@@ -59,7 +59,7 @@ def test_scenario_command__is_refused(line: str, message: str, refuse: Refuse) -
 
 
 EVALUATIONS = [
-    ("evaluate --set harm_count=both", "harm_count 'both': must be 'first' or 'total'"),
+    ("evaluate --set harm_count=both", "harm_count = 'both': must be 'first' or 'total'"),
     ("evaluate --episodes 0", "number of worlds = 0: must be a whole number, at least 1"),
     ("evaluate --episodes 100000000000000", "episodes = 100000000000000: must be a whole number in 1..1000000000000"),
     ("evaluate --seed -1", "seed of the list = -1: must be a whole number, at least 0"),

@@ -77,7 +77,7 @@ def test_standards__full_braking_passes_as_published_and_is_struck_by_a_follower
     refused = ethbrake(*words, "--jobs", "2")
     assert (
         refused.status == 2
-        and "--jobs: is impossible for standards, a group of 7 scenarios; give one of them" in refused.err
+        and "--jobs: cannot be used with standards, a group of 7 scenarios; name a single scenario" in refused.err
     )
 
 

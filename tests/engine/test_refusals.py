@@ -32,13 +32,13 @@ def one(value: object) -> np.ndarray:
 
 
 ACTIONS: dict[str, Callable[[], object]] = {
-    "action of vehicle_2: -1.0000003; must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
+    "action of vehicle_2 = -1.0000003: must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
         [0.5, -1.0000003], (2,), "vehicle_2"
     ),
-    "action of vehicle_2: 1.0000001193; must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
+    "action of vehicle_2 = 1.0000001193: must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
         [0.5, 1.0000001193], (2,), "vehicle_2"
     ),
-    "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
+    "action of vehicle_2 = nan: must be from -1 (full braking) to 1 (full driving)": lambda: checked_action(
         [0.5, np.nan], (2,), "vehicle_2"
     ),
     "action of vehicle_2: has shape (2,); must have shape (1,)": lambda: one(np.zeros(2)),
@@ -58,18 +58,18 @@ def test_action__is_refused(message: str) -> None:
 
 
 OBSERVATIONS: dict[str, Callable[[], object]] = {
-    "observation: front = 1.5; must be a whole number from 0 to 64": lambda: ObservationSpec(1.5, 0),
-    "observation: front = True; must be a whole number from 0 to 64": lambda: ObservationSpec(True, 0),
-    "observation: front = 65; must be a whole number from 0 to 64": lambda: ObservationSpec(65, 0),
-    "observation: front = -1; must be a whole number from 0 to 64": lambda: ObservationSpec(front=-1),
-    "observation: obstacle = 1; must be True or False": lambda: ObservationSpec(obstacle=1),
-    "observe: vehicle index 4; must be from 0 to 2": lambda: observe(
+    "observation: front = 1.5: must be a whole number from 0 to 64": lambda: ObservationSpec(1.5, 0),
+    "observation: front = True: must be a whole number from 0 to 64": lambda: ObservationSpec(True, 0),
+    "observation: front = 65: must be a whole number from 0 to 64": lambda: ObservationSpec(65, 0),
+    "observation: front = -1: must be a whole number from 0 to 64": lambda: ObservationSpec(front=-1),
+    "observation: obstacle = 1: must be True or False": lambda: ObservationSpec(obstacle=1),
+    "observe: vehicle = 4: must be an index from 0 to 2": lambda: observe(
         load_scenario("paper-random").sample(1, 7).worlds, 4, ObservationSpec()
     ),
     "observation: contact features need the time between two decisions; give the argument time_step_s": lambda: observe(
         WORLDS, 1, choose_observation(["own", "contact"])
     ),
-    "observation: time_step_s = -1.0; must be a positive number of seconds": lambda: ObservationSpec(
+    "observation: time_step_s = -1.0: must be a positive number of seconds": lambda: ObservationSpec(
         contact=True, time_step_s=-1.0
     ),
     "policy: scenario: time_step_s = None: must be a number above 0": lambda: make_policy(

@@ -40,10 +40,10 @@ MADE: dict[str, Callable[[], object]] = {
     "observation = 'x': must be an ObservationSpec, for instance ObservationSpec(1, 1), its fields": lambda: (
         parallel_env(observation="x")
     ),
-    "observation: front = 'two'; must be a whole number from 0 to 64": lambda: parallel_env(
+    "observation: front = 'two': must be a whole number from 0 to 64": lambda: parallel_env(
         observation={"front": "two"}
     ),
-    "observation: chosen = 3; must be a list of features": lambda: parallel_env(observation={"chosen": 3}),
+    "observation: chosen = 3: must be a list of features": lambda: parallel_env(observation={"chosen": 3}),
     "agents = 'scripted': must be 'all' or 'learners'": lambda: parallel_env(agents="scripted"),
     "agents = 'learners': scenario 'paper-random' has no learner; pass": lambda: parallel_env(
         agents="learners", learners=[]
@@ -75,7 +75,7 @@ MADE: dict[str, Callable[[], object]] = {
     "must be 'NextStep' or 'SameStep' or 'Disabled'": lambda: eb.EthBrakeVectorEnv(2, autoreset_mode="same"),
     "number of worlds = 0: must be a whole number, at least 1": lambda: eb.EthBrakeVectorEnv(0),
     "reset: seed = -1: must be None or a whole number, at least 0": lambda: eb.make_sb3_vec_env(PAPER, 1, seed=-1),
-    "appended = 'x': must be number or state, or None": lambda: eb.make_sb3_vec_env(FIVE, 3, appended="x"),
+    "appended = 'x': must be 'number', 'state' or None": lambda: eb.make_sb3_vec_env(FIVE, 3, appended="x"),
     "step: no episode is running; call reset first": lambda: eb.make_sb3_vec_env(PAPER, 2).step_wait(),
     "set_attr: indices = 0: must not be passed, because all rows belong to one environment": lambda: (
         eb.make_sb3_vec_env(PAPER, 3).set_attr("label", 8, indices=0)
@@ -110,10 +110,10 @@ STEPS: dict[str, Callable[[], object]] = {
     "step: the action of learner vehicle_2 is missing": lambda: started(parallel_env(FIVE, learners=PAIR)).step(
         {"vehicle_3": [0.0]}
     ),
-    "action of vehicle_3: nan; must be from -1 (full braking) to 1 (full driving)": lambda: started(
+    "action of vehicle_3 = nan: must be from -1 (full braking) to 1 (full driving)": lambda: started(
         parallel_env(FIVE, learners=PAIR)
     ).step({"vehicle_2": [0.0], "vehicle_3": [np.nan]}),
-    "action of vehicle_3: -1.01; must be from -1 (full braking) to 1 (full driving)": lambda: started(
+    "action of vehicle_3 = -1.01: must be from -1 (full braking) to 1 (full driving)": lambda: started(
         parallel_env(FIVE, learners=PAIR)
     ).step({"vehicle_2": [0.0], "vehicle_3": [-1.01]}),
     "step: actions = None: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}": lambda: started(
@@ -141,16 +141,14 @@ STEPS: dict[str, Callable[[], object]] = {
     "action of the learners: has shape (3, 2); must have shape (3, 1)": lambda: started(eb.EthBrakeVectorEnv(3)).step(
         np.zeros((3, 2), np.float32)
     ),
-    "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full driving)": lambda: started(
+    "action of vehicle_2 = nan: must be from -1 (full braking) to 1 (full driving)": lambda: started(
         eb.EthBrakeVectorEnv(2)
     ).step(np.full((2, 1), np.nan)),
     "env_method: indices = [1]: must not be passed, because all rows belong to one environment": lambda: (
         eb.make_sb3_vec_env(PAPER, 3).env_method("seed", 4, indices=[1])
     ),
     "set_options: row 1 has {'initial_state': {'gaps_m': array([4.])}}": lambda: rows(FAR, NEAR, NEAR, NEAR).reset(),
-    "set_options: row 1 has {}; either all rows or no rows may have an initial_state": lambda: rows(
-        FAR, {}, NEAR, NEAR
-    ).reset(),
+    "set_options: row 1 has {}; give initial_state in all rows or in none": lambda: rows(FAR, {}, NEAR, NEAR).reset(),
     "set_options: the list has 2 entries: must have one for each of the 4 rows": lambda: rows(FAR, FAR).reset(),
 }
 
@@ -213,13 +211,11 @@ def test_worlds__that_go_on_from_a_snapshot_are_not_described() -> None:
 def test_world__that_was_left_out_is_not_described() -> None:
     env = started(eb.EthBrakeVectorEnv(2, "realistic-mixed"))
     env.engine.roster.numbers[1] = 40  # as if world 40 had been left out
-    with refused(
-        "describe_worlds: row 1 is unknown, because the physics failed in world 40 of seed 3 before its first"
-    ):
+    with refused("describe_worlds: the random draw of row 1 is unknown, because the physics failed in world 40 of"):
         env.describe_worlds()
 
 
 def test_action__is_compared_after_the_rounding_of_float32() -> None:
     beyond = np.nextafter(np.float32(1), np.float32(2))
-    with refused("action of vehicle_2: 1.000000238418579; must be from -1 (full braking) to 1 (full driving)"):
+    with refused("action of vehicle_2 = 1.000000238418579: must be from -1 (full braking) to 1 (full driving)"):
         started(eb.EthBrakeVectorEnv(2)).step(np.full((2, 1), np.nextafter(beyond, np.float32(2))))

@@ -48,16 +48,16 @@ PARTS: dict[str, Callable[[], object]] = {
     "feature 'mine': high = nan: must be a finite number": lambda: eb.register_feature(
         "mine", TIME, **SCALED | {"high": float("nan")}
     ),
-    "of = 'both', unknown = 0: of must be own or neighbour; with own, unknown must be 0": lambda: eb.register_feature(
+    "of = 'both', unknown = 0: of must be 'own' or 'neighbour'; if of is": lambda: eb.register_feature(
         "mine", TIME, **SCALED, of="both"
     ),
-    "of = 'own', unknown = 1: of must be own or neighbour; with own, unknown must be 0": lambda: eb.register_feature(
+    "of = 'own', unknown = 1: of must be 'own' or 'neighbour'; if of is": lambda: eb.register_feature(
         "mine", TIME, **SCALED, unknown=1.0
     ),
     "feature 'mine': its function returned float64 of shape (); must return numbers of shape (3,), one": lambda: (
         eb.register_feature("mine", gives(1.0), **SCALED)
     ),
-    "feature 'mine': is nan for vehicle_1 in world 0 at 0 s; must be finite": lambda: eb.register_feature(
+    "feature 'mine': its value is nan for vehicle_1 in world 0 at 0 s; must be finite": lambda: eb.register_feature(
         "mine", gives(lambda worlds: np.full(worlds.n, np.nan)), **SCALED
     ),
     "feature 'mine': its function fails for a line of three vehicles: ValueError: assignment destination": lambda: (
@@ -110,7 +110,7 @@ PARTS: dict[str, Callable[[], object]] = {
     "its function returned float64 of shape (); must return numbers of shape (2,), one per world or (2, 3)": lambda: (
         eb.register_measure("mine", gives(1.0), unit="1")
     ),
-    "measure 'mine': is nan in world 0; must be finite": lambda: eb.register_measure(
+    "measure 'mine': its value is nan in world 0; must be finite": lambda: eb.register_measure(
         "mine", gives(lambda episodes: np.full(episodes.worlds.n, np.nan)), unit="1"
     ),
     "its function returned object of shape (); must return numbers of shape (2,), one per world or (2, 3)": lambda: (
@@ -213,8 +213,11 @@ def started(reward: dict[str, Any]) -> Any:
             None,
             "its function returned object of shape (); must return numbers of shape (2,), one per world or (2, 3), one",
         ),
-        (lambda step: np.full(len(step.time_s), np.nan), "is nan in world 0; must be finite"),
-        (lambda step: np.full(step.speeds_mps.shape, np.inf), "is inf for vehicle_1 in world 0; must be finite"),
+        (lambda step: np.full(len(step.time_s), np.nan), "its value is nan in world 0; must be finite"),
+        (
+            lambda step: np.full(step.speeds_mps.shape, np.inf),
+            "its value is inf for vehicle_1 in world 0; must be finite",
+        ),
         (lambda step: step.speed_mps, "its function fails: AttributeError: 'StepOutcome' object has no attribute"),
         (lambda step: step.speeds_mps.fill(0.0), "its function fails: ValueError: assignment destination is read-only"),
     ],
@@ -252,7 +255,7 @@ def test_feature__that_is_not_finite_later_is_told_with_its_world_and_step() -> 
     late = gives(lambda worlds: np.where((worlds.time_s > 1.0) & (np.arange(worlds.n) == 1), np.inf, 0.0))
     eb.register_feature("late", late, **SCALED)
     engine = eb.make_sb3_vec_env(PAPER, 3, seed=1, observation=["own", "late"]).engine
-    with refused("feature 'late': is inf for vehicle_2 in world 1 at 1.1 s after step 6; must be finite"):
+    with refused("feature 'late': its value is inf for vehicle_2 in world 1 at 1.1 s after step 6; must be finite"):
         for _ in range(20):
             engine.step(-np.ones((3, 1)))
             engine.observe(1)

@@ -114,7 +114,7 @@ SETTINGS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: read_settings(
         ["reward.terminl=1"], [PPO]
     ).change(PPO),
-    "--set gamma.x: 'x' cannot be set, because 0.995 is neither a mapping nor a": lambda: read_settings(
+    "--set gamma.x: 'x' cannot be set inside 0.995, which is neither a mapping nor a": lambda: read_settings(
         ["gamma.x=1"], [PPO]
     ).change(PPO),
     "scenario 'paper-random': restitution = 3: must be finite and in [0, 1]": lambda: load_runnable(

@@ -134,5 +134,5 @@ def test_contact_that_was_missed__is_a_defect_with_the_world_and_the_time() -> N
 
 @pytest.mark.parametrize("harm", ["obstacle_harm", "pair_harm", "vehicle_harm", "world_harm"])
 def test_harm__counts_first_or_total(harm: str) -> None:
-    with refused("harm_count 'both': must be 'first' or 'total'"):
+    with refused("harm_count = 'both': must be 'first' or 'total'"):
         getattr(empty_ledger(PAIR), harm)("both")

@@ -73,7 +73,7 @@ MISTAKES: dict[str, Callable[[], object]] = {
     "mixture[0] (stress-wide): follower: the speed of vehicle_3 is random; it must": (
         lambda: eb.load_scenario("mixture-paper").replace(follower={})
     ),
-    "follower: cannot be combined with vehicle_types; set vehicles: 4 and declare the last": (
+    "follower: cannot be combined with vehicle_types; instead of the follower": (
         lambda: eb.load_scenario("realistic-mixed").replace(follower={})
     ),
 }

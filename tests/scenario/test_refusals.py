@@ -124,7 +124,7 @@ QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
     "line 13: roles.vehicle_1 = constant:-7: must not be above the driving_capacity_mps2 of vehicle_1": lambda: given(
         roles="{vehicle_1: constant:-7, vehicle_2: learner}"
     ),
-    "line 13: roles.vehicle_1 = {profile: []}: a profile must be a list of 1 to 64 pieces [start in s": lambda: given(
+    "line 13: roles.vehicle_1 = {profile: []}: a profile must be a list of 1 to 64 pairs [start in s": lambda: given(
         roles="{vehicle_1: {profile: []}, vehicle_2: learner}"
     ),
     'line 13: roles.vehicle_1 = "profile:0=3,1=6.5": must not be above the braking_capacity_mps2': lambda: given(
@@ -133,10 +133,10 @@ QUANTITIES_AND_ROLES: dict[str, Callable[[], object]] = {
     "such as [[0, 3], [1, 7]]; the first start must be 0, and the starts must increase": lambda: given(
         roles="{vehicle_1: {profile: [[0.5, 3]]}, vehicle_2: learner}"
     ),
-    "a piece must be two numbers in [0, 3600], which [1, -1] is not": lambda: given(
+    "[1, -1] is not a list of two numbers in [0, 3600]": lambda: given(
         roles="{vehicle_1: {profile: [[0, 3], [1, -1]]}, vehicle_2: learner}"
     ),
-    "line 13: roles.vehicle_1 = {profile: [[0, 3]], coast: 1}: must be learner, a script": lambda: given(
+    "line 13: roles.vehicle_1 = {profile: [[0, 3]], coast: 1}: must be learner, the name of a script": lambda: given(
         roles="{vehicle_1: {profile: [[0, 3]], coast: 1}, vehicle_2: learner}"
     ),
     "line 13: roles.vehicle_3 = e_v2x_bm: with early_impacts: reject, a script must be full_brake": lambda: given(
@@ -267,7 +267,7 @@ MIXTURES: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: mixture[0].weight = 0: must be greater than 0": lambda: loaded(
         "mixture: [{scenario: paper-random, weight: 0}]"
     ),
-    "mine.yaml, line 2: mixture[0].scenario = mixture-delays: mixture-delays is a mixture itself": lambda: loaded(
+    "mine.yaml, line 2: mixture[0].scenario = mixture-delays: a mixture cannot contain another": lambda: loaded(
         "mixture: [{scenario: mixture-delays}]"
     ),
     "mine.yaml, line 2: mixture[1]: paper-random is listed twice; list it once, with the sum of its weights": lambda: (
@@ -318,7 +318,7 @@ CALLS: dict[str, Callable[[], object]] = {
     "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
     "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),
     "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
-    "learners: 3: a vehicle must be a name (vehicle_1 ... vehicle_3) or an index": lambda: PAPER.with_learners([3]),
+    "learners: 3: must be the name of a vehicle (vehicle_1 ... vehicle_3) or its": lambda: PAPER.with_learners([3]),
     "learners: vehicle_2 is listed twice": lambda: PAPER.with_learners(["vehicle_2", 1]),
     "learners: 'vehicle_2': must be a list of vehicles": lambda: PAPER.with_learners("vehicle_2"),
     "scenario 'paper-random': does not declare gaps_m; if gaps_m follows from other quantities": lambda: PAPER.replace(

@@ -116,7 +116,7 @@ AGENTS: dict[str, Callable[[], object]] = {
         Team({1: COAST}, "half"), PAIR
     ),
     "e_v2x_bm: mode = 'couple': must be 'coupled' or 'pairwise'": lambda: HybridAgent(BRAKE, PAPER, bound="couple"),
-    "harm_count 'both': must be 'first' or 'total'": lambda: HybridAgent(BRAKE, PAPER, harm_count="both"),
+    "harm_count = 'both': must be 'first' or 'total'": lambda: HybridAgent(BRAKE, PAPER, harm_count="both"),
     "shield: agent 'coast': pass scenario= (in which actions are certified), and leave out policy=": lambda: eb.shield(
         COAST
     ),
@@ -233,8 +233,8 @@ def test_second_shield__is_refused_because_a_bound_holds_for_one_alone(interface
     [
         ({}, "shield: an action is missing, and no policy can propose it; pass the action, or make the shield with"),
         ([0.0], "step: actions = [0.0]: must be a mapping from agent to action, such as {'vehicle_2': [-1.0]}"),
-        ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2: nan; must be from -1 (full braking) to 1 (full"),
-        ({"vehicle_2": np.array([1.5])}, "action of vehicle_2: 1.5; must be from -1 (full braking) to 1 (full"),
+        ({"vehicle_2": np.array([np.nan])}, "action of vehicle_2 = nan: must be from -1 (full braking) to 1 (full"),
+        ({"vehicle_2": np.array([1.5])}, "action of vehicle_2 = 1.5: must be from -1 (full braking) to 1 (full"),
         ({"vehicle_2": np.array([1j])}, "action of vehicle_2: array([0.+1.j]) is not a number"),
     ],
     ids=["none", "no mapping", "nan", "beyond 1", "complex"],
@@ -250,7 +250,7 @@ def test_action__of_agents_in_turn_is_refused() -> None:
     env = shielded_aec(parallel_env(), mode="step")
     env.reset(seed=7)
     env.step(None)
-    with refused("action of vehicle_2: 3.0; must be from -1 (full braking) to 1 (full driving)"):
+    with refused("action of vehicle_2 = 3.0: must be from -1 (full braking) to 1 (full driving)"):
         env.step([3.0])
 
 

@@ -46,7 +46,7 @@ PROOFS: dict[str, Callable[[], object]] = {
     "avoidability: speeds_mps[0, 1] = nan: must be >= 0": lambda: avoidability(
         replace(line([5], [9, 9], 5), speeds_mps=np.array([[9, np.nan]])), 1
     ),
-    "harm_count 'worst': must be 'first' or 'total'": lambda: lower_bound(THREE, harm_count="worst"),
+    "harm_count = 'worst': must be 'first' or 'total'": lambda: lower_bound(THREE, harm_count="worst"),
     "lower_bound: horizon_s = 0.2: must be finite and at least 0.5 s": lambda: lower_bound(THREE, horizon_s=0.2),
     "lower_bound: horizon_s = inf: must be finite and at least 0.5": lambda: lower_bound(THREE, horizon_s=float("inf")),
     "lower_bound: horizon_s = '8': must be a number of seconds": lambda: lower_bound(THREE, horizon_s="8"),

@@ -217,7 +217,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "--set network.policy.9: '9' must be an index from 0 to 1": lambda: sweep(
         {"jobs": [GRID, {**GRID, "set": {"network.policy.9": 4}}]}
     ),
-    "--set gamma.x: 'x' cannot be set, because 0.995 is neither a mapping nor a": lambda: sweep(
+    "--set gamma.x: 'x' cannot be set inside 0.995, which is neither a mapping nor a": lambda: sweep(
         {"jobs": [GRID, {**GRID, "set": {"gamma.x": 4}}]}
     ),
     "s.yaml, line 1, column 45: key 'recipe' occurs twice; the first is on line 1": lambda: sweep(
