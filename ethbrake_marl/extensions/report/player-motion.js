@@ -1,9 +1,9 @@
 "use strict";
-// Exact motion: an episode is a list of pieces of constant jerk, 1 + 3 N numbers each: the time at which it begins, the
-// place of Vehicle 1, the gaps, the speeds and the accelerations; with N jerks more where brakes build up. Nothing here
-// touches the page.
+// Exact motion of N vehicles. An episode is a list of pieces (stretches of time with constant jerk). A piece has 1 + 3 N
+// numbers: the time at which it begins, the place of Vehicle 1, the gaps, the speeds and the accelerations. If brakes
+// build up, the N jerks follow. The functions of this file do not change the page.
 
-const BODY_M = 4.5; // drawn length; the physics knows none
+const BODY_M = 4.5; // length of a drawn vehicle; in the physics, vehicles have no length
 const FLASH_S = 0.3; // how long an impact is shown
 
 function decodePieces(text, vehicles, jerks) {
@@ -26,7 +26,7 @@ function decodePieces(text, vehicles, jerks) {
   return pieces;
 }
 
-// The last entry that has begun by then, by halving.
+// Index of the last entry whose time is at most `time`, found by bisection; -1 if all entries are later.
 function lastBegun(list, time, timeOf) {
   let low = 0;
   let high = list.length;
@@ -50,26 +50,27 @@ function moveOn(piece, time) {
   };
 }
 
-// Where the line is at a time; at its end and after it stands as the episode left it.
+// State of the line at a time; after the end of the episode, its state at the end.
 function stateAt(episode, time) {
   const until = Math.min(time, episode.end);
   const k = Math.max(lastBegun(episode.pieces, until, (piece) => piece.time), 0);
   return moveOn(episode.pieces[k], until);
 }
 
-// Front bumpers of vehicles drawn with bodies, apart by the true gaps.
+// Places of the front bumpers as drawn: bodies have a length, and the gaps between the bodies are the true gaps.
 function frontsOf(state) {
   const fronts = [state.front];
   for (const gap of state.gaps) fronts.push(fronts[fronts.length - 1] - gap - BODY_M);
   return fronts;
 }
 
-// The gap ahead of each vehicle: of Vehicle 1 to the obstacle, null where there is none.
+// Gap ahead of each vehicle; for Vehicle 1 the gap to the obstacle, or null if there is no obstacle.
 function gapsAhead(state, obstacle) {
   return [obstacle === null ? null : Math.max(obstacle - state.front, 0), ...state.gaps];
 }
 
-// Impacts are [time, pair, closing speed, first, number so far, first-impact harm so far, total harm so far].
+// Number of impacts and harm up to a time. An impact is the list [time, pair, closing speed, whether it is the first impact
+// of its pair, number of impacts so far, first-impact harm so far, total harm so far].
 function countedBy(episode, time) {
   const k = lastBegun(episode.impacts, time, (impact) => impact[0]);
   if (k < 0) return { impacts: 0, first: 0, total: 0 };
@@ -85,7 +86,7 @@ function steppedInAt(episode, time) {
   return episode.stepped.some((start) => start <= time && time < start + FLASH_S);
 }
 
-// The stretch of road that holds these episodes from the alert to their ends.
+// Left and right end of the road that the vehicles of these episodes need, in m.
 function roadOf(episodes) {
   let left = Infinity;
   let right = -Infinity;
@@ -100,14 +101,14 @@ function roadOf(episodes) {
   return { left: left - 3, right: right + 3 };
 }
 
-// When the last vehicle of an episode has come to rest, or its end.
+// Time at which all vehicles are at rest, or the end of the episode if a vehicle still moves.
 function restOf(episode) {
   const last = episode.pieces[episode.pieces.length - 1];
   return last.speeds.every((v) => v === 0) ? last.time : episode.end;
 }
 
-// Curves as SVG paths, exact: gaps are quadratics, speeds straight lines, accelerations steps; where brakes build up
-// each is one degree higher.
+// Exact curves as SVG paths. In each piece a gap is quadratic in time, a speed linear and an acceleration constant. If
+// brakes build up, the degree of each curve is one higher.
 function curves(episode, until, x, y, vehicles) {
   const gaps = Array.from({ length: vehicles - 1 }, () => "");
   const speeds = Array.from({ length: vehicles }, () => "");

@@ -1,4 +1,4 @@
-// What the player draws: the road with its vehicles, and the traces below it. Both are SVG in the page's own colours.
+// What the player draws: the road with its vehicles, and curves over time (traces) below the road. Both are SVG.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -16,7 +16,7 @@ function make(name, attributes = {}, ...children) {
   return element;
 }
 
-// Round steps for an axis: at most so many of them.
+// Round numbers for the ticks of an axis from `low` to `high`, with at most `most` steps.
 function ticks(low, high, most) {
   const rough = (high - low) / most;
   const power = 10 ** Math.floor(Math.log10(rough));
@@ -29,7 +29,7 @@ function ticks(low, high, most) {
 
 const plain = (value, digits) => value.toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1").replace("-", "−");
 
-// One lane of road, to scale, with the line of one agent on it.
+// A drawn lane, to scale, with the vehicles of one agent's episode.
 class Lane {
   constructor(holder, episode, data, view, scaleBelow) {
     Object.assign(this, { episode });
@@ -126,7 +126,7 @@ const TRACES = [
   { name: "acceleration", title: "Acceleration (m/s²)" },
 ];
 
-// The traces of one agent: three panels over time, with a line where the player is.
+// The traces of one agent: three panels over time, with a vertical line at the time that the player shows.
 class Traces {
   constructor(holder, episode, data, ranges, until, seek) {
     Object.assign(this, { episode, until, vehicles: data.vehicles });
@@ -204,7 +204,7 @@ class Traces {
   }
 }
 
-// The same scales for all agents that are shown.
+// Range of each panel's axis, the same for all agents that are shown.
 function rangesOf(episodes) {
   const found = { gap: [0, 1], speed: [0, 1], acceleration: [-1, 1] };
   const hold = (name, values) => {

@@ -1,4 +1,4 @@
-// The episode player: which world, which agents, and at which time. The page works without it.
+// The episode player shows a chosen world, with chosen agents, at a chosen time. The rest of the page works without it.
 
 const MOST_AGENTS = 3;
 const FRAME_S = 0.04;
@@ -42,13 +42,13 @@ class Player {
   }
 
   listen() {
-    const on = (name, kind, act) => this.find(name)?.addEventListener(kind, act); // not every player is folded
+    const on = (name, kind, act) => this.find(name)?.addEventListener(kind, act); // some parts may be missing on the page
     on("world", "change", (event) => this.choose(Number(event.target.value)));
     on("before", "click", () => this.choose(this.world - 1));
     on("after", "click", () => this.choose(this.world + 1));
     on("scrub", "input", (event) => this.seek(Number(event.target.value)));
     on("speed", "change", (event) => { this.speed = Number(event.target.value); });
-    on("more", "toggle", () => this.build()); // what is folded has no width to draw in
+    on("more", "toggle", () => this.build()); // folded parts have no width, so draw again when unfolded
     for (const button of this.root.querySelectorAll("[data-do]")) button.addEventListener("click", () => this.act(button.dataset.do));
     this.root.addEventListener("keydown", (event) => this.press(event));
     document.addEventListener("click", (event) => {
@@ -109,7 +109,7 @@ class Player {
     this.speed = Number(select.value);
   }
 
-  // At least one agent and at most three; one more takes the place of the first.
+  // Show or hide agent k. At least one agent is shown, and at most three: a fourth replaces the first.
   toggle(k) {
     if (!this.shown.includes(k)) this.shown = [...this.shown, k].slice(-MOST_AGENTS);
     else if (this.shown.length > 1) this.shown = this.shown.filter((each) => each !== k);
@@ -181,7 +181,7 @@ class Player {
         make("span", { "data-total": now.total }, `${plain(now.total, 2)} total`),
         make("span", { class: "unit" }, "m²/s²"),
       );
-      if (!episode.rest) head.append(make("span", { class: "unit", "data-cut": "" }, `not at rest at the horizon, ${plain(episode.end, 2)} s`));
+      if (!episode.rest) head.append(make("span", { class: "unit", "data-cut": "" }, `a vehicle still moves at the horizon, ${plain(episode.end, 2)} s`));
       const guarded = steppedInAt(episode, this.time) ? "shield steps in" : "shielded";
       if (episode.stepped.length) head.append(make("span", { class: "shield" }, guarded));
       readout.replaceChildren(
@@ -208,7 +208,7 @@ class Player {
     this.seek(Math.round((this.time + by) * 1e6) / 1e6);
   }
 
-  // To the impact before or after this moment, of any agent that is shown.
+  // Go to the previous (way < 0) or next (way > 0) impact of any agent that is shown.
   jump(way) {
     this.play(false);
     const times = this.episodes().flatMap((each) => each.impacts.map((impact) => impact[0])).sort((a, b) => a - b);

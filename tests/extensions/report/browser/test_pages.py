@@ -152,7 +152,7 @@ def test_report__says_what_is_missing_without_scripts_and_every_control_has_a_na
     open_page: Open, report_file: Path, report_page: Any
 ) -> None:
     page = open_page(report_file.as_uri(), java_script_enabled=False)
-    assert page.get_by_text("scripts are switched off here").is_visible()
+    assert page.get_by_text("scripts are switched off in this browser").is_visible()
     assert page.get_by_text("Means with 95 % intervals").is_visible() and page.locator(".controls").is_hidden()
     nameless = report_page.evaluate(
         "[...document.querySelectorAll('button, input, select, [role=img], [role=region], [tabindex=\"0\"]')]"
@@ -251,7 +251,7 @@ def test_player__says_each_gap_also_to_an_obstacle_and_whom_the_horizon_cut_off(
     assert report_page.locator(".readout .each").first.inner_text().endswith(f"gap ahead {60.0 - front:.2f} m")
     end = report_page.evaluate(f"{PLAYER}.episodes()[1].end")
     told = report_page.locator(".head").all_inner_texts()
-    assert [f"not at rest at the horizon, {end:.2f} s" in text for text in told] == [False, True, False]
+    assert [f"a vehicle still moves at the horizon, {end:.2f} s" in text for text in told] == [False, True, False]
 
 
 def test_player__plays_in_real_time_and_pauses(report_page: Any) -> None:
