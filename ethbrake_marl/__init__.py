@@ -1,6 +1,6 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
-Importing the package registers ``EthBrake-v0`` with Gymnasium and ``ethbrake/ethbrake-v0`` with PettingZoo. Each public
+Importing the package registers ``EthBrake-v1`` with Gymnasium and ``ethbrake/ethbrake-v1`` with PettingZoo. Each public
 name is imported when it is first used, so torch and matplotlib are loaded only if they are needed.
 
 The ``if TYPE_CHECKING`` block below lists every public name once. Type checkers read this block as imports. At run time

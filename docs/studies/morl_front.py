@@ -4,7 +4,7 @@
     python docs/studies/morl_front.py docs/studies/morl_front.json --seconds 300 --seeds 3
 
 One network observes the weights of the vehicles' harm in addition to the usual observation. It is trained on
-`EthBrakeMO-v0`. Then it drives in worlds that no training uses, once for each weight vector of a grid. Harm is the mean
+`EthBrakeMO-v1`. Then it drives in worlds that no training uses, once for each weight vector of a grid. Harm is the mean
 over these worlds in m2/s2. The hypervolume (m6/s6) is the volume that the points dominate, up to a reference point.
 There are two reference points: full braking, and `ROOF` for each vehicle. Most points of a front do not count with the
 first, because full braking does little harm to Vehicle 1, and only points with even less count.
@@ -65,7 +65,7 @@ def train(seconds: float, seed: int) -> tuple[CAPQL, float, int]:
     """Return a trained agent, its processor seconds and its steps."""
     random.seed(seed)
     torch.manual_seed(seed)
-    env = Limited(mo_gymnasium.make("EthBrakeMO-v0", scenario=SCENARIO), seconds)
+    env = Limited(mo_gymnasium.make("EthBrakeMO-v1", scenario=SCENARIO), seconds)
     env.reset(seed=seed)
     env.action_space.seed(seed)
     start, agent = time.process_time(), CAPQL(env, seed=seed, log=False)

@@ -83,7 +83,7 @@ def _plain(setting: Any) -> Any:
 
 
 class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]):
-    """Environment with one learner in a line of vehicles that follow scripts (``gymnasium.make("EthBrake-v0")``).
+    """Environment with one learner in a line of vehicles that follow scripts (``gymnasium.make("EthBrake-v1")``).
 
     - Observation: the features of ``ObservationSpec``, float32 [F].
     - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.

@@ -161,7 +161,7 @@ class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]
 
     """
 
-    metadata: dict[str, Any] = {"name": "ethbrake_v0", "is_parallelizable": True, **Viewer.METADATA}  # noqa: RUF012
+    metadata: dict[str, Any] = {"name": "ethbrake_v1", "is_parallelizable": True, **Viewer.METADATA}  # noqa: RUF012
 
     def __init__(
         self,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-GYMNASIUM_ID = "EthBrake-v0"
+GYMNASIUM_ID = "EthBrake-v1"
 
-MO_GYMNASIUM_ID = "EthBrakeMO-v0"  # environment with vector rewards, for MO-Gymnasium
+MO_GYMNASIUM_ID = "EthBrakeMO-v1"  # environment with vector rewards, for MO-Gymnasium
 
-PETTINGZOO_ID = "ethbrake/ethbrake-v0"
+PETTINGZOO_ID = "ethbrake/ethbrake-v1"
 
 
 def register_environments() -> None:
@@ -31,6 +31,6 @@ def register_environments() -> None:
             kwargs={"reward_vector": "vehicles"},
         )
     if PETTINGZOO_ID not in pettingzoo.parallel_registry:
-        pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:parallel_env")
+        pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v1:parallel_env")
     if PETTINGZOO_ID not in pettingzoo.aec_registry:
-        pettingzoo.register("aec", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v0:env")
+        pettingzoo.register("aec", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v1:env")

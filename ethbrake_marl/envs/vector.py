@@ -84,7 +84,7 @@ class CostEnv(gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArra
 
 
 class EthBrakeVectorEnv(Begun, Specified, VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
-    """Many worlds of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v0", num_envs=4096, scenario=...)``).
+    """Many worlds of ``EthBrakeEnv`` (``gymnasium.make_vec("EthBrake-v1", num_envs=4096, scenario=...)``).
 
     After ``reset(seed=s)``, row k is world k of seed s. Each new episode takes the next world of this seed. All
     returned arrays are new objects, which later steps do not change.

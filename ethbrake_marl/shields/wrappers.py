@@ -130,12 +130,12 @@ def shielded_aec(env: ParallelEnv[str, Observations, NDArray[Any]], *args: Any, 
 class ShieldedEnv(
     _Closing, gymnasium.Wrapper[Observations, NDArray[Any], Observations, NDArray[Any]], RecordConstructorArgs
 ):
-    """``EthBrake-v0`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
+    """``EthBrake-v1`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
     The info reports each decision under ``shield_reason`` and other ``shield_...`` keys.
 
     Args:
-        env: an ``EthBrake-v0`` environment, or a wrapper around it.
+        env: an ``EthBrake-v1`` environment, or a wrapper around it.
         policy: policy that is simulated from each alert; where it does less harm than E-V2X-BM, its harm is the bound.
             It may be None, except in mode ``episode``.
         options: keywords of ``ShieldOptions``, including ``mode``.
@@ -158,7 +158,7 @@ class ShieldedEnv(
         **options: Any,
     ) -> None:
         RecordConstructorArgs.__init__(self, policy=policy, **options)
-        self.attached = Attached(env, gymnasium.Env, "gymnasium.make('EthBrake-v0')", policy, "ShieldedEnv", options)
+        self.attached = Attached(env, gymnasium.Env, "gymnasium.make('EthBrake-v1')", policy, "ShieldedEnv", options)
         super().__init__(env)
 
     def reset(
@@ -213,7 +213,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     def __init__(
         self, env: VectorEnv[Any, Any, Any], policy: Agent | LearnedPolicy | None = None, **options: Any
     ) -> None:
-        maker = "gymnasium.make_vec('EthBrake-v0')"
+        maker = "gymnasium.make_vec('EthBrake-v1')"
         self.attached = Attached(env, VectorEnv, maker, policy, "ShieldedVectorEnv", options)
         super().__init__(env)
 

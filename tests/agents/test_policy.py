@@ -156,7 +156,7 @@ def test_model_that_has_its_environment__observes_what_it_was_trained_on():
     assert other["observation"].size == eb.ObservationSpec().size
     for rows in (
         eb.make_sb3_vec_env("paper-random", 2, **other),
-        stable.common.env_util.make_vec_env("EthBrake-v0", env_kwargs=other),
+        stable.common.env_util.make_vec_env("EthBrake-v1", env_kwargs=other),
     ):
         assert eb.policy_agent(stable.PPO("MlpPolicy", rows)).observation.front == 2
 

@@ -68,7 +68,7 @@ def test_pettingzoo__checkers_pass(name: str) -> None:
 @pytest.mark.parametrize("actions", [None, 9])
 @pytest.mark.parametrize("scenario", [*SCENARIOS.values(), REST], ids=lambda scenario: scenario.name)
 def test_gymnasium_and_stable_baselines3__checkers_pass(scenario: Any, actions: int | None) -> None:
-    plain = gymnasium.make("EthBrake-v0", scenario=scenario, actions=actions).unwrapped
+    plain = gymnasium.make("EthBrake-v1", scenario=scenario, actions=actions).unwrapped
     check_env(plain)
     sb3_check_env(plain)
 
@@ -92,13 +92,13 @@ def test_stable_baselines3__learns_on_the_vec_env() -> None:
 
 
 def test_stable_baselines3__makes_it_by_its_id() -> None:
-    assert make_vec_env("EthBrake-v0", n_envs=2).reset().shape[0] == 2
-    model = PPO("MlpPolicy", "EthBrake-v0", n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
+    assert make_vec_env("EthBrake-v1", n_envs=2).reset().shape[0] == 2
+    model = PPO("MlpPolicy", "EthBrake-v1", n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
     assert model.get_env().render(mode="rgb_array").shape == (HEIGHT, WIDTH, 3)
 
 
 def test_old_gymnasium_spec__is_made():
-    spec = gymnasium.make("EthBrake-v0", scenario="paper-random").spec
+    spec = gymnasium.make("EthBrake-v1", scenario="paper-random").spec
     old = spec.to_json().replace("ethbrake_marl.envs.gymnasium:", "ethbrake_marl.envs:")
     assert old != spec.to_json()
     assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(old)).reset(seed=1)[0].shape

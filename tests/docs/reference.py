@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl import ethbrake_v0
+from ethbrake_marl import ethbrake_v1
 from ethbrake_marl.agents.protocol import Source
 from ethbrake_marl.agents.registry import agent_entries
 from ethbrake_marl.cli.app import Installed, whole_command
@@ -195,11 +195,11 @@ def feature_table(features: Sequence[Feature], first: int = 0) -> str:
 
 def fact_table() -> str:
     """What PettingZoo's pages say of an environment, here with its default arguments."""
-    env = ethbrake_v0.parallel_env()
+    env = ethbrake_v1.parallel_env()
     agent = env.possible_agents[0]
     spaces = {"Action": env.action_space(agent), "Observation": env.observation_space(agent), "State": env.state_space}
     rows = [
-        ("Import", "`from ethbrake_marl import ethbrake_v0`"),
+        ("Import", "`from ethbrake_marl import ethbrake_v1`"),
         ("Actions", "continuous"),
         ("Parallel API", "yes"),
         ("Manual control", "no"),

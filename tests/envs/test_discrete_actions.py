@@ -81,7 +81,7 @@ def test_spaces__are_discrete_for_learners_and_as_ever_for_scripts() -> None:
     team = eb.parallel_env(PAIR, agents="learners", actions=np.int64(3))
     assert [team.action_space(agent) for agent in team.possible_agents] == [Discrete(3)] * 2
     assert eb.EthBrakeEnv(actions=9).action_space == eb.make_sb3_vec_env(PAIR, 2, actions=9).action_space == Discrete(9)
-    many = gymnasium.make_vec("EthBrake-v0", num_envs=4, actions=9)
+    many = gymnasium.make_vec("EthBrake-v1", num_envs=4, actions=9)
     assert many.single_action_space == Discrete(9) and many.action_space.shape == (4,)
 
 
@@ -96,7 +96,7 @@ def test_team__acts_by_an_index_each() -> None:
 
 
 def test_id__keeps_the_number_of_actions_in_its_spec() -> None:
-    env = gymnasium.make("EthBrake-v0", actions=np.int64(9))
+    env = gymnasium.make("EthBrake-v1", actions=np.int64(9))
     assert gymnasium.make(EnvSpec.from_json(env.spec.to_json())).action_space == Discrete(9)
 
 
@@ -226,7 +226,7 @@ def test_dqn__learns_to_beat_full_braking_and_drives(trained: DQN) -> None:
 
 
 def test_dqn__drives_in_evaluate_as_in_its_environment() -> None:
-    worlds, n = make_vec_env("EthBrake-v0", env_kwargs={"actions": 9}), 10
+    worlds, n = make_vec_env("EthBrake-v1", env_kwargs={"actions": 9}), 10
     model = small(worlds)
     worlds.seed(7)
     seen, returned = worlds.reset(), [0.0]
@@ -264,8 +264,8 @@ def test_dqn__of_two_learners_and_of_supersuit_drives() -> None:
 
 
 def test_copies__with_other_numbers_of_actions_are_refused() -> None:
-    model = small(make_vec_env("EthBrake-v0", n_envs=2, env_kwargs={"actions": 9}))
-    model.get_env().envs[1] = gymnasium.make("EthBrake-v0", actions=17)
+    model = small(make_vec_env("EthBrake-v1", n_envs=2, env_kwargs={"actions": 9}))
+    model.get_env().envs[1] = gymnasium.make("EthBrake-v1", actions=17)
     with pytest.raises(InvalidInput, match="the copies of the model's environment have different numbers of actions"):
         eb.policy_agent(model)
 

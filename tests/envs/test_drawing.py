@@ -25,7 +25,7 @@ COAST = np.zeros(1, np.float32)
 
 
 def crash(mode: str | None = "rgb_array", **changes: Any) -> Any:
-    environment = gymnasium.make("EthBrake-v0", scenario=CRASH.replace(**changes), render_mode=mode)
+    environment = gymnasium.make("EthBrake-v1", scenario=CRASH.replace(**changes), render_mode=mode)
     environment.reset(seed=0)
     return environment
 
@@ -142,7 +142,7 @@ def test_view__stands_still_until_the_line_would_leave_it(ends: tuple[float, flo
 
 @pytest.mark.parametrize("make", [gymnasium.make, eb.EthBrakeEnv])
 def test_list__has_the_beginning_and_each_step_once(make: Any) -> None:
-    name = ("EthBrake-v0",) if make is gymnasium.make else ()
+    name = ("EthBrake-v1",) if make is gymnasium.make else ()
     environment = make(*name, scenario=CRASH, render_mode="rgb_array_list")
     environment.reset(seed=0)
     for _ in range(3):
@@ -180,8 +180,8 @@ def test_ansi__says_it_in_words() -> None:
 
 
 def test_vector__gives_the_frame_of_each_world() -> None:
-    batch = gymnasium.make_vec("EthBrake-v0", num_envs=3, scenario="paper-random", render_mode="rgb_array")
-    single = gymnasium.make("EthBrake-v0", scenario="paper-random", render_mode="rgb_array")
+    batch = gymnasium.make_vec("EthBrake-v1", num_envs=3, scenario="paper-random", render_mode="rgb_array")
+    single = gymnasium.make("EthBrake-v1", scenario="paper-random", render_mode="rgb_array")
     batch.reset(seed=5)
     batch.step(np.full((3, 1), -1.0, np.float32))
     frames = batch.render()
@@ -207,7 +207,7 @@ def test_vector__goes_on_through_automatic_resets(mode: str) -> None:
 
 def test_human__shows_each_step_in_real_time_and_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     pygame = pytest.importorskip("pygame", reason="needs the extra: pip install 'ethbrake-marl[render]'")
-    environment = gymnasium.make("EthBrake-v0", scenario=CRASH, render_mode="human")
+    environment = gymnasium.make("EthBrake-v1", scenario=CRASH, render_mode="human")
     assert pygame.display.get_surface() is None  # no window before there is something to show
     environment.reset(seed=0)
     before = pygame.time.get_ticks()

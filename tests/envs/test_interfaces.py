@@ -18,7 +18,7 @@ from pettingzoo.utils.conversions import aec_to_parallel
 from stable_baselines3.common.monitor import Monitor
 
 import ethbrake_marl as eb
-from ethbrake_marl import ethbrake_v0
+from ethbrake_marl import ethbrake_v1
 from ethbrake_marl.engine.stream import Stream
 from ethbrake_marl.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.envs.making import IgnoredAction, action_box, feature_box
@@ -159,7 +159,7 @@ def test_aec__plays_the_same_episode_in_turns(make: Any) -> None:
     ],
 )
 def test_make__passes_settings_which_survive_the_json_of_a_spec(settings: dict[str, Any]) -> None:
-    made, alone = gymnasium.make("EthBrake-v0", **settings), eb.EthBrakeEnv(**settings)
+    made, alone = gymnasium.make("EthBrake-v1", **settings), eb.EthBrakeEnv(**settings)
     assert made.spec is not None and alone.spec is None
     again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(made.spec.to_json()))
     engines = [environment.unwrapped.engine for environment in (made, again, alone)]
@@ -233,16 +233,16 @@ def test_step__is_that_of_gymnasiums_own_vector_environment(mode: str, n: int) -
 
 @pytest.mark.parametrize("mode", [*list(AutoresetMode)[:2], *MODES])
 def test_mode__can_be_chosen_in_every_way_and_is_stated(mode: Any) -> None:
-    native = gymnasium.make_vec("EthBrake-v0", num_envs=2, autoreset_mode=mode)
+    native = gymnasium.make_vec("EthBrake-v1", num_envs=2, autoreset_mode=mode)
     kwargs = {"autoreset_mode": AutoresetMode(mode)}
-    sync = gymnasium.make_vec("EthBrake-v0", num_envs=2, vectorization_mode="sync", vector_kwargs=kwargs)
+    sync = gymnasium.make_vec("EthBrake-v1", num_envs=2, vectorization_mode="sync", vector_kwargs=kwargs)
     assert native.metadata["autoreset_mode"] is sync.metadata["autoreset_mode"] is AutoresetMode(mode)
     assert eb.EthBrakeVectorEnv(2).autoreset_mode is AutoresetMode.NEXT_STEP
 
 
 @pytest.mark.parametrize("way", [None, "vector_entry_point", "sync", "async"])
 def test_make_vec__makes_it_in_every_way(way: str | None) -> None:
-    environment = gymnasium.make_vec("EthBrake-v0", num_envs=2, vectorization_mode=way, scenario=PAPER)
+    environment = gymnasium.make_vec("EthBrake-v1", num_envs=2, vectorization_mode=way, scenario=PAPER)
     assert environment.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     native = type(environment.unwrapped) is eb.EthBrakeVectorEnv
     assert native == (way in (None, "vector_entry_point"))
@@ -273,15 +273,15 @@ def test_registration__by_id_twice_and_with_the_projects_name() -> None:
     before = (gymnasium.registry[GYMNASIUM_ID], pettingzoo.parallel_registry[PETTINGZOO_ID])
     register_environments()
     assert (gymnasium.registry[GYMNASIUM_ID], pettingzoo.parallel_registry[PETTINGZOO_ID]) == before
-    named, usual = gymnasium.make("ethbrake/EthBrake-v0"), gymnasium.make("EthBrake-v0")
+    named, usual = gymnasium.make("ethbrake/EthBrake-v1"), gymnasium.make("EthBrake-v1")
     assert type(named.unwrapped) is type(usual.unwrapped) is eb.EthBrakeEnv
-    assert gymnasium.make_vec("ethbrake/EthBrake-v0", num_envs=2).reset(seed=1)[0].shape[0] == 2
-    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v0", learners=[2]), eb.EthBrakeParallelEnv)
-    in_turn = pettingzoo.make("aec", "ethbrake/ethbrake-v0")
+    assert gymnasium.make_vec("ethbrake/EthBrake-v1", num_envs=2).reset(seed=1)[0].shape[0] == 2
+    assert isinstance(pettingzoo.make("parallel", "ethbrake/ethbrake-v1", learners=[2]), eb.EthBrakeParallelEnv)
+    in_turn = pettingzoo.make("aec", "ethbrake/ethbrake-v1")
     assert isinstance(in_turn, pettingzoo.AECEnv) and isinstance(in_turn.unwrapped, eb.EthBrakeParallelEnv)
-    assert (str(env()), eb.parallel_env.metadata["name"]) == ("ethbrake_v0", "ethbrake_v0")
+    assert (str(env()), eb.parallel_env.metadata["name"]) == ("ethbrake_v1", "ethbrake_v1")
     assert eb.parallel_env.metadata["is_parallelizable"] is True
-    assert ethbrake_v0.parallel_env is eb.parallel_env and {"env", "raw_env"} <= set(dir(ethbrake_v0))
+    assert ethbrake_v1.parallel_env is eb.parallel_env and {"env", "raw_env"} <= set(dir(ethbrake_v1))
 
 
 def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_id() -> None:
@@ -289,7 +289,7 @@ def test_import__stays_light_until_a_name_is_used_and_lets_gymnasium_make_it_by_
         "import sys, ethbrake_marl as eb\n"
         "heavy = lambda: sorted({'torch', 'numba', 'stable_baselines3', 'matplotlib', 'pydantic'} & set(sys.modules))\n"
         "print(heavy()); p = eb.parallel_env(); p.reset(seed=0); print(heavy())\n"
-        "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v0'); print(type(e.unwrapped).__name__)\n"
+        "import gymnasium; e = gymnasium.make('ethbrake_marl:EthBrake-v1'); print(type(e.unwrapped).__name__)\n"
         "e.reset(seed=0); e.step(e.action_space.sample())\n"
         "a = eb.EthBrakeEnv(render_mode='ansi'); a.reset(seed=0); a.render()\n"
         "watched = e.unwrapped.engine._now.watched, p.engine._now.watched\n"

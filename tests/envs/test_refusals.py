@@ -80,7 +80,7 @@ MADE: dict[str, Callable[[], object]] = {
     "set_attr: indices = 0: must not be passed, because all rows belong to one environment": lambda: (
         eb.make_sb3_vec_env(PAPER, 3).set_attr("label", 8, indices=0)
     ),
-    "must be an environment made by gymnasium.make_vec('EthBrake-v0')": lambda: eb.ShieldedVectorEnv(parallel_env()),
+    "must be an environment made by gymnasium.make_vec('EthBrake-v1')": lambda: eb.ShieldedVectorEnv(parallel_env()),
     "observation: vehicle_2 and vehicle_3 of 'five' observe different features, but here all learners": lambda: (
         eb.make_sb3_vec_env(FIVE, 3, learners=PAIR, observation={"vehicle_3": ["own"]})
     ),

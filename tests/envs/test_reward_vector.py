@@ -66,9 +66,9 @@ def test_vector__by_hand() -> None:
 
 def test_interfaces__give_the_same_vectors() -> None:
     actions = np.random.default_rng(3).uniform(-1.0, 1.0, (60, 1, 1))
-    vector = gymnasium.make_vec("EthBrakeMO-v0", num_envs=1, scenario="paper-random", autoreset_mode="Disabled")
+    vector = gymnasium.make_vec("EthBrakeMO-v1", num_envs=1, scenario="paper-random", autoreset_mode="Disabled")
     made: list[Any] = [
-        gymnasium.make("EthBrakeMO-v0", scenario="paper-random"),
+        gymnasium.make("EthBrakeMO-v1", scenario="paper-random"),
         eb.ShieldedEnv(eb.EthBrakeEnv(reward_vector="vehicles"), mode="step"),
         eb.parallel_env(reward_vector="vehicles"),
         eb.env(reward_vector="vehicles"),

@@ -153,7 +153,7 @@ def test_disabled_autoreset__wants_its_ended_rows_reset() -> None:
 def test_max_episode_steps__in_make_vec_cuts_off_as_gymnasiums_time_limit_does(mode: str) -> None:
     worlds = SHORT.sample(200, 5, channel="training").worlds
     listed = (initial_state(worlds, k) for k in range(200))
-    native = gymnasium.make_vec("EthBrake-v0", 3, scenario=SHORT, max_episode_steps=5, autoreset_mode=mode)
+    native = gymnasium.make_vec("EthBrake-v1", 3, scenario=SHORT, max_episode_steps=5, autoreset_mode=mode)
     rows = [lambda: gymnasium.wrappers.TimeLimit(FromOneStream(listed), 5)] * 3
     own = SyncVectorEnv(rows, autoreset_mode=mode)
     native.reset(seed=5), own.reset(seed=5)
@@ -176,7 +176,7 @@ def test_max_episode_steps__in_make_vec_cuts_off_as_gymnasiums_time_limit_does(m
 
 @pytest.mark.parametrize("way", ["vector_entry_point", "sync"])
 def test_max_episode_steps__means_the_same_in_every_way_and_goes_into_the_spec(way: str) -> None:
-    env = gymnasium.make_vec("EthBrake-v0", 2, vectorization_mode=way, scenario="paper-random", max_episode_steps=4)
+    env = gymnasium.make_vec("EthBrake-v1", 2, vectorization_mode=way, scenario="paper-random", max_episode_steps=4)
     env.reset(seed=1)
     assert [env.step(np.zeros((2, 1), np.float32))[3].all() for _ in range(4)] == [False, False, False, True]
     spec = EnvSpec.from_json(env.spec.to_json())
@@ -206,8 +206,8 @@ def test_max_episode_steps__must_be_a_whole_number(steps: Any) -> None:
     ids=["paper", "at once", "short"],
 )
 def test_spec__holds_the_most_steps_of_an_episode(scenario: Scenario, most: int, taken: int) -> None:
-    env = gymnasium.make("EthBrake-v0", scenario=scenario)
-    many = gymnasium.make_vec("EthBrake-v0", 2, scenario=scenario)
+    env = gymnasium.make("EthBrake-v1", scenario=scenario)
+    many = gymnasium.make_vec("EthBrake-v1", 2, scenario=scenario)
     assert env.spec.max_episode_steps == many.spec.max_episode_steps == most
     env.reset(seed=0)
     steps = 1
@@ -218,7 +218,7 @@ def test_spec__holds_the_most_steps_of_an_episode(scenario: Scenario, most: int,
 
 @pytest.mark.parametrize("settings", [{}, {"flatten": False}, {"normalize_time": True}], ids=str)
 def test_time_aware_observation__works_on_what_make_gives(settings: dict[str, Any]) -> None:
-    env = TimeAwareObservation(gymnasium.make("EthBrake-v0"), **settings)
+    env = TimeAwareObservation(gymnasium.make("EthBrake-v1"), **settings)
     state = {"gaps_m": 7, "speeds_mps": 30, "latency_s": 0}
     for options in (None, {"initial_state": state}):
         seen, _ = env.reset(seed=0, options=options)
@@ -254,7 +254,7 @@ LEARNERS: list[Any] = [
 )
 def test_spec__survives_json_whatever_the_settings_are_made_of(settings: dict[str, Any], vector: bool) -> None:
     make: Any = (lambda *given, **more: gymnasium.make_vec(*given, **more)) if vector else gymnasium.make
-    made = make("EthBrake-v0", **settings)
+    made = make("EthBrake-v1", **settings)
     again = make(EnvSpec.from_json(made.spec.to_json()))
     for name in ("scenario", "reward", "observation", "learners"):
         assert getattr(again.unwrapped.engine, name) == getattr(made.unwrapped.engine, name)
@@ -264,7 +264,7 @@ def test_spec__survives_json_whatever_the_settings_are_made_of(settings: dict[st
 def test_spec__survives_json_with_a_path_and_a_mode(tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text(json.dumps({**REST.declared(), "name": "mine"}))
     settings = {"scenario": tmp_path / "mine.yaml", "autoreset_mode": AutoresetMode.SAME_STEP}
-    made = gymnasium.make_vec("EthBrake-v0", np.int64(2), **settings)
+    made = gymnasium.make_vec("EthBrake-v1", np.int64(2), **settings)
     again = gymnasium.make_vec(EnvSpec.from_json(made.spec.to_json()))
     assert again.unwrapped.engine.scenario == made.unwrapped.engine.scenario and again.num_envs == 2
     assert again.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP

@@ -244,7 +244,7 @@ def test_interfaces__see_the_same() -> None:
     np.testing.assert_array_equal(seen["vehicle_2"], engine.observe(1)[0])
     np.testing.assert_array_equal(infos["vehicle_2"]["age_s"], ages_in(engine.worlds)[0, 1])
     assert "known_from_s" not in eb.parallel_env(PAPER).reset(seed=5)[1]["vehicle_2"]
-    _, told = gymnasium.make_vec("EthBrake-v0", num_envs=3, scenario=scenario).reset(seed=5)
+    _, told = gymnasium.make_vec("EthBrake-v1", num_envs=3, scenario=scenario).reset(seed=5)
     assert told["age_s"].shape == (3, 3) and (told["age_s"][:, 1] == 0.0).all()
     vec = eb.make_sb3_vec_env(scenario, 3, seed=5)
     alike = vec.reset()

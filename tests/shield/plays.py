@@ -207,7 +207,7 @@ class Single(Play):
     """Gymnasium."""
 
     def make(self) -> None:
-        plain = gymnasium.make("EthBrake-v0", scenario=self.scenario).unwrapped
+        plain = gymnasium.make("EthBrake-v1", scenario=self.scenario).unwrapped
         self.bad = [
             lambda: self.env.step(np.array([np.nan])),
             lambda: self.env.step(np.zeros(2)),

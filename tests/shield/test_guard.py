@@ -30,7 +30,7 @@ DRIVE = np.array([1.0])
 
 
 def shielded(scenario=PAPER, policy=None, **settings):
-    env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=scenario).unwrapped, policy, **settings)
+    env = ShieldedEnv(gymnasium.make("EthBrake-v1", scenario=scenario).unwrapped, policy, **settings)
     env.reset(seed=0)
     return env
 
@@ -91,7 +91,7 @@ def test_last_step__is_compared_too_whatever_starts_the_next_episode(interface, 
         engine, step = episode_engine(short.sample(1, 0).worlds, driver, short, 1), None
     else:
         env = {
-            "single": lambda: ShieldedEnv(gymnasium.make("EthBrake-v0").unwrapped),
+            "single": lambda: ShieldedEnv(gymnasium.make("EthBrake-v1").unwrapped),
             "vector": lambda: ShieldedVectorEnv(eb.EthBrakeVectorEnv(3, PAPER)),
             "sb3": lambda: eb.ShieldedVecEnv(eb.make_sb3_vec_env(PAPER, 3)),
         }[interface]()
@@ -116,7 +116,7 @@ def test_ledger__harm_that_nobody_predicted_is_seen_before_the_next_decision(gro
 
 
 def test_autoreset__of_gymnasium_inside_is_left_alone():
-    env = ShieldedEnv(Autoreset(gymnasium.make("EthBrake-v0").unwrapped))
+    env = ShieldedEnv(Autoreset(gymnasium.make("EthBrake-v1").unwrapped))
     env.reset(seed=0)
     for _ in range(3):
         over = False
@@ -176,7 +176,7 @@ def drives_off(worlds, vehicle):
 
 
 def test_horizon__what_still_moves_then_is_told_and_warned_of_once():
-    env = ShieldedEnv(gymnasium.make("EthBrake-v0", scenario=PAPER.replace(horizon_s=3.0)).unwrapped)
+    env = ShieldedEnv(gymnasium.make("EthBrake-v1", scenario=PAPER.replace(horizon_s=3.0)).unwrapped)
     with pytest.warns(MovingAtHorizon, match="in 1 of 1 worlds a vehicle still moves at the horizon .3 s.") as told:
         env.reset(seed=0)
         env.reset(seed=1)

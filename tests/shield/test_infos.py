@@ -56,7 +56,7 @@ def aec(**options: Any) -> Iterator[Episode]:
 
 
 def single(**options: Any) -> Iterator[Episode]:
-    env, rng = eb.shield(gymnasium.make("EthBrake-v0"), **options), np.random.default_rng(0)
+    env, rng = eb.shield(gymnasium.make("EthBrake-v1"), **options), np.random.default_rng(0)
     _, info = env.reset(seed=7)
     while True:
         first, over = info, False
@@ -68,7 +68,7 @@ def single(**options: Any) -> Iterator[Episode]:
 
 
 def autoreset(**options: Any) -> Iterator[Episode]:
-    env = eb.shield(gymnasium.wrappers.Autoreset(gymnasium.make("EthBrake-v0")), **options)
+    env = eb.shield(gymnasium.wrappers.Autoreset(gymnasium.make("EthBrake-v1")), **options)
     rng = np.random.default_rng(0)
     _, info = env.reset(seed=7)
     while True:
@@ -109,7 +109,7 @@ def vector(mode: str) -> Callable[..., Iterator[Episode]]:
 
 def sync(mode: str) -> Callable[..., Iterator[Episode]]:
     def make(**options: Any) -> Iterator[Episode]:
-        one = lambda: eb.shield(gymnasium.make("EthBrake-v0"), **options)  # noqa: E731
+        one = lambda: eb.shield(gymnasium.make("EthBrake-v1"), **options)  # noqa: E731
         return batch(SyncVectorEnv([one] * 3, autoreset_mode=AutoresetMode(mode)))
 
     return make
@@ -137,7 +137,7 @@ def monitored(**options: Any) -> Iterator[Episode]:
 
 
 def dummy(**options: Any) -> Iterator[Episode]:
-    return rows(DummyVecEnv([lambda: eb.shield(gymnasium.make("EthBrake-v0"), **options)] * 3))
+    return rows(DummyVecEnv([lambda: eb.shield(gymnasium.make("EthBrake-v1"), **options)] * 3))
 
 
 INTERFACES = {

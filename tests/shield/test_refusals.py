@@ -160,7 +160,7 @@ AROUND: dict[str, Callable[[], object]] = {
     "HybridShield: None: must be an environment made by eb.parallel_env; eb.shield(env) chooses the": lambda: (
         HybridShield(None, BRAKE)
     ),
-    "must be an environment made by gymnasium.make('EthBrake-v0')": lambda: ShieldedEnv(gymnasium.make("CartPole-v1")),
+    "must be an environment made by gymnasium.make('EthBrake-v1')": lambda: ShieldedEnv(gymnasium.make("CartPole-v1")),
     "policy = 'ppo': must be an agent or a policy (eb.load_policy); eb.policy_agent(function) makes": lambda: (
         HybridShield(parallel_env(), "ppo")
     ),
@@ -177,10 +177,10 @@ AROUND: dict[str, Callable[[], object]] = {
     "no vehicle of scenario 'paper-random' learns, and only learners can be shielded; make": lambda: HybridShield(
         parallel_env(learners=[]), BRAKE, mode="step"
     ),
-    "HybridShield: ethbrake_v0: must be an environment made by eb.parallel_env; eb.shield(env) chooses": lambda: (
+    "HybridShield: ethbrake_v1: must be an environment made by eb.parallel_env; eb.shield(env) chooses": lambda: (
         HybridShield(aec_env(), mode="step")
     ),
-    "shield: in BaseWrapper<ethbrake_v0> the agents act one after the other; shield the parallel": lambda: eb.shield(
+    "shield: in BaseWrapper<ethbrake_v1> the agents act one after the other; shield the parallel": lambda: eb.shield(
         BaseWrapper(aec_env())
     ),
     "shield: None: must be an agent, a team, or an environment made by eb.parallel_env, eb.env": lambda: eb.shield(

@@ -141,7 +141,7 @@ def env_spec(task: Task) -> EnvSpec:
         names,
         "a Minari dataset has one learner; give the other learners a script, or write a Parquet file",
     )
-    spec = copy.deepcopy(gymnasium.spec("EthBrake-v0"))
+    spec = copy.deepcopy(gymnasium.spec("EthBrake-v1"))
     spec.kwargs = {"scenario": task.scenario.declared(), "reward": task.reward.model_dump(mode="json")}
     if task.observation != observation_for(task.scenario):
         spec.kwargs["observation"] = [feature.name for feature in task.observation.features]
