@@ -104,8 +104,8 @@ def training_environment(model: Any, name: str, *, ignore_wrappers: bool = False
     counts = {getattr(base, "actions", None) for base in bases}
     if not ignore_wrappers and len(counts) > 1:
         raise InvalidInput(
-            f"agent {name!r}: the copies of the model's environment have different numbers of actions, {counts}; all must"
-            " have the same number"
+            f"agent {name!r}: the copies of the model's environment have different numbers of actions, {counts}; all"
+            " must have the same number"
         )
     return bases[0] if bases else None
 
