@@ -35,10 +35,10 @@ class ShovedFront:
 
     @classmethod
     def of(cls, worlds: Worlds, task: Task) -> ShovedFront | None:
-        """Return the measurement for ``worlds`` at the alert, or None if it is not defined for the task.
+        """Return the measurement for ``worlds`` at the alert, or None if shoving is not defined for the task.
 
-        It is not defined if Vehicle 1 is controlled, if its script reacts to the state of the world, or if brake force
-        builds up gradually.
+        Shoving is not defined if Vehicle 1 is controlled, if its script reacts to the state of the world, or if brake
+        force builds up gradually.
         """
         script = None if 0 in task.vehicles else task.scenario.scripts.get(0)
         vehicles = worlds.vehicles
@@ -53,8 +53,8 @@ class ShovedFront:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the distance that Vehicle 1 drives in one step.
 
-        The distance is the change of Vehicle 1's gap to an obstacle. If the world has none, an obstacle is assumed
-        that Vehicle 1 cannot reach in this step.
+        The distance is the change of Vehicle 1's gap to an obstacle. If the world has no obstacle, one is assumed that
+        Vehicle 1 cannot reach in this step.
 
         Args:
             before: the worlds at the beginning of the step.
@@ -80,9 +80,9 @@ class SampledHarm:
     """Compute the sampled harm of the episodes: the paper's sum of squared closing speeds over time samples.
 
     The agents' commands are applied again in ``advance_sampled``, the paper's equations of motion with a fixed step.
-    Every world runs to the horizon. If its episode in the exact physics ended earlier, its last commands are held. The
-    agents decided in the exact physics; they are not asked again. ``of`` creates the object, ``see`` is called for each
-    step, and ``finish`` returns the harm.
+    Every world is simulated up to the horizon. If the episode of a world ended earlier in the exact physics, the last
+    commands of its vehicles remain in force. The agents made their decisions in the exact physics, and make no new
+    decisions here. ``of`` creates the object, ``see`` is called for each step, and ``finish`` returns the harm.
 
     Args:
         worlds: the n worlds at the alert; they are copied.
@@ -102,9 +102,9 @@ class SampledHarm:
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
         """Return the measurement for ``worlds`` at the alert, or None if sampled harm is not defined for the task.
 
-        It is defined if Vehicle 2 alone is controlled and no script reacts to the state of the world, because the
-        samples are taken at Vehicle 2's decisions. The paper's equations also exclude an obstacle, and brake force that
-        builds up gradually.
+        Sampled harm is defined if Vehicle 2 is the only controlled vehicle and no script reacts to the state of the
+        world, because the samples are taken at Vehicle 2's decisions. Sampled harm is not defined with an obstacle or
+        with brake force that builds up gradually, which the paper's equations do not cover.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -114,7 +114,9 @@ class SampledHarm:
         return cls(worlds, task.scenario)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Apply the commands of one step in the paper's equations; a world whose episode has ended repeats its last.
+        """Apply the commands of one step in the paper's equations.
+
+        A world whose episode has ended repeats its last commands.
 
         Args:
             before: the worlds at the beginning of the step.

@@ -48,7 +48,7 @@ class AgentTally:
     def share(self, name: str, worlds: int) -> float | None:
         """Return the fraction (0 to 1) of the worlds in which the true/false measure ``name`` is true.
 
-        ``worlds`` is the number of evaluated worlds. The result is None if some of these worlds have no value.
+        ``worlds`` is the number of evaluated worlds. The result is None if the measure has no value in some of them.
         """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
@@ -56,7 +56,7 @@ class AgentTally:
     def sums(self, name: str, worlds: int) -> Moments | None:
         """Return count, sum and sum of squares of the numeric measure ``name``.
 
-        ``worlds`` is the number of evaluated worlds. The result is None if some of these worlds have no value.
+        ``worlds`` is the number of evaluated worlds. The result is None if the measure has no value in some of them.
         """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
@@ -76,8 +76,8 @@ def tally_agents(
         outcomes: outcome of each agent, by the agent's name.
         contexts: data that each set of measures computed once for these worlds (``contexts_of``), by the set's name.
         baseline: name of the agent to compare with, for sets of measures that name no baseline.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). With a list, even an empty one, the result
-            also has the harm that each vehicle bears, and the vehicle's value under each of these objectives.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list, even an empty one, the
+            result also has the harm that each vehicle bears, and the value of each objective for each vehicle.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
@@ -119,8 +119,9 @@ def estimate_all(
     Args:
         tallies: sums of every agent, by the agent's name.
         agent: name of the agent.
-        worlds: number of evaluated worlds. The estimate of a measure is None if some of these worlds have no value.
-        baseline: name of the agent to compare with. If it was not evaluated, the comparisons are None.
+        worlds: number of evaluated worlds. The estimate of a measure is None if the measure has no value in some of
+            these worlds.
+        baseline: name of the agent to compare with. If this agent was not evaluated, all comparisons are None.
 
     """
     own = tallies[agent]
@@ -139,7 +140,7 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Return the estimate of one measure, or None if some worlds have no value or the comparison is impossible.
+    """Return the estimate of one measure, or None if the measure lacks a value in some world or cannot be compared.
 
     Args:
         measure: the measure.
@@ -167,7 +168,7 @@ def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
     """Return the names of the measures whose means are lower bounds of the true means, for one agent.
 
     A set of measures may name a true/false measure (``MeasureSet.whole``) that says whether a world's values are
-    complete. If it is false in some world, all means of the set are lower bounds.
+    complete. If this measure is false in some world, all means of the set are lower bounds.
 
     Args:
         tally: sums of the agent.

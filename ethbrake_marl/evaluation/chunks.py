@@ -202,8 +202,8 @@ def tally_list(
         lineup: the agents.
         episodes: number of worlds in the list, 1 to 10^12.
         seed: seed from which the worlds are drawn.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). The result then also has the harm that
-            each vehicle bears, and the vehicle's value under each of these objectives.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If objectives are passed, the result also
+            has the harm that each vehicle bears, and the value of each objective for each vehicle.
         jobs: number of processes; None: one process, or with Ray one per core of the cluster.
         ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
         on_done: function that is called after each chunk with the number of worlds evaluated so far.

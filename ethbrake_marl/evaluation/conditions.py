@@ -85,8 +85,8 @@ class Conditions(dict[str, Any]):
                 worlds; None if the set applies.
             quantities: quantities of the worlds, as ``of`` returns them.
             recordings: number of recordings that the worlds come from; 0 if the worlds come from no recordings.
-            rejected: number of drawn worlds that were rejected because of an early impact. The result has this number
-                only if the scenario takes its worlds from a table.
+            rejected: number of drawn worlds that were rejected because of an early impact. The result contains this
+                number only if it is above 0 and the scenario takes its worlds from a table.
 
         """
         scenario = task.scenario

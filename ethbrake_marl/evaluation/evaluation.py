@@ -136,8 +136,8 @@ class Evaluation:
     def hidden(self) -> Bools:
         """Whether the V2X channel hides something from a controlled vehicle, for each world, [n].
 
-        This is so if messages arrive late, only from time to time or not at all, if they omit a quantity, or if another
-        vehicle reacts later than its message says.
+        The channel hides something if messages arrive late, only from time to time or not at all, if messages omit a
+        quantity, or if another vehicle reacts later than its message says.
         """
         messages, hides = Messages.of(self.worlds), self.worlds.vehicles.hide_from
         from_each = [hides(i) | messages.periodic | messages.withhold_from(i) for i in self.vehicles]

@@ -142,7 +142,7 @@ def result_identity(
     Args:
         kind: kind of results, such as ``evaluate`` or ``shield``.
         scenario: scenario of the worlds.
-        sample: the worlds. None if the file has results on several samples; ``worlds_sha256`` is then omitted.
+        sample: the worlds. For a file with results on several samples pass None; then ``worlds_sha256`` is omitted.
         left_out: rows of the sample that were left out because of errors; the hash does not include them.
 
     """

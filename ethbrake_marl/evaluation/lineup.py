@@ -58,7 +58,7 @@ def make_lineup(
 
     Args:
         specs: texts that name agents (``"full_brake"``, ``"ppo+step"``), as a list or as one text with commas between
-            the specs. The name of a group, such as ``ladder``, stands for several agents.
+            the specs. The name of a group of agents, such as ``ladder``, is replaced by all agents of the group.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
         uncertainty: uncertainty for shields that need one, as ``make_agent`` takes it.

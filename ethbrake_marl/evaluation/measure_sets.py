@@ -29,9 +29,10 @@ BASELINE = "full_brake"
 class Measure:
     """One measure of an agent. Tables show the mean of its values; for true/false values, the fraction that is true.
 
-    ``of`` is a function that takes the agent's outcome and the context that ``MeasureSet.prepare`` returned. It returns
-    one value per world, [n], or None if the measure is not defined for this outcome. A measure that compares an agent
-    with the baseline has the name of another measure as ``of``; ``against`` says how the values are compared.
+    ``of`` is a function that takes the agent's outcome and the context that ``MeasureSet.prepare`` returned. The
+    function returns one value per world, [n], or None if the measure is not defined for this outcome. A measure that
+    compares an agent with the baseline has the name of another measure as ``of``; ``against`` says how the values are
+    compared.
     """
 
     name: str  # key in JSON results, different for all measures
@@ -80,9 +81,9 @@ class GroupColumn:
 class MeasureSet:
     """Base class of a set of measures that are computed from the same information about the worlds.
 
-    A subclass must list its measures in ``measures``. It may override ``prepare``, which computes this information
-    (the *context*) once per evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and ``notes``,
-    which add texts to a results table.
+    A subclass must list its measures in ``measures``. A subclass may override ``prepare``, which computes this
+    information (the *context*) once per evaluation; ``row``, which adds fields to JSON results; and ``warnings`` and
+    ``notes``, which add texts to a results table.
     """
 
     measures: tuple[Measure, ...] = ()  # measures with a column or a JSON key, in the order of JSON
@@ -253,7 +254,7 @@ def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
     """Return the context of each installed set of measures for an ``Evaluation``, by the set's name.
 
     The context is what ``MeasureSet.prepare`` returned: the set's information about the worlds, or ``Silent`` with the
-    reason why the set does not apply. It is computed once per evaluation.
+    reason why the set does not apply. The context is computed once per evaluation.
 
     Args:
         evaluation: the evaluation.

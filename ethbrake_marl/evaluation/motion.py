@@ -50,8 +50,9 @@ def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[E
 
     Args:
         worlds: worlds at the alert.
-        agent: an agent, of which each learner gets a copy, or a team. The object itself does not change.
-        scenario: scenario of the worlds. The agent drives its learners, its scripts drive the other vehicles.
+        agent: an agent, of which each learner gets a copy, or a team. The object that you pass does not change.
+        scenario: scenario of the worlds. The agent drives the learners of the scenario, and the scripts of the scenario
+            drive the other vehicles.
 
     Raises ``PhysicsError`` with the worlds that could not be simulated.
 
@@ -122,7 +123,7 @@ class _Follower(Tape):
         return motions
 
     def _pieces(self) -> list[Floats]:
-        """Return the pieces of each world's motion, [k, 1 + 4 N] as in ``EpisodeMotion``.
+        """Return the motion of each world as k pieces with constant jerks, [k, 1 + 4 N] as in ``EpisodeMotion``.
 
         A world whose episode ends at the alert has a single piece.
         """
@@ -146,8 +147,8 @@ class _Follower(Tape):
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
-    A piece is dropped if the piece before it, continued, leads to the same state within rounding. If several pieces
-    begin within the same 0.1 ms, all but the last are dropped.
+    A piece is dropped if a continuation of the piece before it leads to the same state within rounding. If several
+    pieces begin within the same 0.1 ms, only the last of them is kept.
 
     Args:
         pieces: time and state at the beginning of each piece, [k, 1 + 4 N], as in ``EpisodeMotion``.

@@ -18,7 +18,7 @@ SEES_THROUGH = "† "  # mark of an omniscient agent, which reads values that no
 
 
 def notes_of(rows: Sequence[SummaryRow]) -> list[Note]:
-    """Return the notes to print below a results table, in this order."""
+    """Return the notes to print below a results table, in the order of printing."""
     if not rows:
         return []
     notes: list[Note] = [

@@ -170,7 +170,7 @@ def none_for_nan(column: Values) -> list[Any]:
 
 
 class LeftOut(NamedTuple):
-    """A world that is left out for all agents, because the physics failed to simulate it with one of them."""
+    """A world that is left out for all agents, because the physics failed to simulate the world with one agent."""
 
     world: int  # number of the world in its evaluation list, from 0
     seed: int | None  # seed of the evaluation list; None for worlds that the caller passed
@@ -183,7 +183,7 @@ class LeftOut(NamedTuple):
 
     @staticmethod
     def line(worlds: Sequence[str], whole: int) -> str:
-        """Return the note for users that some worlds were left out. It lists at most ten of these worlds.
+        """Return the note for users that some worlds were left out. The note lists at most ten of these worlds.
 
         Args:
             worlds: description of each left-out world, with the reason.

@@ -14,7 +14,7 @@ LOADED: dict[str, None] = {}  # all names that ``load_measures`` has loaded so f
 
 
 def load_measures(names: Iterable[str]) -> None:
-    """Load measures by name. All later evaluations of this process report them.
+    """Load measures by name. All later evaluations of this process report these measures.
 
     A name is ``risk``, ``injury``, the name of a measure of an installed package, or ``FILE:NAME``. The name
     ``my_file.py:measure`` runs the Python file ``my_file.py`` with your permissions, and takes ``measure`` from it: a

@@ -99,7 +99,7 @@ def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
             if harms[0] not in (None, ""):
                 values = tuple(map(float, harms))
                 if not all(0.0 <= value <= _MOST_HARM for value in values):
-                    raise ValueError(f"world {world} has the invalid harms {harms}")
+                    raise ValueError(f"harms of world {world} = {harms}: must be from 0 to {_MOST_HARM:g}")
                 of_agents.setdefault(agent, {})[int(world)] = values
                 recordings |= {int(world): name for name in recording}
         return of_agents, recordings
@@ -205,10 +205,10 @@ class Result:
         """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
-            raise InvalidInput(f"{self.path} was written without such a file (--per-world)")
+            raise InvalidInput(f"{self.path} was written without a file with one row per world (--per-world)")
         file = self.path.parent / Path(beside["file"]).name
         if not file.is_file():
-            raise InvalidInput(f"{file} does not exist")
+            raise InvalidInput(f"{file}, the file with one row per world of {self.path}, does not exist")
         data = read_plain(file, _MOST_BYTES)
         if hashlib.sha256(data).hexdigest() != beside.get("sha256"):
             raise InvalidInput(f"{file} was changed after {self.path} was written")
@@ -264,7 +264,7 @@ def read_result(path: Path) -> Result:
 def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
     """Return the value of ``key`` in an agent's JSON object ``row``, or else in its ``parameters``, as text.
 
-    Return None if neither has the key.
+    Return None if neither the object nor its ``parameters`` have the key.
     """
     parameters = row.get("parameters")
     value = row.get(key, parameters.get(key) if isinstance(parameters, dict) else None)
@@ -274,7 +274,7 @@ def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
     """Return whether ``mean`` is a mean harm, and ``interval`` an interval ``[low, high]`` that contains it.
 
-    ``interval`` may be None. If ``draws``, the number of independent worlds, is 1, it must be None.
+    ``interval`` may be None. If ``draws``, the number of independent worlds, is 1, ``interval`` must be None.
     """
     ends = [mean, mean] if interval is None else interval
     if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and draws == 1):

@@ -74,10 +74,10 @@ def record_episode(
 
     Args:
         world: the world at the alert, n = 1.
-        agent: agent or team. The object itself does not change.
+        agent: agent or team. The object that you pass does not change.
         scenario: scenario of the world, whose scripts drive the other vehicles.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        sample_s: largest time between two samples (s). Times of decisions are sampled in any case.
+        sample_s: largest time between two samples (s). The times of decisions are always among the samples.
 
     Raises ``InvalidInput`` if there is not exactly one world, or if ``sample_s`` is not above 0.
 
@@ -105,7 +105,8 @@ def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float)
 
     Two samples of a step are at most ``sample_s`` apart (s). The end of a step is sampled as the beginning of the next
     step, and the end of the last step as its last sample. A world does not contain positions, so Vehicle 1's position
-    is computed from its gap to an obstacle. If the world has no obstacle, one is assumed that Vehicle 1 cannot reach.
+    is computed from its gap to an obstacle. If the world has no obstacle, an obstacle is assumed that Vehicle 1 cannot
+    reach.
 
     Args:
         segments: steps of one world, each as (world at the beginning, commands [1, N], time of the end [1]).

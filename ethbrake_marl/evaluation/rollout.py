@@ -120,7 +120,7 @@ def drive_chunk(
     first: int = 0,
     aftermath: bool = True,
 ) -> Evaluation:
-    """Let each agent drive one chunk of worlds, all together, from the alert to the end of their episodes.
+    """Let each agent drive all worlds of one chunk at once, from the alert to the end of their episodes.
 
     If the physics fails in every world, the result has no worlds.
 
@@ -217,7 +217,10 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let copies of ``agent`` drive the rows ``rows`` of ``whole``. The other arguments are as in ``drive_chunk``."""
+    """Let copies of ``agent`` drive the worlds ``rows`` (row numbers) of ``whole``.
+
+    The other arguments are as in ``drive_chunk``.
+    """
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
     task = Task(scenario, tuple(team.drivers))

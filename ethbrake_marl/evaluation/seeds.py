@@ -1,8 +1,8 @@
 """Statistics over trainings with different seeds: means whose intervals say what to expect of another seed.
 
 There are usually few seeds, and a single bad seed moves a mean a lot. The interquartile mean omits the best and the
-worst quarter. Its error is estimated with a stratified bootstrap: seeds are resampled within each task (scenario),
-because seeds are random and tasks are not.
+worst quarter. The error of the interquartile mean is estimated with a stratified bootstrap: seeds are resampled within
+each task (scenario), because seeds are random and tasks are not.
 """
 
 from __future__ import annotations
@@ -77,14 +77,15 @@ def mean_over_seeds(
 
     The bootstrap resamples the seeds of ``values``, the seeds of ``baseline``, and the worlds (or clusters of worlds).
     The interval is therefore valid for other seeds and other worlds. There is no interval for a single world or
-    cluster. Without a baseline, there is none either if all values are 0; and the interval of true/false values always
-    contains Wilson's interval, because bootstrap intervals of nearly constant values are too narrow.
+    cluster. Without a baseline, there is also no interval if all values are 0. Without a baseline, the interval of
+    true/false values always contains Wilson's interval, because bootstrap intervals of nearly constant values are too
+    narrow.
 
     Args:
         values: result of the training with each seed in each world, [seeds, worlds].
         baseline: results to subtract, in the same worlds, [seeds, worlds]; the number of seeds may differ.
-        clusters: name of the cluster of each world, [worlds]. Only clusters are independent of each other. None: all
-            worlds are independent.
+        clusters: name of the cluster of each world, [worlds]. Only clusters are independent of each other. If this is
+            None, all worlds are independent.
         seed: seed of the bootstrap.
 
     Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite.
@@ -113,13 +114,13 @@ def share_over_seeds(
     """Return the share of the possible reduction: 0 for values as bad as ``worst``, 1 for values as good as ``best``.
 
     The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
-    ``mean_over_seeds``. Returns None if the mean of ``best`` is not below the mean of ``worst``, or if it is not
-    clearly below the mean of ``worst`` in 5 % or more of the resamples.
+    ``mean_over_seeds``. Returns None unless the mean of ``best`` is below the mean of ``worst`` and, in more than 95 %
+    of the resamples, the difference of the means is above 0.1 % of the original difference.
 
     Args:
         values: harms of the trainings to judge, [seeds, worlds] (m2/s2).
-        worst: harms that count as share 0, in the same worlds, [seeds, worlds].
-        best: harms that count as share 1, in the same worlds, [seeds, worlds].
+        worst: harms of the agent whose share is 0 by definition, in the same worlds, [seeds, worlds].
+        best: harms of the agent whose share is 1 by definition, in the same worlds, [seeds, worlds].
         clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap.
 
@@ -179,10 +180,10 @@ def _resampled(
 
 
 def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed: int) -> Floats:
-    """Return the mean of each side in each bootstrap resample, [resamples, sides].
+    """Return the mean of each side (array of results) in each bootstrap resample, [resamples, sides].
 
-    Seeds are resampled separately for each side. Clusters are resampled once for all sides; a drawn cluster contributes
-    all its worlds.
+    Seeds are resampled separately for each side. The clusters are resampled once for all sides together. A drawn
+    cluster contributes all its worlds.
 
     Args:
         sides: arrays [seeds, worlds].

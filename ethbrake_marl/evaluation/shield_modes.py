@@ -138,17 +138,18 @@ def compare_modes(
 ) -> ShieldModes:
     """Compare every agent without a shield, with a shield in episode mode, and in step mode, in the same worlds.
 
-    Step mode is also tried with rollouts of the policy at the alert only (``step-alert``). For teams, which have no
-    episode mode, step mode is also tried with a cap of each vehicle's harm (``step-cap``). Each decision that step mode
-    replaced is simulated again without the replacement. If the physics fails in a world with one agent, the world is
-    left out for all agents, and ``left_out`` of each row lists it.
+    Step mode is also run with rollouts of the policy only at the alert (``step-alert``). For teams, which have no
+    episode mode, step mode is also run with a cap of each vehicle's harm (``step-cap``). For each decision that step
+    mode replaced, the episode is simulated again with the policy driving unshielded from this decision on. If the
+    physics fails in a world with one agent, the world is left out for all agents, and ``left_out`` of each row lists
+    it.
 
     Args:
-        agents: agents or teams by name, without a shield. The objects themselves do not change.
+        agents: agents or teams by name, without a shield. The objects that you pass do not change.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        behind: whether ``agents`` already have shields. The policies behind episode and step shields are then compared;
-            all other agents are ignored. The result is empty if no agent has such a shield.
+        behind: whether ``agents`` already have shields. If so, the policies behind episode and step shields are
+            compared, and all other agents are ignored; the result is empty if no agent has such a shield.
         clusters: name of the cluster of each world, [n]; None: all worlds are independent.
         on_progress: function that is called with an agent's name and the number of worlds that it has driven so far.
 

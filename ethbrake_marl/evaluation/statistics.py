@@ -146,8 +146,8 @@ class Moments:
     def standard_error(self) -> float:
         """Standard error of the mean, ``s / sqrt(n)``, where s is the standard deviation with n - 1 degrees of freedom.
 
-        With G clusters it is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where D_g is the sum of the deviations from
-        the mean in cluster g. Raises ``ZeroDivisionError`` for fewer than two values or clusters.
+        With G clusters the standard error is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where D_g is the sum of the
+        deviations from the mean in cluster g. Raises ``ZeroDivisionError`` for fewer than two values or clusters.
         """
         n = self.count
         if self.clusters:
@@ -165,12 +165,12 @@ class Moments:
     def share(self) -> Estimate:
         """Mean p of values that are 0 or 1, with Wilson's interval (``rate``).
 
-        With G clusters, Wilson's interval is computed for an effective number of independent draws. This is the number
-        with which independent draws would have the same standard error, ``1 + p (1 - p) / error ** 2``, but at most the
-        number of values; if all values agree, it is G. It is multiplied by ``(z / t) ** 2``, because the standard error
-        has G - 1 degrees of freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected
-        number of positive counts estimated from survey data", Survey Methodology 24). There is no interval for a single
-        cluster.
+        With G clusters, Wilson's interval is computed for an effective number of independent draws. The effective
+        number is ``1 + p (1 - p) / error ** 2``, the number with which independent draws would have the same standard
+        error, but at most the number of values. If all values agree, the effective number is G. The effective number is
+        then multiplied by ``(z / t) ** 2``, because the standard error has G - 1 degrees of freedom (Korn and Graubard
+        1998, "Confidence intervals for proportions with small expected number of positive counts estimated from survey
+        data", Survey Methodology 24). There is no interval for a single cluster.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -186,7 +186,7 @@ class Moments:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
         The residuals ``values - r * others`` have mean 0, so the error is
-        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. Its square is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of the error is
         ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where x are the values, y the others, Sx and Sy
         their sums, and Qxx, Qxy and Qyy the sums of products. With clusters, x and y are the sums of the clusters.
 
@@ -325,9 +325,8 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
     """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
     The standard errors s1 and s2 of the two means are the half-widths of their t intervals, divided by the t quantiles.
-    The difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with
-    ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two means has no interval, the
-    difference has none either.
+    The difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
+    degrees of freedom. If one of the two means has no interval, the difference has no interval either.
 
     Args:
         value: first mean with its interval.
@@ -392,6 +391,7 @@ def _check_pair(values: Floats, baseline: Floats, clusters: Texts | None) -> tup
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(
-            f"statistics: {len(data)} values and {len(reference)} values of the baseline: must be equally many"
+            f"statistics: {len(data)} values and {len(reference)} values of the baseline: both must have the same"
+            " number of values"
         )
     return Moments.of(data, clusters), Moments.of(reference, clusters), exact_sum(data, reference)

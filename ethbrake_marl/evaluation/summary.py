@@ -124,7 +124,7 @@ class SummaryTable(list[SummaryRow]):
     def terminal(self) -> Sheet:
         """Return the table for a terminal with at least 80 columns.
 
-        It ends with rows from other sources, and a text about the worlds, the intervals and other notes.
+        The table ends with rows from other sources, and a text about the worlds, the intervals and other notes.
         """
         narrow = self._narrow()
         columns = [
@@ -147,7 +147,7 @@ class SummaryTable(list[SummaryRow]):
         return (*_ALWAYS_SHOWN, *last)
 
     def tables(self) -> list[Sheet]:
-        """Return the tables to print, which are ``terminal()`` and, if there are any, the measures of the user."""
+        """Return the tables to print: ``terminal()`` and, if there are any, a table of the user's measures."""
         lines = [(row.agent, heading_of(column), value) for row in self for column, value in row.metrics.items()]
         own = Sheet("Measures", ["Agent", Column("Measure", text=True), Column("Mean or rate")], lines)
         return [self.terminal(), own] if lines else [self.terminal()]
@@ -197,7 +197,7 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
 
     Args:
         evaluation: outcomes of the agents, from ``evaluate``.
-        baseline: name of the agent to compare with. If it was not evaluated, the table has no comparisons.
+        baseline: name of the agent to compare with. If this agent was not evaluated, the table has no comparisons.
 
     """
     contexts = contexts_of(evaluation)

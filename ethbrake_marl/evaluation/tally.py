@@ -41,8 +41,8 @@ class Tally:
 
         Args:
             part: outcomes of the agents in a chunk of worlds.
-            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). With a list, even an empty one, the
-                sums include the harm that each vehicle bears, and its value under each of these objectives.
+            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list, even an empty one,
+                the sums include the harm that each vehicle bears, and the value of each objective for each vehicle.
             long_list: omit sets of measures that do not apply to more than 100,000 worlds.
 
         """

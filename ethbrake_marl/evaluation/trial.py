@@ -73,8 +73,8 @@ def load_runnable(
 def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     """Simulate ``worlds`` of a scenario, and count the worlds in which something unusual happens.
 
-    Learners brake fully; the other vehicles follow their scripts. Searching scripts try few candidates. The result has
-    these keys:
+    Learners brake fully; the other vehicles follow their scripts. Scripts that search try only a few candidates, to
+    save time. The result has these keys:
 
     - ``early_impacts``: number of worlds with an impact before a learner may act;
     - ``moving_at_horizon``: number of worlds in which a vehicle still moves at the horizon;
@@ -130,7 +130,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Try all agents, shields and settings on ``worlds``, and return the error messages where one fails.
+    """Try all agents, shields and settings on ``worlds``, and return the error message of each that fails.
 
     The keys of the result are specs of agents, ``+SHIELD`` for shields, and names of settings.
     """

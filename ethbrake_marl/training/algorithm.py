@@ -19,10 +19,10 @@ from ethbrake_marl.training.training import Training
 class Algorithm(ABC):
     """Base class of a learning algorithm whose model is a ``BaseAlgorithm`` of Stable-Baselines3.
 
-    A subclass must implement ``build``, which returns the model. It may override ``actors`` (the policies inside the
-    model), ``tensors`` (the weights of a policy), ``optimizers`` and ``learned_beside`` (what a checkpoint saves in
-    addition to ``model.policy``), and ``log_noise`` (the exploration noise). The default methods fit a model whose
-    ``policy`` has one ``optimizer``, such as PPO and A2C.
+    A subclass must implement ``build``, which returns the model. A subclass may override ``actors`` (the policies
+    inside the model), ``tensors`` (the weights of a policy), ``optimizers`` and ``learned_beside`` (what a checkpoint
+    saves in addition to ``model.policy``), and ``log_noise`` (the exploration noise). The default methods fit a model
+    whose ``policy`` has one ``optimizer``, such as PPO and A2C.
     """
 
     @abstractmethod
@@ -53,7 +53,7 @@ class Algorithm(ABC):
         return tensors_of(actor, network)
 
     def optimizers(self, model: BaseAlgorithm) -> Mapping[str, Optimizer]:
-        """Return all optimisers of the model by name. Their order must always be the same."""
+        """Return all optimisers of the model by name, always in the same order."""
         return {"policy": model.policy.optimizer}
 
     def learned_beside(self, model: BaseAlgorithm) -> Mapping[str, Tensor]:

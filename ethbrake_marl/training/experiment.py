@@ -195,11 +195,11 @@ def run_experiment(
 def compared_agents(
     trained: Trained, scenario: Scenario, harm_count: HarmCount, baselines: Sequence[str] | None = None
 ) -> dict[str, Driver]:
-    """Return the agents to compare, by name: baselines, the trained policy or team, and the same with a shield.
+    """Return the agents to compare, by name: baselines, and the trained policy or team with and without a shield.
 
     With one learner, the trained agent is ``trained policy``, and ``hybrid`` is this policy with the paper's shield.
-    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a step shield. There
-    is then also a team ``all but vehicle_i`` for each learner i, in which this vehicle brakes fully.
+    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a step shield. For
+    several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i brakes fully.
 
     Args:
         trained: the trained policy or policies.

@@ -140,7 +140,7 @@ class IndependentPPO(PPO):
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def train(self) -> None:
-        """Update each learner that learns now with ``PPO.train``, from its own rows and with its own optimiser."""
+        """Update each learner whose turn it is with ``PPO.train``, from its own rows and with its own optimiser."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
         parts = {number: self._part(buffer, number) for number in self._learning}
         try:

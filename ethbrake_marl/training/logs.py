@@ -16,8 +16,8 @@ def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
 
     Args:
         run: folder of the run.
-        state: checkpoint from which the training continues. Rows of the logs after this checkpoint are dropped. None:
-            begin with empty logs.
+        state: checkpoint from which the training continues. Rows of the logs after this checkpoint are dropped. If this
+            is None, the logs begin empty.
 
     Returns the two writers, for ``output_formats`` of Stable-Baselines3's logger.
 

@@ -187,7 +187,7 @@ def check_counter(name: str, value: object, kind: type) -> None:
     Args:
         name: name of the counter, for the message.
         value: the counter's value.
-        kind: required type. If it is ``int``, the value must be from 0 to 2^53 - 1.
+        kind: required type. If this type is ``int``, the value must be from 0 to 2^53 - 1.
 
     """
     if type(value) is not kind or (kind is int and not 0 <= value < 1 << 53):  # type: ignore[operator]  # an int

@@ -29,7 +29,7 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
     """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` is the description of the network. It belongs to PPO if its ``output`` is ``clip``, else to SAC.
+    ``spec`` is the description of the network. The network belongs to PPO if its ``output`` is ``clip``, else to SAC.
     Stable-Baselines3 also numbers the activations, so its number of a hidden layer is twice the number in a bundle.
     """
     if spec.output == "clip":
@@ -51,7 +51,8 @@ def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
     """Return a copy of the weights of a perceptron, by their names in a policy bundle.
 
     Args:
-        name: name of the network in the bundle, such as ``policy`` or ``gate``. The tensors' names begin with it.
+        name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all tensors begin with
+            this name.
         layers: linear layers, possibly with activations between them. The last linear layer is the output.
 
     """

@@ -38,7 +38,7 @@ def save_team(
     seed: int,
     steps: int,
 ) -> None:
-    """Save the actors of several learners as a team. The agent ``team@FOLDER`` loads it.
+    """Save the actors of several learners as a team, which the agent ``team@FOLDER`` loads.
 
     If all learners have the same actor object, it is saved once, as a shared policy.
 

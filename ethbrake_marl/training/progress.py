@@ -21,8 +21,8 @@ class Course:
     """Last policy, best policy and evaluations of a running training.
 
     The best policy is the policy with the smallest mean of the learners' objectives on the fixed list of worlds. If all
-    learners have the harm of the line as objective, it is the policy with the least harm in ``harm_count``. Without
-    evaluations there is no best policy.
+    learners have the harm of the line as objective, the best policy is the policy with the least harm in
+    ``harm_count``. Without evaluations there is no best policy.
     """
 
     harm_count: HarmCount = "first"  # count of harm by which the best policy is chosen

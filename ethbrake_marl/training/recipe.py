@@ -63,8 +63,8 @@ class LearningRate(FileModel):
 class Shape(FileModel):
     """Base class for the value of a recipe's key ``network``, which describes the networks.
 
-    A subclass declares the keys as fields. It needs the fields ``policy`` (sizes of the actor's hidden layers, such as
-    ``[64, 64]``) and ``activation``, unless it overrides ``spec``.
+    A subclass declares the keys as fields. A subclass needs the fields ``policy`` (sizes of the actor's hidden layers,
+    such as ``[64, 64]``) and ``activation``, unless it overrides ``spec``.
     """
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
@@ -158,7 +158,9 @@ class TrainingRecipe(FileModel):
     @classmethod
     def _some_reward(cls, value: RewardParams) -> RewardParams:
         if not any(weight for name, weight in value.weights.items() if name != "shaping"):
-            raise ValueError("all weights are 0, so there is nothing to learn; set at least one weight")
+            raise ValueError(
+                "all weights are 0, so there is nothing to learn; give at least one term a weight other than 0"
+            )
         return value
 
     @field_validator("observation", mode="before")
@@ -197,7 +199,7 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. By default every number fits."""
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. The default accepts all."""
 
     def begins(self, scenario: Scenario) -> str | None:
         """Return a description of the initial weights for a scenario, or None if the initial weights are random."""

@@ -119,7 +119,7 @@ class SacRecipe(TrainingRecipe):
         if value == "auto":
             return "auto"
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
-            raise ValueError("must be auto, or a finite number of at least 0")
+            raise ValueError("must be 'auto' or a finite number of at least 0")
         return float(value)
 
     @model_validator(mode="after")

@@ -53,7 +53,7 @@ class RunDirectory:
     def create(
         self, config: Mapping[str, Any], *, team: Mapping[str, Any] | None = None, force: bool = False
     ) -> RunDirectory:
-        """Create the folder with ``config.json`` and ``run.json`` atomically. The run can then be resumed.
+        """Create the folder with ``config.json`` and ``run.json`` atomically, so that the run can be resumed.
 
         Args:
             config: content of ``config.json``.

@@ -90,7 +90,7 @@ def _only(trained: Trained) -> Policy:
     if isinstance(trained, Policy):
         return trained
     raise InvalidInput(
-        f"training: {', '.join(trained.drivers)} have different policies; use policies, for instance"
+        f"training: {', '.join(trained.drivers)} have different policies; use the attribute policies, for instance"
         f" policies[{next(iter(trained.drivers))!r}]"
     )
 
@@ -119,22 +119,22 @@ def train(
 
     Args:
         recipe: a recipe, its name, or the path of its file.
-        scenario: a scenario, its name, or the path of its file. Its roles determine the learners.
+        scenario: a scenario, its name, or the path of its file. The roles in the scenario say which vehicles learn.
         directory: the new folder of the run.
         scheme: how several learners train together; None: the recipe's scheme.
         turns: number of turns of each independent learner (docs/train.md); None: the recipe's number.
         seed: seed of the training; None: the recipe's seed.
         steps: number of decisions of all learners; None: the recipe's number. The training ends with a whole update, so
-            the actual number may be larger.
+            the learners may make a few more decisions.
         force: replace an earlier run.
         settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files, for ``config.json``.
         measure: function that takes the training and returns a function that measures its policies. Policies are
             measured before the first update, every few updates (a key of the recipe), and at the end. By default the
-            fixed list of worlds in the recipe is used. None: policies are not measured.
+            policies are measured on the fixed list of worlds in the recipe. If this is None, policies are not measured.
         stop_at: function that takes an evaluation (an entry of ``TrainResult.evaluations``), and returns a reason to
             stop the training with status ``interrupted``, or None to continue.
-        on_progress: function that is called with the progress. By default the progress is printed on stderr. None: it
-            is not printed.
+        on_progress: function that is called with the progress. By default the progress is printed on stderr. If this is
+            None, the progress is not printed.
 
     Raises ``AlreadyExists`` for an existing directory if ``force`` is false, ``InvalidInput`` if recipe and scenario do
     not fit each other, ``TrainingDiverged`` if a number is not finite.
@@ -166,7 +166,7 @@ def resume(
     Args:
         directory: the folder of the run.
         measure: the same argument as in the call of ``train``.
-        stop_at: the same argument as in the call of ``train``. It is called with new evaluations only.
+        stop_at: the same argument as in the call of ``train``. This function is called only with new evaluations.
         on_progress: as in ``train``.
         other_versions: accept a checkpoint that was written by other versions of packages. The resulting policies may
             differ from the policies of an uninterrupted training.
@@ -216,8 +216,9 @@ def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[st
     The policies are also saved if the training ends with an error.
 
     Args:
-        callback: callback from ``build``, which contains the model and measures it during the training.
-        state: checkpoint from which the training continues; None: the training begins.
+        callback: callback from ``build``, which contains the model and measures the model's policies during the
+            training.
+        state: checkpoint from which the training continues; None: the training begins from the start.
         notes: messages for the user, passed to ``on_progress`` when the training begins.
 
     """

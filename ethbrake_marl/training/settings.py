@@ -71,7 +71,7 @@ def read_settings(
     by_owner: dict[str, list[Override]] = {owner: [] for owner in known}
     for override in Override.parse(texts or ()):
         if override.top == "recipe" and len(override.path) > 1 and not recipes:
-            raise InvalidInput(f"--set {override.key}: this command has no recipe; remove this setting")
+            raise InvalidInput(f"--set {override.key}: this command uses no recipe; remove this setting")
         whose = [override.top] if override.top in known and len(override.path) > 1 else [*known]
         inside = override.inside() if whose == [override.top] else override
         owners = [each for each in whose if inside.top in known[each]]

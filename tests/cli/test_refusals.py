@@ -63,7 +63,7 @@ EVALUATIONS = [
     ("evaluate --episodes 0", "number of worlds = 0: must be a whole number, at least 1"),
     ("evaluate --episodes 100000000000000", "episodes = 100000000000000: must be a whole number in 1..1000000000000"),
     ("evaluate --seed -1", "seed of the list = -1: must be a whole number, at least 0"),
-    ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command has no recipe; remove this setting"),
+    ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command uses no recipe; remove this setting"),
     ("evaluate --agents full_brke", "unknown agent 'full_brke'; did you mean 'full_brake'?"),
     ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; list each agent once"),
     (

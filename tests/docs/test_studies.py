@@ -5,7 +5,6 @@ import os
 import re
 import subprocess
 import sys
-import tomllib
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, get_args
@@ -34,7 +33,6 @@ from ethbrake_marl.scenario.tables import worlds_from_table
 from ethbrake_marl.scenario.task import Task
 from ethbrake_marl.training.recipe import Scheme
 from tests.docs.site import DOCS, load
-from tests.fixtures.installed import write_metadata
 
 sampling, price, equal_time, message_contents, team_curves, equilibria = (
     load(f"../studies/{name}")
@@ -383,16 +381,10 @@ def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-def test_ablate_cooperation__its_files_and_commands_make_what_it_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for language, name in (("python", "my_objective.py"), ("yaml", "my-level.yaml")):
-        (text,) = re.findall(f"```{language}\n(.*?)```", ABLATION, re.DOTALL)
-        (tmp_path / name).write_text(text, "utf-8")
-    (package,) = re.findall("```toml\n(.*?)```", ABLATION, re.DOTALL)
-    write_metadata(tmp_path, tomllib.loads(package)["project"])  # as pip does
-    path = os.pathsep.join([os.environ["PYTHONPATH"], str(tmp_path)])
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+def test_ablate_cooperation__its_file_and_commands_make_what_it_says(tmp_path: Path) -> None:
+    (level,) = re.findall("```yaml\n(.*?)```", ABLATION, re.DOTALL)
+    (tmp_path / "my-level.yaml").write_text(level, "utf-8")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     small = "--seeds 1 --steps 512 --episodes 20 --search-episodes 3"
     for command in re.findall(r"^\$ (.*)", ABLATION, re.MULTILINE):
         words = command.replace("--seeds 3", small).split()[1:]

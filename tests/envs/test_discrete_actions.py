@@ -137,7 +137,7 @@ def test_ignored_row__of_an_automatic_reset_may_hold_anything() -> None:
 # What is refused.
 
 BAD: list[tuple[Any, str]] = [
-    (9, "9; with actions=9 an index is needed, a whole number from 0 to 8"),
+    (9, "9; with actions=9, an action must be an index, a whole number from 0 to 8"),
     (-1, "-1; with actions=9"),
     (2**40, "1099511627776; with"),
     (10**30, "1000000000000000000000000000000; with"),

@@ -125,7 +125,7 @@ def test_reset_mask__is_refused_with_a_seed_or_a_generator_that_no_row_has_start
         env.reset(options=some)
     env.reset()
     assert env.reset(options=some)[1]["world"].tolist() == [0, 4, 5, 0]
-    with pytest.raises(InvalidInput, match="the first reset with a reset_mask that leaves rows out"):
+    with pytest.raises(InvalidInput, match="reset: reset_mask omits some rows, but the first reset"):
         eb.EthBrakeVectorEnv(4).reset(options=some)
     with pytest.warns(UnknownResetOption, match=r"unknown keys colour, which are ignored; known keys: .*reset_mask"):
         env.reset(options={**some, "colour": "red"})

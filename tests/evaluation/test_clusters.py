@@ -287,12 +287,12 @@ def test_command__says_how_many_recordings_and_how_many_draws_were_refused(
     share = f"{rejected} of {200 + rejected} draws ({100 * rejected / (200 + rejected):.1f} %)"
     assert run_command(["scenario", "explain", "recorded.yaml"]) == 0
     told = in_one_line(capsys.readouterr().out)
-    assert f"is drawn again: {share}." in told
-    assert "one of 5 rows of a table of 5 recordings, by which intervals are: gap_1_m" in told
+    assert f"is rejected and drawn again: {share}." in told
+    assert "one of the 5 rows of a table" in told and "The rows come from 5 recordings; confidence intervals" in told
     assert run_command(["scenario", "validate", "recorded.yaml"]) == 0
     told = in_one_line(capsys.readouterr().out)
-    assert f"early impacts: {share} refused" in told and "recording: 4 different" in told
+    assert f"{share} rejected" in told and "recording: 4 different" in told
     assert run_command(["scenario", "sample", "recorded.yaml", "--episodes", "200"]) == 0
-    assert f"before a learner may act, and drawn again: {share}" in in_one_line(capsys.readouterr().err)
+    assert f"drawn again because of an impact before a learner can act: {share}" in in_one_line(capsys.readouterr().err)
     assert run_command(["scenario", "sample", "paper-random", "--episodes", "200"]) == 0
     assert "drawn again" not in capsys.readouterr().err

@@ -104,10 +104,10 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "x.csv: is not a file that --per-world wrote: invalid literal for int() with base 10: 'x'": lambda: read_harms(
         Path("x.csv"), f"{HEAD}a,x,1,1\n".encode()
     ),
-    "x.csv: is not a file that --per-world wrote: world 1 has the invalid harms ['nan',": lambda: read_harms(
+    "x.csv: is not a file that --per-world wrote: harms of world 1 = ['nan',": lambda: read_harms(
         Path("x.csv"), f"{HEAD}a,1,nan,1\n".encode()
     ),
-    "x.csv: is not a file that --per-world wrote: world 1 has the invalid harms ['1',": lambda: read_harms(
+    "x.csv: is not a file that --per-world wrote: harms of world 1 = ['1',": lambda: read_harms(
         Path("x.csv"), f"{HEAD}a,1,1,1e300\n".encode()
     ),
 }
@@ -264,7 +264,7 @@ STATISTICS: dict[str, Callable[[], object]] = {
     "statistics: values of shape (2,): must be one finite number per world, shape [n] with n at": lambda: mean(
         np.array([1.0, nan])
     ),
-    "statistics: 3 values and 2 values of the baseline: must be equally many": lambda: paired_difference(
+    "statistics: 3 values and 2 values of the baseline: both must have the same": lambda: paired_difference(
         np.zeros(3), np.zeros(2)
     ),
     "interquartile_mean: tasks is empty; pass the results of at least one task": lambda: interquartile_mean([]),

@@ -89,7 +89,7 @@ RECIPES: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2, column 10: not valid YAML: expected ',' or ']'": lambda: recipe("name: mine", "name: [mine"),
     "mine.yaml: must be a mapping of keys to values": lambda: recipe(GOOD, "- ppo\n"),
     "recipe 'ppo': seed = -1: must be greater than or equal to 0": lambda: load_recipe("ppo").replace(seed=-1),
-    "recipe 'sac': ent_coef = automatic: must be auto, or a finite number of at least 0": lambda: load_recipe(
+    "recipe 'sac': ent_coef = automatic: must be 'auto' or a finite number of at least 0": lambda: load_recipe(
         "sac"
     ).replace(ent_coef="automatic"),
     "recipe 'sac': buffer_size = 63: must be at least n_envs = 128": lambda: load_recipe("sac").replace(buffer_size=63),

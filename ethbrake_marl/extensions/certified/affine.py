@@ -3,12 +3,13 @@
 A *box* contains all worlds whose K uncertain numbers lie in given intervals. An *affine form* represents a number that
 differs from world to world. It is an array [W], W = K + 2, for ``c + g_1 e_1 + ... + g_K e_K + r e``: a centre c, one
 slope g_k for each uncertain number, and a remainder r. ``e_k`` in [-1, 1] is the position of the world in the interval
-of uncertain number k; it is the same in all forms. ``e`` in [-1, 1] is arbitrary, and independent in each form. In a
-difference of two forms the common ``e_k`` cancel. Plain intervals do not have this advantage.
+of uncertain number k; it is the same in all forms. ``e`` in [-1, 1] is an unknown number of its own in each form. If
+two forms depend on the same ``e_k``, these parts cancel in their difference; a difference of two plain intervals would
+be wider.
 
-Every operation encloses the exact result: for each world of the box, some value of ``e`` makes the form equal to the
-exact result. The operations ignore floating-point rounding; instead, ``ROUNDING`` widens the results once in each
-piece.
+The result of every operation encloses the exact number: for each world of the box, some value of ``e`` makes the form
+equal to that number. The operations ignore floating-point rounding; instead, the speeds and distances are widened by
+``ROUNDING`` once in each piece.
 
 A *piece* is a time interval in which no command changes. Letters for shapes: ``N`` vehicles, ``P = N - 1`` pairs, ``J``
 pieces.
@@ -51,7 +52,7 @@ def high(x: Floats) -> float:
 
 @compiled(apart=True)
 def add(out: Floats, share: float, x: Floats) -> None:
-    """Add ``share * x`` to ``out`` in place. The result is exact except for rounding.
+    """Add ``share * x`` to ``out`` in place.
 
     ``x`` and ``out`` are affine forms [W] (centre, slopes, remainder); ``share`` is any number.
     """
@@ -132,7 +133,8 @@ def square_root(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses the square root of ``x`` where ``x >= 0``.
 
     ``high(x)`` must be at least 0. In worlds with negative ``x`` the result has no meaning. On an interval [a, b] the
-    root lies between its chord, with slope 1 / (sqrt a + sqrt b), and the tangent of the same slope.
+    square root lies between two parallel lines: its chord, with slope 1 / (sqrt(a) + sqrt(b)), and the tangent with
+    this slope.
     """
     least, most = math.sqrt(max(low(x), 0.0)), math.sqrt(high(x))
     if most <= 0.0:
@@ -147,8 +149,8 @@ def square_root(x: Floats) -> Floats:
 def reciprocal(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``1 / x``. ``low(x)`` must be above 0.
 
-    On an interval [a, b] the reciprocal lies between its chord, with slope -1 / (a b), and the tangent of the same
-    slope.
+    On an interval [a, b] the reciprocal lies between two parallel lines: its chord, with slope -1 / (a b), and the
+    tangent with this slope.
     """
     least, most = low(x), high(x)
     slope = -1.0 / (least * most)
@@ -161,7 +163,7 @@ def reciprocal(x: Floats) -> Floats:
 def positive_part(x: Floats) -> Floats:
     """Return an affine form [W] (centre, slopes, remainder) that encloses ``max(x, 0)``.
 
-    ``max(x, 0)`` lies between its chord and the parallel line through 0.
+    If ``x`` may have both signs, ``max(x, 0)`` lies between its chord and the parallel line through the origin.
     """
     least, most = low(x), high(x)
     if least >= 0.0:
@@ -175,11 +177,11 @@ def positive_part(x: Floats) -> Floats:
 
 @compiled(apart=True)
 def cut(x: Floats, least: float, most: float) -> Floats:
-    """Return an affine form [W] (centre, slopes, remainder) of ``x``, whose value is known to be from ``least`` to
-    ``most``.
+    """Return an affine form [W] (centre, slopes, remainder) for ``x``, whose values are known to be at least ``least``
+    and at most ``most``.
 
-    The result is an arbitrary number of the remaining interval if this interval is narrower than ``x``, else ``x``
-    itself.
+    If the limits make the interval of ``x`` less than half as wide, the result stands for any number in this smaller
+    interval. Otherwise the result is ``x`` itself.
     """
     inside_low, inside_high = max(low(x), least), min(high(x), most)
     if inside_high - inside_low < radius(x):
@@ -205,7 +207,7 @@ TOUCH_WIDTH = 9
 
 
 class Forces(NamedTuple):
-    """Accelerations of vehicles whose brakes or engine build up, as affine forms, for every vehicle and time interval.
+    """Accelerations while brakes or engines build up: affine forms for every vehicle and time interval.
 
     Index 0 of the second axis is the time from the alert to the first piece (time interval of constant command). Index
     j + 1 is piece j. Impacts do not change these accelerations, so they are the same for every sequence of impacts.
@@ -220,7 +222,8 @@ class Forces(NamedTuple):
 
 
 class Cell(NamedTuple):
-    """A box of worlds as affine forms [W], with the commands and the pieces (time intervals of constant command).
+    """A box of uncertain worlds as affine forms [W], and the commands in each piece (time interval of constant
+    command).
 
     An *affine form* represents a number that differs from world to world: a centre, a slope for each uncertain number
     of the box, and a remainder.
@@ -244,7 +247,7 @@ class Cell(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Worlds of a box (``Cell``) that had the same sequence of impacts and contacts so far, and their present state.
+    """Those worlds of a box (``Cell``) that had the same impacts and contacts so far, and their present state.
 
     An affine form [W] represents a number that differs from world to world: a centre, a slope for each uncertain number
     of the box, and a remainder.
@@ -263,7 +266,7 @@ class Path(NamedTuple):
 class Motion(NamedTuple):
     """Motion of each vehicle through one piece (time interval of constant command), as if it were alone on the road.
 
-    Every array [N, W] has an affine form for each vehicle: centre, a slope for each uncertain number of the box,
+    Each row of an array [N, W] is the affine form of one vehicle: centre, a slope for each uncertain number of the box,
     remainder.
     """
 
@@ -278,7 +281,7 @@ class Motion(NamedTuple):
 
 @compiled(apart=True)
 def new_motion(N: int, width: int) -> Motion:
-    """Return a ``Motion`` of zeros for ``N`` vehicles and affine forms of length ``width``."""
+    """Return a ``Motion`` with all values 0, for ``N`` vehicles and affine forms of length ``width``."""
     return Motion(
         np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)), np.zeros((N, width)),
         np.zeros(N, np.int64), np.zeros(N),
@@ -290,7 +293,7 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
     """Compute the motion of every vehicle through one piece under its command, as if it were alone on the road.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         piece: index of the piece, 0 to J - 1.
         motion: receives the result.
@@ -342,10 +345,12 @@ def move_alone(cell: Cell, path: Path, piece: int, motion: Motion) -> None:
 
 @compiled(apart=True)
 def hold(speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Widen the motion of vehicle ``i`` in place, because released brakes may still hold the vehicle at rest.
+    """Widen the motion of vehicle ``i`` in place, because brakes that release gradually may still hold the vehicle at
+    rest.
 
-    The vehicle may stand until its acceleration is above 0. Its speed is then larger by at most the size of the
-    negative speed that it would have reached, and its distance by at most this speed times the length of the piece.
+    The vehicle may stand until its acceleration is above 0. Let u be the size of the negative speed that the formulas
+    would give meanwhile. Then the speed of the vehicle is larger than computed by at most u, and its distance by at
+    most u times the length of the piece.
 
     Args:
         speed: speed at the start of the piece as an affine form [W], m/s.
@@ -374,13 +379,13 @@ def between_shifted(x: Floats, shift: float) -> Floats:
 
 @compiled(apart=True)
 def command(cell: Cell, i: int, piece: int, motion: Motion) -> None:
-    """Set ``motion.pull`` of vehicle ``i`` to the acceleration by its command in a piece; 0 before its latency has
+    """Set ``motion.pull`` of vehicle ``i`` in a piece: the acceleration that it commands, or 0 before its latency has
     elapsed.
 
     The function also sets ``motion.rest`` and ``motion.vague`` of the vehicle.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
         motion: receives the result.
@@ -409,7 +414,7 @@ def begin_later(cell: Cell, i: int, piece: int, motion: Motion) -> None:
     """Set the motion of vehicle ``i`` in a piece if its command may take effect only within the piece or after it.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
         motion: motion of each vehicle in the piece; ``onward``, ``reach``, ``pull`` and ``vague`` of vehicle ``i`` are
@@ -445,7 +450,7 @@ def since(cell: Cell, i: int, time: float) -> Floats:
 
 @compiled(apart=True)
 def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> None:
-    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and stays at rest.
+    """Set speed and distance of a braking vehicle that stops, or may stop, within a piece and then stays at rest.
 
     Args:
         moving: True if the command of any vehicle builds up.
@@ -471,7 +476,8 @@ def stop(moving: bool, speed: Floats, i: int, length: float, motion: Motion) -> 
 
 @compiled(apart=True)
 def deceleration(pull: Floats, vague: float) -> Floats:
-    """Return the mean deceleration over any part of a piece, as an affine form [W] (centre, slopes, remainder), m/s2.
+    """Return the mean deceleration of a vehicle over any part of a piece, as an affine form [W] (centre, slopes,
+    remainder), m/s2.
 
     Args:
         pull: mean acceleration in the piece (time interval of constant command) as an affine form [W], m/s2.

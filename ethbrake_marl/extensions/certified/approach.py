@@ -1,8 +1,8 @@
 """First contacts in a box of worlds: when, and at which closing speed, a pair of vehicles may come into contact.
 
-Each function looks at one piece (time interval of constant command). A *path* is a set of worlds (``affine.Path``).
-Statements about "the worlds" of a path hold for all worlds that really have its impacts. The affine forms of the path
-may also cover other worlds.
+Each function looks at one piece (time interval of constant command). A *path* is a set of worlds with the same impacts
+so far (``affine.Path``). The affine forms of a path may also cover worlds with other impacts; the results of the
+functions hold for the worlds that really have the impacts of the path.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ SLOWEST = 0.05  # below this mean closing speed (m/s) an impact is assumed possi
 
 
 class Approach(NamedTuple):
-    """How a pair may come into contact within one piece (time interval of constant command).
+    """Time and closing speed at which a pair may come into contact within one piece (time interval of constant
+    command).
 
     Every array [W] is an affine form: centre, slopes, remainder.
     """
@@ -56,14 +57,14 @@ class Approach(NamedTuple):
 
 @compiled(apart=True)
 def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
-    """Return how much bounces of neighbouring pairs may change the relative speed (m/s) or the gap (m) of pair ``p`` at
+    """Return by how much bounces of the neighbouring pairs may change the relative speed or the gap of pair ``p``, at
     most.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
-        of_gap: True for the gap, False for the relative speed.
+        of_gap: True: the result is for the gap, m. False: it is for the relative speed, m/s.
 
     """
     P, most = cell.gap.shape[0], 0.0
@@ -76,9 +77,8 @@ def noise(cell: Cell, path: Path, p: int, of_gap: bool) -> float:
 
 @compiled(apart=True)
 def pressing(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2.
-
-    Either vehicle may stop within the piece. ``motion`` is the motion of all vehicles in the piece (time interval of
+    """Return the smallest and the largest closing acceleration of pair ``p`` in a piece, m/s2. The function allows for
+    vehicles that stop within the piece. ``motion`` is the motion of all vehicles in the piece (time interval of
     constant command).
     """
     front_low, front_high = low(motion.pull[p]) - motion.vague[p], high(motion.pull[p]) + motion.vague[p]
@@ -95,7 +95,7 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
     """Return whether pair ``p`` may come into contact within this piece while its gap closes.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -123,14 +123,14 @@ def may_meet(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> b
 def approach(
     cell: Cell, path: Path, motion: Motion, p: int, length: float, front_stands: bool
 ) -> tuple[Approach, bool]:
-    """Return closing speed and time of a pair's contact in this piece, and whether such a contact is possible.
+    """Return closing speed and time of the contact of pair ``p`` in this piece, and whether such a contact is possible.
 
-    With closing speed w, closing acceleration b and gap g, the squared closing speed at contact is ``w^2 + 2 b g``.
-    With w' as the closing speed at contact, the time until contact is ``2 g / (w + w')``. If the front vehicle stops
-    first, its stopping distance is added to g.
+    Let w be the present closing speed, b the closing acceleration and g the gap. The closing speed at contact, w', then
+    has the square ``w^2 + 2 b g``, and the contact comes after the time ``2 g / (w + w')``. If the front vehicle stops
+    first, g includes its stopping distance.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.

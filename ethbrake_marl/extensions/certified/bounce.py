@@ -32,7 +32,7 @@ def spring_apart(
     """Set speed and distance, up to the end of the piece, of both vehicles of a pair that separates after an impact.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
@@ -63,10 +63,11 @@ def spring_apart(
 
 @compiled(apart=True)
 def stand_still(cell: Cell, pull: Floats, vague: float, left: float, speed: Floats, way: Floats) -> None:
-    """Let a braking vehicle stand from the time at which its speed would become negative.
+    """Correct speed and distance of a braking vehicle: it stands from the time at which its speed would become
+    negative.
 
     Args:
-        cell: the box of worlds.
+        cell: a box of uncertain worlds, as affine forms.
         pull: mean acceleration after the impact as an affine form [W] (centre, slopes, remainder), m/s2.
         vague: largest deviation of the acceleration from ``pull``, m/s2.
         left: longest time from the impact to the end of the piece (time interval of constant command), s.
@@ -96,7 +97,7 @@ def stay(
     Both vehicles get the speed of the pair's centre of mass.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.

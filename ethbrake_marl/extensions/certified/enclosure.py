@@ -1,8 +1,8 @@
-"""Compute an upper bound on the harm of a plan over a box of worlds, by branch and bound.
+"""Upper bound on the harm of a plan in all worlds of a box, by branch and bound.
 
-A *plan* has one action for each decision up to the horizon. The search halves the part of the box with the largest
-bound, again and again. Letters for shapes: ``Q`` numbers describe a world, ``K`` of them are uncertain, ``L`` is the
-length of a plan.
+A *plan* has one action for each decision up to the horizon. The search divides the box into parts: it repeatedly halves
+the part with the largest bound. Letters for shapes: a world consists of ``Q`` numbers, of which ``K`` are uncertain; a
+plan has ``L`` actions.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
     """Return one number of a box as an affine form [K + 2] (centre, slopes, remainder).
 
     Args:
-        low_: [Q] smallest value of each number of the box.
-        high_: [Q] largest value of each number of the box.
-        which: index of the number in the box.
-        free: [K] indices of the uncertain numbers; each has its own slope.
+        low_: [Q] smallest value that each number of a world has in the box.
+        high_: [Q] largest value that each number of a world has in the box.
+        which: index of the number among the Q numbers of a world.
+        free: [K] indices of the uncertain numbers; each of them has its own slope in the affine form.
 
     """
     out = np.zeros(free.shape[0] + 2)
@@ -87,17 +87,17 @@ def form_of(low_: Floats, high_: Floats, which: int, free: Ints) -> Floats:
 
 @compiled(apart=True)
 def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats) -> tuple[Cell, Floats]:
-    """Return the cell of a box, and the time from the alert to the first piece (s) as an affine form [W].
+    """Return the cell of a box, and the time (s) from the alert to the start of the first piece as an affine form [W].
 
     A *cell* is the box as affine forms, with the commands divided into pieces (time intervals of constant command).
-    Times count from the first decision. (If the shielded vehicle's latency is uncertain, the first decision falls at a
-    different time in each world.) The first piece starts before the first decision; the time between them is the
-    shortest time that any world needs from the alert to its first decision.
+    Times count from the first decision. (If the shielded vehicle's latency is uncertain, the time from the alert to the
+    first decision differs between worlds.) The first piece starts before the first decision, by the shortest time that
+    any world has from the alert to its first decision.
 
     Args:
-        low_: [Q] smallest value of each number of the box.
-        high_: [Q] largest value of each number of the box.
-        free: [K] indices of the uncertain numbers.
+        low_: [Q] smallest value that each number of a world has in the box.
+        high_: [Q] largest value that each number of a world has in the box.
+        free: [K] indices of those of a world's Q numbers that are uncertain.
         known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
 
@@ -149,7 +149,8 @@ def cell_of(low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats)
 
 @compiled(apart=True)
 def build_up(cell: Cell, i: int, late: Floats, rates: Floats) -> None:
-    """Compute ``cell.forces`` of vehicle ``i`` in place, for every piece and for the time before the first piece.
+    """Write the accelerations of vehicle ``i`` into ``cell.forces``, for every piece and for the time before the first
+    piece.
 
     The acceleration is 0 at the alert. A *piece* is a time interval of constant command.
 
@@ -204,22 +205,22 @@ def ramp(
 ) -> bool:  # fmt: skip
     """Move an acceleration towards its target for some time, and add its effect on speed and distance.
 
-    Let d be the difference to ``wanted`` at the start, e the difference at the end, and m the time in which the
-    acceleration changes. Compared with the acceleration ``wanted`` for the whole duration t, the speed changes by ``m
-    (d + e) / 2`` more, and the distance by ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` more. Returns True if the
-    acceleration has reached ``wanted`` at the end in every world.
+    Let d be the acceleration minus ``wanted`` at the start, e the same difference at the end, t the duration, and m the
+    time during which the acceleration changes. The changes of speed and distance are those of the constant acceleration
+    ``wanted``, plus ``m (d + e) / 2`` in speed and ``m t (d + e) / 2 - m^2 (d + 2 e) / 6`` in distance. Returns True if
+    in every world the acceleration equals ``wanted`` at the end.
 
     Args:
         force: acceleration at the start as an affine form [W] (centre, slopes, remainder), m/s2; becomes the
             acceleration at the end.
         wanted: acceleration of the command as an affine form [W], m/s2.
-        duration: time for which the command acts as an affine form [W], s.
+        duration: time for which the command acts, as an affine form [W], s.
         longest: upper limit of ``duration``, s.
         rates: [2, W] rates at which the brakes build up (index 0) and release (index 1), m/s3.
         rise: change of speed as an affine form [W], m/s; increased in place.
         gain: distance beyond initial speed times duration as an affine form [W], m; increased in place.
-        swing: [2] receives the largest deviation of the acceleration from its mean, m/s2: index 0 for a falling, index
-            1 for a rising acceleration.
+        swing: [2] receives the largest deviation of the acceleration from its mean, m/s2: at index 0 if the
+            acceleration falls, at index 1 if it rises.
 
     """
     start, there = difference(force, wanted), True
@@ -254,8 +255,8 @@ def wait(cell: Cell, late: Floats) -> bool:
     """Advance the speeds and gaps of a cell in place, from the alert to the first piece (time interval of constant
     command).
 
-    Returns False if something may disturb the motion in this time: a contact, a stop, the speed limit, or a command
-    that takes effect. ``late`` [W] is the time from the alert to the first piece, s.
+    Returns False if a contact, a stop, the speed limit or a command that takes effect may disturb the motion before the
+    first piece. ``late`` [W] is the time from the alert to the first piece, s.
     """
     if high(late) <= 1e-12:
         return True
@@ -287,10 +288,11 @@ def wait(cell: Cell, late: Floats) -> bool:
 
 @compiled(apart=True)
 def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
-    """Return the acceleration of vehicle ``i`` from the alert until ``late``, and whether this acceleration is certain.
+    """Return the acceleration of vehicle ``i`` from the alert until the time ``late``, and whether this acceleration is
+    certain.
 
     The acceleration is an affine form [W] (centre, slopes, remainder) in m/s2; it is 0 for the shielded vehicle. The
-    acceleration is uncertain if the vehicle's command may take effect within that time. ``cell`` is the box of worlds;
+    acceleration is uncertain if the vehicle's command may take effect before ``late``. ``cell`` is the box of worlds;
     ``late`` [W] is the time from the alert to the first piece (time interval of constant command), s.
     """
     pull = np.zeros_like(late)
@@ -309,15 +311,15 @@ def early_pull(cell: Cell, i: int, late: Floats) -> tuple[Floats, bool]:
 
 @compiled(apart=True)
 def pieces(known: Known, onset: Floats, earliest: float, plan: Floats) -> tuple[Floats, Floats]:
-    """Return the limits of the J pieces (time intervals of constant command), [J + 1], and the action in each piece,
-    [J].
+    """Return the times that separate the J pieces (time intervals of constant command), [J + 1], and the action in each
+    piece, [J].
 
-    The limits are in s after the first decision.
+    The times are in s after the first decision.
 
     Args:
         known: quantities that are the same in all worlds of the box.
         onset: [N, W] time after the first decision at which each vehicle's command takes effect, s.
-        earliest: earliest possible time of the first decision, s.
+        earliest: shortest time from the alert to the first decision in any world, s.
         plan: [L] action of the shielded vehicle at each decision.
 
     """
@@ -355,17 +357,17 @@ def bound_of(
 ) -> float:  # fmt: skip
     """Return an upper bound (m2/s2) on the harm of a plan over one box.
 
-    A result above ``most`` is not a bound: the harm may then be larger than the result.
+    A result above ``most`` is no bound: the search stopped, and the harm may be larger than the result.
 
     Args:
-        low_: [Q] smallest value of each number of the box.
-        high_: [Q] largest value of each number of the box.
-        free: [K] indices of the uncertain numbers.
+        low_: [Q] smallest value that each number of a world has in the box.
+        high_: [Q] largest value that each number of a world has in the box.
+        free: [K] indices of those of a world's Q numbers that are uncertain.
         known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
-        stack: working memory for the paths (sets of worlds with the same impacts).
+        stack: working memory for the paths (each a set of worlds with the same impacts).
         motion: working memory for the motion of each vehicle.
-        out: [K + 2] receives the affine form of the harm that reaches the bound.
+        out: [K + 2] receives the affine form of the largest harm, whose largest value is the bound.
         most: harm above which the search stops, m2/s2.
 
     """
@@ -391,20 +393,20 @@ def bound_of(
 def bound_box(
     low_: Floats, high_: Floats, free: Ints, known: Known, plan: Floats, enough: float, cells: int, only_enough: bool
 ) -> tuple[float, int]:
-    """Return an upper bound (m2/s2) on the harm of a plan over a box, and how many parts of the box were examined.
-
-    The part with the largest bound is halved until the bound is at most ``enough``, or ``cells`` parts were examined.
+    """Return an upper bound (m2/s2) on the harm of a plan over a box, and how many parts of the box were examined. The
+    function halves the part with the largest bound until the bound of the whole box is at most ``enough``, or ``cells``
+    parts were examined.
 
     Args:
-        low_: [Q] smallest value of each number of the box.
-        high_: [Q] largest value of each number of the box.
-        free: [K] indices of the uncertain numbers.
+        low_: [Q] smallest value that each number of a world has in the box.
+        high_: [Q] largest value that each number of a world has in the box.
+        free: [K] indices of those of a world's Q numbers that are uncertain.
         known: quantities that are the same in all worlds of the box.
         plan: [L] action of the shielded vehicle at each decision.
         enough: bound that is small enough to stop, m2/s2.
         cells: largest number of parts to examine.
-        only_enough: True: stop in a part as soon as its harm is above ``enough``; a result above ``enough`` is then not
-            a bound.
+        only_enough: True: stop examining a part as soon as its harm is above ``enough``; a result above ``enough`` is
+            then no bound.
 
     """
     N, K, Q = known.limit.shape[0], free.shape[0], low_.shape[0]
@@ -448,8 +450,8 @@ SCRIPTS = ("full_brake", "coast", "constant")
 
 
 class Boxes(NamedTuple):
-    """Boxes of ``n`` worlds: each number of a world lies between ``low`` and ``high``. A world has ``Q = 8 N - 1``
-    numbers.
+    """Boxes around ``n`` reported worlds: in a box each of a world's ``Q = 8 N - 1`` numbers lies between ``low`` and
+    ``high``.
     """
 
     # [n, Q] smallest values: braking and driving capacity, latency, mass, brake rate, release rate and speed of each
@@ -472,9 +474,9 @@ class Boxes(NamedTuple):
         than full braking, coasting or one constant deceleration.
 
         Args:
-            robust: ``corners`` (never raises) or ``interior``.
+            robust: worlds to certify: ``corners`` (with which the function never raises) or ``interior``.
             scenario: the scenario of the worlds.
-            harm_count: ``first`` or ``total``.
+            harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
             others: script of each other vehicle, by its index.
 
         """
@@ -501,13 +503,13 @@ class Boxes(NamedTuple):
     ) -> Boxes:
         """Return the boxes of ``n`` worlds at the alert.
 
-        Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a braking profile in
-        pieces, brakes that began to build up before the alert, or another vehicle whose command differs within the box.
-        ``check_possible`` checks the settings that do not depend on the worlds.
+        Raises ``InvalidInput`` for worlds that interior mode cannot certify: an obstacle ahead, a vehicle whose command
+        changes over time (profile), brakes that began to build up before the alert, or another vehicle whose command is
+        not the same in all worlds of the box. ``check_possible`` checks the settings that do not depend on the worlds.
 
         Args:
-            possible: [n * M] worlds, M consecutive ones for each box: the reported world and the corners of its box.
-            problem: the same worlds as columns of numbers, with the commands of the other vehicles.
+            possible: [n * M] worlds, M in a row for each box: the reported world, then the corners of its box.
+            problem: the same worlds as a table with one row for each world, with the commands of the other vehicles.
             n: number of boxes.
             scenario: the scenario of the worlds.
             others: script of each other vehicle, by its index.
@@ -549,12 +551,11 @@ class Boxes(NamedTuple):
         return self._replace(**arrays)
 
     def placed(self, old: Boxes | None, rows: Ints) -> Boxes:
-        """Return the boxes of all running episodes after new episodes begin in ``rows``.
+        """Return the boxes of all running episodes, with the new boxes (``self``) at the indices ``rows``.
 
         Args:
-            old: boxes of all episodes before; None at the first start.
-            rows: [m] indices of the new episodes, whose boxes this object contains. If all episodes are new, ``old`` is
-                not used.
+            old: boxes of all episodes before the new ones begin; None: no episode has begun yet.
+            rows: [m] indices of the new episodes. If all episodes are new, ``old`` is not used.
 
         """
         if old is None or len(rows) >= len(old.low):
@@ -569,7 +570,8 @@ class Boxes(NamedTuple):
 
         Args:
             plans: [n, L] action of the shielded vehicle at each decision, for each world.
-            harm: [n] largest harm of the plan in any corner of the box, m2/s2; the search stops at a bound close to it.
+            harm: [n] largest harm of the plan in any corner of the box, m2/s2; the search stops when its bound is close
+                to this harm.
 
         """
         return self.bound(np.arange(len(plans)), plans, NEAR * harm + NEARLY_NOTHING, CELLS_AT_ALERT)
@@ -577,17 +579,15 @@ class Boxes(NamedTuple):
     def bound(
         self, rows: Ints, plans: Floats, enough: Floats, cells: int = CELLS, *, only_enough: bool = False
     ) -> Floats:
-        """Return an upper bound on the harm of each plan over all worlds of its box, [m] m2/s2.
-
-        The harm counts from the alert on.
+        """Return an upper bound on the harm since the alert, for each plan over all worlds of its box, [m] m2/s2.
 
         Args:
             rows: [m] indices of the boxes.
             plans: [m, L] action of the shielded vehicle at each decision, for each box.
             enough: [m] bound that is small enough to stop, m2/s2.
             cells: largest number of parts of a box to examine.
-            only_enough: True: a result above ``enough`` is not a bound, because the search stops as soon as the harm
-                may exceed ``enough``.
+            only_enough: True: the search stops as soon as the harm may exceed ``enough``; a result above ``enough`` is
+                then no bound.
 
         """
         bounds = np.empty(len(rows))

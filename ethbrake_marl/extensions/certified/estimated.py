@@ -1,16 +1,16 @@
-"""The estimated world of one vehicle: its received information, completed by the scenario's ranges.
+"""The estimated world of one vehicle: the information that the vehicle received, completed from the scenario's ranges.
 
-A vehicle is *known* if its message has arrived or it is in sight. The estimate combines the following information:
+A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
 
-* From a known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The
-  vehicle's script extrapolates this state to the present. The extrapolation starts at the time of the state if a
-  command was in force then, otherwise at the time at which the vehicle is expected to react.
-* For a vehicle that is not known: the scenario. Each quantity is the median of its distribution, or a chosen value of
-  its range. The vehicle's script starts at the alert.
-* For a known vehicle whose messages lack a piece (``v2x: tells``): the scenario, for this piece only. Place and speed
-  are used only together. A command in force is used only together with place and speed. A received intent is not used,
-  because the scripts already predict what the vehicle does.
-* From the vehicle itself: measurements of its own state, its distance since the alert, and its impacts with known
+* From a known vehicle: its capacities, mass and own latency, and the newest state that was received from it. The state
+is extrapolated to the present: the vehicle follows its script from the time of the state on if a command was in force
+then, otherwise it coasts until the time at which it is expected to react. * For a vehicle that is not known: the
+scenario. Each quantity is the median of its distribution, or a chosen value of
+  its range. The vehicle is assumed to follow its script from the alert on.
+* For a known vehicle whose messages lack some quantity (``v2x: tells``): the scenario, for this quantity only. A
+received place is used only together with the speed, and a received command only together with both. A received intent
+(announced command) is not used, because the script already predicts what the vehicle does. * From the vehicle itself:
+measurements of its own state, its distance since the alert, and its impacts with known
   neighbours.
 
 The estimate reads nothing else of the true world, so information that was not received cannot change it.
@@ -48,9 +48,10 @@ OF_OTHERS = (
 
 
 class Told(NamedTuple):
-    """Information that one vehicle has received about the others by now.
+    """Information that one vehicle has received about the other vehicles up to the present time.
 
-    A vehicle is *known* if its message has arrived or it is in sight. Columns of unknown vehicles have no meaning.
+    A vehicle is *known* if its message has arrived or it is in sight. Values in the columns of unknown vehicles have no
+    meaning.
     """
 
     known: Bools  # [n, N] True for vehicles with known place and speed, and for the vehicle itself
@@ -65,7 +66,7 @@ class Told(NamedTuple):
 
     @property
     def reacts(self) -> Bools:
-        """Vehicles that are known to have a command in force: boolean mask, [n, N]."""
+        """Boolean mask [n, N]: True for a vehicle that is known to have a command in force."""
         reacts: Bools = self.known & self.pieces[..., ACCELERATION] & (self.command_mps2 != 0.0)
         return reacts
 
@@ -73,8 +74,7 @@ class Told(NamedTuple):
     def heard(self) -> Floats:
         """Amount of information about each vehicle, [n, N].
 
-        0: nothing is known. 1: some pieces of information, but not both place and speed. 2: place and speed are known
-        as well.
+        0: nothing is known. 1: something is known, but not both place and speed. 2: place and speed are known.
         """
         return self.pieces.any(axis=2).astype(np.float64) + self.known
 
@@ -107,7 +107,8 @@ class Told(NamedTuple):
         return received
 
     def _hear_messages(self, worlds: Worlds, vehicle: int, periodic: Bools) -> None:
-        """Replace the present state of other vehicles in place by their newest message, except for vehicles in sight.
+        """Overwrite the present states of other vehicles with the states in their newest messages, except for vehicles
+        in sight.
 
         ``periodic`` [n] is True for worlds in which vehicles send messages periodically.
         """
@@ -125,9 +126,11 @@ class Told(NamedTuple):
 
 
 def _places_of(worlds: Worlds, vehicle: int) -> Floats:
-    """Return the position of each vehicle relative to ``vehicle``, [n, N] m, from the gaps of ``worlds``.
+    """Compute from the gaps of ``worlds`` the position of each vehicle relative to the vehicle with index ``vehicle``,
+    [n, N] m.
 
-    Positions ahead are positive, positions behind negative. Direct neighbours are exactly one gap away.
+    Positions ahead are positive, positions behind negative. The position of a direct neighbour is exactly plus or minus
+    the gap.
     """
     ahead = np.concatenate([np.zeros((worlds.n, 1)), -np.cumsum(worlds.gaps_m, axis=1)], axis=1)
     place: Floats = ahead - ahead[:, [vehicle]]
@@ -139,12 +142,12 @@ def _places_of(worlds: Worlds, vehicle: int) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Ranges:
-    """Ranges that a scenario declares for the vehicles that ``vehicle`` does not know.
+    """Ranges that a scenario declares for quantities of the vehicles that the estimating vehicle does not know.
 
     Keys of the mappings: ``place`` (position relative to the estimating vehicle at the alert, m), ``speeds_mps``,
     ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the alert message, s) and
-    ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a channel). Each value has
-    the shape [N].
+    ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a channel). Each mapping has
+    an array [N] for each key.
     """
 
     vehicle: int  # index of the estimating vehicle
@@ -159,8 +162,8 @@ class Ranges:
         """Return the ranges that ``scenario`` declares for all vehicles, for the estimates of the vehicle with index
         ``vehicle``.
 
-        ``others`` are the scripts of the other vehicles by index; None: the scenario's scripts. Raises ``InvalidInput``
-        for a mixture of scenarios, because an unknown vehicle could belong to any of them.
+        ``others`` are the scripts of the other vehicles by index; None: the scripts of the scenario. Raises
+        ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle could belong to any of them.
         """
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
@@ -192,11 +195,12 @@ class Ranges:
         return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
 
     def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return a value of one quantity for every vehicle, [N]: the median, or the selected value of the range.
+        """Return one quantity of every vehicle, [N]: the median of its range, or the value at a selected position in
+        the range.
 
         Args:
-            share: position in the range for each selected (quantity, vehicle index): 0 is the smallest value, 1 the
-                largest. None: the median of every vehicle.
+            share: position in the range for some pairs (quantity, vehicle index): 0 is the smallest value, 1 the
+                largest. Other vehicles get the median. None: all vehicles get the median.
             key: the quantity, a key of ``middle``.
 
         """
@@ -210,7 +214,7 @@ class Ranges:
     def uncertain(self) -> tuple[tuple[str, int], ...]:
         """Uncertain numbers of the other vehicles, as pairs (quantity, vehicle index).
 
-        A number is uncertain if the scenario declares a range for it, not one value.
+        A number is uncertain if the scenario declares a range for it instead of one value.
         """
         others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
         return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
@@ -227,10 +231,10 @@ class Ranges:
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             way_m: [n] the vehicle's own distance since the alert, m.
-            share: position in the range for each selected (quantity, vehicle index), 0 to 1; None: the median of every
-                quantity.
-            foretold: worlds as predicted for the present time, including impacts, and a mask [n, N] of the vehicles
-                whose predicted state replaces their last message. None: no prediction.
+            share: position in the range, 0 to 1, for some pairs (quantity, vehicle index); all other quantities get
+                their median. None: the median of every quantity.
+            foretold: the predicted present worlds, including impacts, and a mask [n, N]: True for a vehicle whose
+                predicted state replaces the state in its last message. None: no prediction.
 
         """
         worlds.refuse_build_up(":estimated")
@@ -289,7 +293,8 @@ class Ranges:
 
 
 def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
-    """Return the position of each vehicle relative to ``vehicle``, [N] m. Positions behind it are negative.
+    """Return the position of each vehicle relative to ``vehicle``, [N] m. Positions ahead are positive, positions
+    behind negative.
 
     Args:
         ahead_m: [P] gaps for the pairs in front of the vehicle, m.
@@ -302,7 +307,7 @@ def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
 
 
 def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
-    """Correct positions so that the vehicles are in the order of the line, and return them, [n, N] m.
+    """Correct estimated positions so that no vehicle is ahead of its predecessor, and return the positions, [n, N] m.
 
     Args:
         place: [n, N] position of each vehicle relative to ``vehicle``, m; changed in place.

@@ -1,10 +1,11 @@
-"""Shields in the estimated world: they read only the information that their vehicle received.
+"""Shields that decide in the estimated world: they use only the information that their vehicle received.
 
-``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world with the
-median of every unknown quantity. This mode promises nothing about the true world. Mode ``robust`` also certifies in
-every corner of the unknown quantities' ranges. If the true world is one of these corners, its harm up to the horizon is
-at most the first bound. The bound holds because later messages only remove corners that contradict them, and a new plan
-must be better than the present plan in the remaining corners.
+``estimated`` explains the *estimated world*. Mode ``step`` certifies every action in the estimated world in which every
+unknown quantity has its median. This mode promises nothing about the true world. Mode ``robust`` also certifies every
+action in the corners: the estimated worlds in which every unknown quantity has its smallest or largest value. If the
+true world is one of these corners, its harm up to the horizon is at most the bound at the first decision. Reason: later
+messages only remove corners that contradict them, and a new plan replaces the present plan only if it is better in the
+remaining corners.
 """
 
 from __future__ import annotations
@@ -41,10 +42,11 @@ SURPRISE = 1e-6  # largest difference (m, m/s) between a measurement and its pre
 
 
 def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
-    """Restore the harm so far after a restart of the shield in ``rows``, and keep the old plan where it is at least as
+    """After a restart of the shield in ``rows``: restore the harm so far, and keep the old plan where it is at least as
     good.
 
-    ``shield`` has just been restarted; it is changed in place. ``before`` is its copy from before the restart.
+    ``shield`` has just been restarted; it is changed in place. ``before`` is a copy of the shield from before the
+    restart.
     """
     (running, backup), (old, held) = shield.memory[:2], before.memory[:2]
     assert running is not None and old is not None
@@ -65,19 +67,19 @@ def _hold_better(shield: StepShield, rows: Ints, before: StepShield) -> None:
 class EstimatedShield:
     """``StepShield`` that certifies the proposed actions of one vehicle in its estimated world.
 
-    The shield starts at the first decision. The shield starts again whenever another vehicle becomes known, is known to
-    react, or moves otherwise than predicted. At a restart, the rest of the previous plan is a candidate for the new
-    plan. After the first decision ``predicted_harm`` [n] is the first bound. ``predicted_harm`` is infinite if the
-    vehicle had an impact before, because the harm of that impact is unknown.
+    The shield starts at the first decision. It restarts when the vehicle learns of a further vehicle, learns that
+    another vehicle reacts, or sees a vehicle move otherwise than predicted. At a restart, the rest of the previous plan
+    is a candidate for the new plan. From the first decision on, ``predicted_harm`` [n] is the bound of that decision.
+    It is infinite if the vehicle had an impact before the first decision, because the harm of that impact is unknown.
 
     Args:
         scenario: the scenario of the worlds; a mixture raises ``InvalidInput``.
         vehicle: index of the shielded vehicle.
-        harm_count: ``first`` or ``total`` impacts.
-        robust: worlds to certify. None: the median of every unknown quantity. ``corners``: also all corners of the
-            ranges; more than ``MOST_CORNERS`` raise ``InvalidInput``. ``interior``: all worlds of the box around the
-            corners, once, at the first decision.
-        others: scripts of the other vehicles by index; None: the scenario's scripts.
+        harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
+        robust: worlds in which actions are certified. None: the world with the median of every unknown quantity.
+            ``corners``: also all corners of the ranges; more than ``MOST_CORNERS`` corners raise ``InvalidInput``.
+            ``interior``: all worlds of the box between the corners, certified only once, at the first decision.
+        others: scripts of the other vehicles by index; None: the scripts of the scenario.
 
     """
 
@@ -120,11 +122,11 @@ class EstimatedShield:
 
     @property
     def members(self) -> int:
-        """Number of worlds that are certified for each true world: 1 for the median, plus the number of corners."""
+        """Number of possible worlds that are certified for each true world: the median world and all corners."""
         return 1 + len(self._corners())
 
     def __copy__(self) -> EstimatedShield:
-        """Return an independent copy. Decisions of the copy do not change this shield."""
+        """Return an independent copy. Decisions of the copy do not change the original shield."""
         apart = object.__new__(EstimatedShield)
         apart.__dict__.update(self.__dict__)
         apart.shield = copy.copy(self.shield)
@@ -169,9 +171,9 @@ class EstimatedShield:
         Args:
             worlds: the true worlds; only the information that the vehicle received is read.
             proposed: [n] proposed actions.
-            proposer: the policy and its memory. If no other plan certifies a proposal, the policy's rollout in the
-                estimated worlds is tried. None: no rollout.
-            only: [n] True for worlds that decide now; None: all.
+            proposer: the policy and its memory. If no other plan certifies a proposal, the shield also tries the
+                policy's rollout in the estimated worlds. None: it tries no rollout.
+            only: [n] True for worlds in which the vehicle decides now; None: all worlds.
 
         """
         shield, vehicle = self.shield, self.vehicle
@@ -195,13 +197,14 @@ class EstimatedShield:
         return self._wanted.copy()
 
     def _begin_anew(self, worlds: Worlds, estimated: Worlds, way_m: Floats, due: Bools) -> None:
-        """Restart the inner shield in worlds where it has not started, or where a message contradicts the prediction.
+        """Start the inner shield in worlds where it has not started, and restart it where new information requires
+        this.
 
         Args:
             worlds: the true worlds.
             estimated: the estimated worlds.
             way_m: [n] the vehicle's distance since the alert, m.
-            due: [n] True for worlds that decide now.
+            due: [n] True for worlds that have a decision now.
 
         """
         shield, vehicle = self.shield, self.vehicle
@@ -239,7 +242,7 @@ class EstimatedShield:
         Args:
             worlds: the true worlds of these rows.
             estimated: the estimated worlds of these rows.
-            way_m: the vehicle's distance since the alert in each of these rows, m.
+            way_m: [rows] distance of the vehicle since the alert, m.
             rows: indices of the episodes in the batch.
             keeps: mask of the vehicles, [rows, N], whose predicted state is better than their received state.
             before: the inner shield before the restart; None at the first start.
@@ -260,7 +263,7 @@ class EstimatedShield:
     def _keeps(self, received: Told, time_s: Floats) -> Bools:
         """Return a mask [n, N] of the vehicles whose predicted state is better than their received state.
 
-        These vehicles are unknown, or have sent no message since their last predicted impact or contact. ``received``
+        Such a vehicle is unknown, or its last message is older than its last predicted impact or contact. ``received``
         is the received information, ``time_s`` [n] the present time.
         """
         running = self.shield.memory.running
@@ -278,7 +281,8 @@ class EstimatedShield:
         return keeps
 
     def _note_impacts(self, worlds: Worlds) -> None:
-        """Store the present time for vehicles that had an impact in any certified world since the last decision.
+        """Store the present time as the time of impact of vehicles that had an impact in any certified world since the
+        last decision.
 
         ``worlds`` are the true worlds now.
         """

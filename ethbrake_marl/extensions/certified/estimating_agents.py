@@ -1,4 +1,4 @@
-"""Agents that decide in the estimated world: on received information, completed by the scenario's ranges."""
+"""Agents that decide in the estimated world: received information, completed from the scenario's ranges."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
 
 class Odometer(NamedTuple):
-    """Distance of a vehicle since the alert, computed from its own speed and command at its decisions."""
+    """Distance that a vehicle has travelled since the alert, computed from its own speed and command at each decision."""
 
     way_m: Floats  # [n] distance since the alert, m
     time_s: Floats  # [n] time of the last decision, s
@@ -33,10 +33,9 @@ class Odometer(NamedTuple):
         return cls(np.zeros(alert.n), alert.time_s.copy(), alert.speeds_mps[:, vehicle].copy())
 
     def look(self, worlds: Worlds, vehicle: int) -> Odometer:
-        """Return the odometer for the present time; ``worlds`` [n] are the present worlds.
-
-        The added distance is exact under a constant command, even if the vehicle stops. Otherwise the added distance is
-        the mean speed times the time since the last decision.
+        """Return the odometer for the present time; ``worlds`` [n] are the present worlds. The method adds the distance
+        since the last decision: mean speed times time, or the stopping distance if a braking vehicle stopped. This is
+        exact if the command was constant.
         """
         speed, command, before = worlds.speeds_mps[:, vehicle], worlds.command_mps2[:, vehicle], self.speed_mps
         way = 0.5 * (before + speed) * (worlds.time_s - self.time_s)
@@ -48,10 +47,10 @@ class Odometer(NamedTuple):
 class Estimating(AgentAround):
     """Agent that lets another agent, ``policy``, control its vehicle in the estimated world.
 
-    The policy starts at its first decision, with the information received by then. The policy starts again in worlds
-    where another vehicle becomes known, or where a message over a channel says that a vehicle reacts. The estimate
-    assumes that the other vehicles follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the policy
-    expected at its first decision.
+    The policy starts at its first decision, with the information received by then. The policy restarts in a world when
+    the vehicle learns of a further vehicle, or when a message over a channel says that another vehicle reacts. The
+    estimate assumes that the other vehicles follow the scenario's scripts. ``predicted_harm`` [n] is the harm that the
+    policy expected at its first decision.
 
     Args:
         policy: any agent that reads the state of the line.
@@ -120,8 +119,8 @@ class Estimating(AgentAround):
         """Return a summary of what ``vehicle`` has received about each vehicle, [n, 2 N].
 
         The first N columns are the amount of information (``Told.heard``). The other N columns are 1 if a message says
-        that the vehicle reacts, and this was not predicted. The policy starts again where the summary changes.
-        ``worlds`` are the true worlds now.
+        that the vehicle reacts and the reaction was not predicted. The policy restarts in worlds where this summary
+        changes. ``worlds`` are the true worlds now.
         """
         known = Told.to(worlds, vehicle)
         # a received latency predicts the reaction, unless a channel may delay the reaction
@@ -135,7 +134,7 @@ class Estimating(AgentAround):
 
 
 class EstimatingHybrid(Estimating):
-    """The paper's Algorithm 1 in the estimated world: a choice between the policy and E-V2X-BM at the first decision.
+    """The paper's Algorithm 1 in the estimated world: it chooses between the policy and E-V2X-BM at the first decision.
 
     E-V2X-BM is the best constant deceleration. Whichever of the two predicts less harm controls the vehicle for the
     whole episode.
@@ -145,11 +144,13 @@ class EstimatingHybrid(Estimating):
 
     @property
     def knows(self) -> Knowledge:
-        """Information that the agent uses: the policy's information, and the estimated world for the comparison."""
+        """Information that the agent uses: the information that the policy uses, and the estimated world, in which the
+        agent compares the policy with E-V2X-BM.
+        """
         return Knowledge.of(self.policy.policy, also=Source.ESTIMATES)
 
     def _shown_at_first(self, estimated: Worlds) -> Worlds:
-        """Return the estimated worlds with their clock at 0 and without past impacts.
+        """Return the estimated worlds with the present time set to 0 and past impacts removed.
 
         The rollouts that compare the policy with E-V2X-BM start in these worlds.
         """

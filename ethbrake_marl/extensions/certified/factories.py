@@ -18,13 +18,13 @@ from ethbrake_marl.shields.factories import shield_episodes
 def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
     """Make the shield ``+robust`` or ``+robust:interior`` around ``policy``.
 
-    The shield certifies actions against an uncertainty, which is an interval around each uncertain quantity: in the
-    corners of the box of intervals, or in its whole interior.
+    The uncertainty is an interval around each uncertain quantity; together the intervals form a box of possible worlds.
+    The shield certifies actions for the corners of this box, or for its whole interior.
 
     Args:
         policy: the agent to shield.
         argument: ``corners``, ``interior``, or None for ``corners``.
-        settings: scenario, uncertainty, harm count, and the agent's spec for error messages.
+        settings: scenario, uncertainty and harm count; the agent's spec appears in error messages.
 
     """
     where = f"agent {settings.spec!r}"
@@ -38,12 +38,13 @@ def shield_robustly(policy: Agent, argument: str | None, settings: AgentSettings
 def shield_robustly_as_estimated(policy: Agent, argument: str | None, settings: AgentSettings) -> Driver:
     """Make the shield ``+robust:estimated`` or ``+robust:interior:estimated``.
 
-    The shield certifies actions against the ranges of the quantities that the vehicle did not receive.
+    The shield certifies actions in the estimated world and in the ranges of the quantities that its vehicle did not
+    receive.
 
     Args:
         policy: the agent to shield.
         argument: ``corners``, ``interior``, or None for ``corners``.
-        settings: scenario, harm count, and the agent's spec for error messages.
+        settings: scenario and harm count; the agent's spec appears in error messages.
 
     """
     where = f"agent {settings.spec!r}"
@@ -61,7 +62,7 @@ def shield_steps_as_estimated(policy: Driver, argument: str | None, settings: Ag
     Args:
         policy: the agent to shield.
         argument: not used.
-        settings: scenario, harm count, and the agent's spec for error messages.
+        settings: scenario and harm count; the agent's spec appears in error messages.
 
     """
     scenario = settings.needed_scenario()
@@ -77,14 +78,14 @@ def shield_episodes_as_estimated(policy: Agent, argument: str | None, settings: 
     """Make the shield ``+episode:estimated`` or ``+episode:pairwise:estimated``: the paper's Algorithm 1 on estimates.
 
     At the first decision the shield predicts, in the estimated world, the harm of ``policy`` and of E-V2X-BM (the best
-    constant deceleration). The one with less harm controls the whole episode.
+    constant deceleration). Whichever of the two has less predicted harm controls the whole episode.
 
     Raises ``InvalidInput`` for an agent that already decides on received information.
 
     Args:
         policy: the agent to compare with E-V2X-BM.
         argument: ``pairwise`` or None.
-        settings: scenario, and the agent's spec for error messages.
+        settings: scenario; the agent's spec appears in error messages.
 
     """
     hybrid = shield_episodes(policy, argument, settings)

@@ -25,10 +25,11 @@ class RobustMode(IntEnum):
 
 
 class RobustGuard(StepGuard):
-    """Guard of mode ``robust``: a ``RobustShield`` decides on the actions in each step of a running engine."""
+    """Guard of mode ``robust``: in each step of the engine, a ``RobustShield`` decides which actions are applied."""
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step as a mapping. ``members`` is the number of certified worlds for each world.
+        """Return the infos of a step as a mapping. ``members`` is the number of possible worlds that are certified for
+        each true world.
 
         Args:
             memory: shield and policies after the step.
@@ -39,10 +40,11 @@ class RobustGuard(StepGuard):
 
 
 class EstimatedGuard(ShieldGuard):
-    """Guard of modes ``step`` and ``robust`` in the estimated world: an ``EstimatedShield`` decides on the actions.
+    """Guard of modes ``step`` and ``robust`` in the estimated world: an ``EstimatedShield`` decides which actions are
+    applied.
 
     Its bound on harm exists from the first decision on and holds in the estimated world. The guard does not compare the
-    motion with the prediction, because an estimate may be wrong although nothing is broken.
+    true motion with the prediction: estimates may be wrong, so a difference is no error.
     """
 
     def _started(self, shield: EstimatedShield, alert: Worlds, rows: Ints) -> EstimatedShield:
@@ -69,8 +71,8 @@ class EstimatedGuard(ShieldGuard):
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
         """Return the infos of a step that is certified in the estimated worlds, as a mapping.
 
-        ``trusted`` is true in mode ``robust``, whose bound also says something about the true world. ``memory`` has the
-        shield after the step; ``ruling`` is its decision (None at the reset).
+        ``trusted`` is true in mode ``robust``, because only there the bound may also hold in the true world. ``memory``
+        has the shield after the step; ``ruling`` is its decision (None at the reset).
         """
         estimated: EstimatedShield = memory.shield
         robust, shield = estimated.robust is not None, estimated.shield

@@ -1,4 +1,4 @@
-"""Checked settings of ``robust`` and ``estimated`` shields; they also make the shields and guards."""
+"""Checked settings of ``robust`` and ``estimated`` shields; the settings object also makes the shield and its guard."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from ethbrake_marl.shields.options import ShieldOptions, check_mode, misplaced, 
 
 @dataclass(frozen=True)
 class RobustOptions(ShieldOptions):
-    """``eb.ShieldOptions`` with settings for incomplete knowledge.
+    """``eb.ShieldOptions`` with further settings for incomplete knowledge.
 
     Args:
-        mode: a mode of ``eb.ShieldOptions``, or ``robust``, which is ``step`` for uncertain worlds. None: ``robust`` if
-            there is an uncertainty, else ``step``.
+        mode: a mode of ``eb.ShieldOptions``, or ``robust``: mode ``step`` extended to uncertain worlds. None:
+            ``robust`` if there is an uncertainty, else ``step``.
         uncertainty: uncertainty for mode ``robust``, such as ``"gaps_m=0.5"``.
         robust: worlds that mode ``robust`` certifies: the ``corners`` of the uncertainty (fast) or its whole
             ``interior``.
@@ -68,7 +68,7 @@ class RobustOptions(ShieldOptions):
 
     @property
     def written(self) -> str:
-        """Text of the mode in an agent spec, after the ``+``.
+        """The part of an agent spec after the ``+`` that asks for this shield.
 
         For instance ``robust:interior:estimated`` in ``ppo+robust:interior:estimated``.
         """
@@ -86,7 +86,7 @@ class RobustOptions(ShieldOptions):
         """Return a new shield for ``vehicle``, before any episode.
 
         ``vehicle`` is an index, or several indices for modes that shield several vehicles. ``others`` are the scripts
-        of the other vehicles by index; None: the scenario's scripts.
+        of the other vehicles by index; None: the scripts of the scenario.
         """
         if self.estimated:
             assert isinstance(vehicle, int)
@@ -102,7 +102,7 @@ class RobustOptions(ShieldOptions):
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
         """Raise ``InvalidInput`` if a shield with these settings refuses the scenario.
 
-        ``several`` is True for one shield of all learners together.
+        ``several`` is True if one shield decides for all learners together.
         """
         one = one_learner(scenario)
         if self.estimated:  # the scenario's scripts are used only if the scenario has exactly one learner
@@ -116,7 +116,7 @@ class RobustOptions(ShieldOptions):
         Args:
             engine: the engine whose learners are shielded.
             policies: agents that propose the actions, by vehicle index.
-            several: True: one shield for several learners.
+            several: True: one shield decides for all learners together.
             how: further keyword arguments of ``StepGuard``.
 
         """
@@ -138,9 +138,8 @@ class RobustOptions(ShieldOptions):
 
 
 def checked_uncertainty(given: object) -> Uncertainty | None:
-    """Return ``given`` as an ``Uncertainty``, or None if it is None. A text such as ``"gaps_m=0.5"`` is parsed.
-
-    Raises ``InvalidInput`` for anything else.
+    """Return ``given`` as an ``Uncertainty``, or None if ``given`` is None. A text such as ``"gaps_m=0.5"`` is parsed.
+    Raises ``InvalidInput`` if ``given`` is anything else.
     """
     if given is None or isinstance(given, Uncertainty):
         return given
@@ -154,8 +153,8 @@ def checked_uncertainty(given: object) -> Uncertainty | None:
 def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None:
     """Return the checked uncertainty for a shield mode, or None if there is none.
 
-    Raises ``InvalidInput`` if mode ``robust`` has no uncertainty, or another mode has one; ``where`` begins the
-    message. ``given`` is an ``Uncertainty``, its text, or None.
+    Raises ``InvalidInput`` if mode ``robust`` has no uncertainty, or another mode has one; ``where`` is the beginning
+    of the error message. ``given`` is an ``Uncertainty``, its text, or None.
     """
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):

@@ -1,4 +1,4 @@
-"""Simulate the paths of a box of worlds: a new path branches off wherever a pair may have an impact.
+"""Simulate all worlds of a box along paths: where a pair has an impact in some worlds only, a new path branches off.
 
 A *path* is a set of worlds with the same sequence of impacts (``affine.Path``). A *cell* is a box with its commands.
 """
@@ -63,7 +63,7 @@ STACK = 256  # largest number of waiting paths
 
 
 class Stack(NamedTuple):
-    """Stack of paths that are not simulated yet. A *path* is a set of worlds with the same impacts so far."""
+    """Stack of paths that still have to be simulated. A *path* is a set of worlds with the same impacts so far."""
 
     forms: Floats  # [STACK, N + P + 1, W] ``Path.forms`` of each path
     touch: Floats  # [STACK, P, TOUCH_WIDTH] ``Path.touch`` of each path
@@ -97,16 +97,15 @@ def keep_worst(harm: Floats, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
-    """Record the rough bound on the harm of a path that is not simulated any further, and return the largest recorded
-    harm.
+    """Record a rough bound on the harm of a path that is no longer simulated; return the largest harm recorded so far.
 
     The rough bound (``rough_harm``) uses only the largest speeds that are still possible.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is the largest so far.
+        out: [W] receives the affine form of the harm if this harm is the largest so far.
 
     """
     return keep_with(np.zeros(cell.speed.shape[1]), rough_harm(cell, path, -1), worst, out)
@@ -116,21 +115,20 @@ def keep_rough(cell: Cell, path: Path, worst: float, out: Floats) -> float:
 def branch(
     cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, how: Approach, worst: float, out: Floats
 ) -> float:
-    """Record or branch off the worlds in which pair ``p`` has an impact in this piece; return the largest recorded
-    harm.
+    """Handle the worlds in which pair ``p`` has an impact in this piece; return the largest harm recorded so far.
 
     If no other impact can follow, the harm of these worlds is final and is recorded. Otherwise the worlds become a new
     path on the stack. If that path cannot be simulated, a rough bound (``rough_harm``) is recorded instead.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that are not simulated yet; new paths are added to it.
+        stack: paths that still have to be simulated; the function adds new paths.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is the largest so far.
+        out: [W] receives the affine form of the harm if this harm is the largest so far.
 
     """
     P = cell.gap.shape[0]
@@ -164,9 +162,8 @@ def branch(
 
 @compiled(apart=True)
 def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
-    """Record the affine form ``harm`` [W], increased by ``rest`` (m2/s2), and return the largest recorded harm, m2/s2.
-
-    ``rest`` is an upper bound on the harm that follows. ``worst`` is the largest harm recorded so far; ``out`` [W]
+    """Record the affine form ``harm`` [W] plus ``rest``, and return the largest harm recorded so far, m2/s2. ``rest``
+    is an upper bound on the harm of later impacts, m2/s2. ``worst`` is the largest harm recorded so far; ``out`` [W]
     receives the affine form of a new largest harm.
     """
     whole = harm.copy()
@@ -176,19 +173,19 @@ def keep_with(harm: Floats, rest: float, worst: float, out: Floats) -> float:
 
 @compiled(apart=True)
 def closing_after(cell: Cell, path: Path, motion: Motion, p: int, speed: Floats, time: Floats, length: float) -> Floats:
-    """Return the closing speed (m/s) of the other pair if its impact may follow in the same piece after the impact of
-    ``p``.
+    """Return the closing speed (m/s) of the other pair if its impact may follow the impact of pair ``p`` in the same
+    piece.
 
     The line has three vehicles. The result is an affine form [W] (centre, slopes, remainder); it is 0 if the other pair
     cannot have contact.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         speed: closing speed at the impact of pair ``p`` as an affine form [W], m/s.
-        time: time of that impact as an affine form [W], s after the start of the piece.
+        time: time of the impact of pair ``p`` as an affine form [W], s after the start of the piece.
         length: length of the piece, s.
 
     """
@@ -220,9 +217,9 @@ def strike(
     (``thrown_back``).
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that are not simulated yet; new paths are added to it.
+        stack: paths that still have to be simulated; the function adds new paths.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         how: closing speed and time of the contact (from ``approach``).
@@ -301,7 +298,7 @@ def may_only_touch(cell: Cell, path: Path, motion: Motion, p: int, how: Approach
     This is possible only if a command changes or an acceleration builds up.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -332,7 +329,7 @@ def may_turn(cell: Cell, motion: Motion, p: int, piece: int) -> bool:
     The front vehicle's acceleration may fall, or the rear vehicle's acceleration may rise.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         piece: index of the piece, 0 to J - 1.
@@ -346,7 +343,7 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
     """Return whether brake build-up may lower (``which`` 0) or raise (``which`` 1) an acceleration within a piece.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         i: index of the vehicle.
         piece: index of the piece, 0 to J - 1.
@@ -360,15 +357,16 @@ def may_move(cell: Cell, motion: Motion, i: int, piece: int, which: int) -> bool
 
 @compiled(apart=True)
 def touch_only(cell: Cell, path: Path, stack: Stack, motion: Motion, p: int, length: float) -> bool:
-    """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed so.
+    """Put a second path on the stack: the worlds in which pair ``p`` came into contact without an impact and stayed in
+    contact.
 
-    With brake build-up the pair may separate and have its first impact within the piece. The path below this one on the
-    stack covers such worlds. Returns False if the stack is full.
+    With brake build-up the pair may separate and have its first impact within the piece. The path just below on the
+    stack covers the worlds in which this happens. Returns False if the stack is full.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        stack: paths that are not simulated yet; new paths are added to it.
+        stack: paths that still have to be simulated; the function adds new paths.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         length: length of the piece, s.
@@ -400,7 +398,7 @@ def thrown_back(cell: Cell, path: Path, motion: Motion, p: int, how: Approach, s
     motion cannot lead to an impact.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
@@ -422,15 +420,14 @@ MOST_PATHS = 4000  # largest number of paths to simulate in one cell
 
 @compiled(apart=True)
 def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float) -> float:
-    """Return an upper bound on the harm of every world of the cell, m2/s2.
-
-    A result above ``most`` is not a bound, because the search then stopped early.
+    """Return an upper bound on the harm in all worlds of the cell, m2/s2. A result above ``most`` is no bound, because
+    the search then stopped early.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
-        stack: working memory for paths (sets of worlds with the same impacts).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
+        stack: working memory for paths (each a set of worlds with the same impacts).
         motion: working memory for the motion of each vehicle.
-        out: [W] receives the affine form of the harm that reaches the bound.
+        out: [W] receives the affine form of the largest harm, whose largest value is the bound.
         most: harm above which the search stops, m2/s2.
 
     """
@@ -460,16 +457,16 @@ def most_harm(cell: Cell, stack: Stack, motion: Motion, out: Floats, most: float
 def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out: Floats) -> float:
     """Simulate a path to its end, and return the largest recorded harm, m2/s2.
 
-    The recorded harms include the harm of the path and of the paths that branch off and end at once.
+    The function records the harm of the path, and of each path that branches off and needs no further simulation.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
             place.
-        stack: paths that are not simulated yet; new paths are added to it.
+        stack: paths that still have to be simulated; the function adds new paths.
         motion: working memory for the motion of each vehicle.
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is the largest so far.
+        out: [W] receives the affine form of the harm if this harm is the largest so far.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -498,10 +495,10 @@ def follow(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, o
 def may_meet_unseen(cell: Cell, path: Path, motion: Motion) -> bool:
     """Return whether a pair that is in contact without an impact so far may have its first impact in the present piece.
 
-    Such a pair must separate before it can have an impact.
+    The vehicles of such a pair must separate before they can have an impact.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).
 
@@ -523,13 +520,13 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
     stack (``branch``). Returns the largest recorded harm, m2/s2.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
             place.
-        stack: paths that are not simulated yet; new paths are added to it.
+        stack: paths that still have to be simulated; the function adds new paths.
         motion: motion of each vehicle in the present piece; changed in place.
         worst: largest harm recorded so far, m2/s2.
-        out: [W] receives the affine form of the harm if it is the largest so far.
+        out: [W] receives the affine form of the harm if this harm is the largest so far.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -576,10 +573,11 @@ def meet(cell: Cell, path: Path, stack: Stack, motion: Motion, worst: float, out
 
 @compiled(apart=True)
 def go_on(cell: Cell, path: Path, motion: Motion) -> bool:
-    """Advance the path to the end of the present piece without an impact. Return False if every world has an impact.
+    """Advance the path to the end of the present piece without an impact. Return False if the path has no world without
+    an impact in this piece.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
             place.
         motion: motion of each vehicle in the present piece if it were alone on the road (``move_alone``).

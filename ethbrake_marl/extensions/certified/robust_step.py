@@ -1,4 +1,5 @@
-"""Step shield for uncertain worlds: it certifies the corners of an uncertainty, or its whole interior.
+"""Step shield for uncertain worlds: it certifies plans in the corners of the box of possible worlds, or in the whole
+box.
 
 The *members* of a world are the worlds in which ``StepShield`` certifies a plan. For this shield the members are the
 reported world and the corners of an ``Uncertainty``. With ``robust="interior"`` the shield also bounds the harm of
@@ -28,19 +29,20 @@ from ethbrake_marl.shields.step_memory import StepMemory
 
 
 class RobustShield(StepShield):
-    """``StepShield`` whose bound holds in every corner of an uncertainty, or in its whole interior.
+    """``StepShield`` whose bound on harm holds in every corner of the box of possible worlds, or in the whole box.
 
     Args:
         scenario: the scenario of all worlds.
         vehicle: index of the shielded vehicle; with an uncertainty there may be only one.
-        uncertainty: intervals around the reported quantities; None: ``begin`` receives the ``possible`` worlds.
+        uncertainty: intervals around the reported quantities; None: the caller passes the ``possible`` worlds to
+            ``begin``.
         robust: worlds to certify: ``corners`` or ``interior``.
-        harm_count: ``first`` or ``total`` impacts.
-        others: scripts of the other vehicles by index; None: the scenario's scripts.
+        harm_count: impacts that count: ``first`` (first impact of each pair) or ``total`` (every impact).
+        others: scripts of the other vehicles by index; None: the scripts of the scenario.
         settings: further keyword arguments of ``StepShield``.
 
-    Raises ``InvalidInput`` as ``StepShield`` does, for several vehicles or a cap together with an uncertainty, and for
-    settings that ``interior`` cannot certify.
+    Raises ``InvalidInput`` in three cases: where ``StepShield`` raises it, if an uncertainty is combined with several
+    vehicles or a cap, and for settings that ``interior`` cannot certify.
 
     """
 
@@ -64,7 +66,9 @@ class RobustShield(StepShield):
 
     @property
     def possible_are(self) -> str:  # type: ignore[override]  # a constant there
-        """Name of a world's members (possible worlds) in error messages, such as "uncertainty: gaps_m=0.5"."""
+        """Text in error messages that says which worlds are the members (possible worlds), such as "uncertainty:
+        gaps_m=0.5".
+        """
         return f"uncertainty: {self.uncertainty}"
 
     def members_of(self, worlds: Worlds) -> Worlds:
@@ -73,7 +77,9 @@ class RobustShield(StepShield):
 
     @property
     def boxes(self) -> Boxes | None:
-        """Boxes of mode ``interior`` (range of every number of each world) after episodes began; otherwise None."""
+        """In interior mode, the boxes (smallest and largest value of every number of each world) once episodes have
+        begun; otherwise None.
+        """
         boxes: Boxes | None = self.memory.enclosure
         return boxes
 
@@ -87,7 +93,7 @@ class RobustShield(StepShield):
 
         Args:
             possible: [m * M] members of the new worlds, M consecutive ones for each world.
-            problem: the same worlds as columns of numbers.
+            problem: the same worlds as a table with one row for each world.
             rows: [m] indices of the new episodes.
             plan: [m, L] action at each decision.
             harm: [m] largest harm of the plan in any member, m2/s2.
@@ -109,20 +115,19 @@ class RobustShield(StepShield):
             now: state of the members (the corners of the boxes) before the decision.
             memory: memory of the shield.
             budget: [n] largest harm that a new plan may have, m2/s2.
-            decision: the decision, certified only in the members.
-            asked: [n] True for episodes that decide now.
+            decision: the present decision, whose plans are certified only in the members.
+            asked: [n] True for episodes that have a decision now.
 
         """
         boxes = memory.enclosure
         return decision if boxes is None else certify_inside(boxes, now, memory.backup, budget, decision, asked)
 
     def _leaves_range(self, running: Running) -> Bools:
-        """Return a mask [n] of the worlds that may leave the range between their members, in the states ``running``.
-
-        The members are the reported world and the corners of its uncertainty. The mask is True where the mask of
-        ``StepShield`` is, and in worlds in which the shielded vehicle's latency is uncertain, because decisions then
-        fall at different times in the worlds of a box. The mask is True everywhere if one uncertain number (friction)
-        changes several quantities.
+        """Return a mask [n] of the reported worlds in whose box some world may leave the range between the members. The
+        members are the reported world and the corners of its box; ``running`` has their states. The mask is True where
+        ``StepShield`` returns True, and in worlds in which the shielded vehicle's latency is uncertain, because
+        decisions then fall at different times in the worlds of a box. The mask is True everywhere if one uncertain
+        number (friction) changes several quantities.
         """
         leaves, boxes = super()._leaves_range(running), self.boxes
         if boxes is not None:
@@ -136,17 +141,16 @@ class RobustShield(StepShield):
 def certify_inside(
     boxes: Boxes, running: Running, held: Backup, budget: Floats, decision: Decision, asked: Bools
 ) -> Decision:
-    """Replace plans of a decision that are not certified for every world of their box by the plans from before the
-    decision.
+    """Return the decision with the old plan in place of each new plan that is not certified in all worlds of its box.
 
     Args:
-        boxes: range of every number of each world.
+        boxes: smallest and largest value of every number of each world.
         running: state of the members (corners of the boxes) before the decision.
         held: plans and bounds from before the decision.
         budget: [n] largest harm that a new plan may have, m2/s2.
-        decision: the decision, certified only in the corners.
-        asked: [n] True for episodes that decide now. Such an episode ends only at the horizon, because a box may
-            contain moving worlds when all its corners are at rest.
+        decision: the present decision, whose plans are certified only in the corners.
+        asked: [n] True for episodes that have a decision now. In interior mode an episode ends only at the horizon,
+            because a box may contain moving worlds when all its corners are at rest.
 
     """
     plan, other = decision.backup.plan.copy(), (decision.backup.plan != held.plan).any(axis=1)

@@ -1,14 +1,15 @@
-"""Rough upper bound on harm, from the largest speeds that the vehicles of a line can still reach.
+"""Rough upper bound on harm, computed from the largest speeds that the vehicles of a line can still reach.
 
 The bound applies to worlds whose path cannot be simulated. The bound is always finite.
 
 Without impacts, a vehicle reaches at most its present speed, or the speed that it can reach by driving. An impact with
-closing speed w changes each vehicle's speed by (1 + e) w times the partner's share of the mass; e is the restitution.
-Let u be the largest speed of any vehicle, and assume that no vehicle moves backwards yet. An impact slows the rear
-vehicle, at most to -e times its speed. A front vehicle at rest gains at most (1 + e) times the rear vehicle's speed. So
-the middle vehicle of three stays between -e u and (1 + e) u until its second pair has contact. (Three vehicles in
-contact at once leave with P + e (P - v) each, where v is the vehicle's speed before and P a weighted mean of the
-speeds. These speeds lie between the same bounds.)
+closing speed w and restitution e changes the speed of each vehicle by (1 + e) w m / M, where m is the mass of the other
+vehicle and M the sum of both masses. Let u be the largest speed of any vehicle, and assume that no vehicle moves
+backwards yet. An impact slows the rear vehicle, but not below -e times its previous speed. It gives a front vehicle at
+rest at most (1 + e) times the rear vehicle's speed. So, in a line of three, the speed of the middle vehicle stays
+between -e u and (1 + e) u until both its pairs have had contact. (Three vehicles in contact at once leave with P + e (P
+- v) each, where v is the vehicle's speed before and P a weighted mean of the speeds. These speeds lie between the same
+bounds.)
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(apart=True)
 def driven(cell: Cell, i: int, speed: float, since: float) -> float:
-    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving, from at most ``speed`` at the time
+    """Return the largest speed (m/s) that vehicle ``i`` can reach by driving if it has at most ``speed`` at the time
     ``since``.
 
     ``since`` counts from the first decision, in s. ``cell`` is the box of worlds with its commands.
@@ -47,9 +48,10 @@ def rough_harm(cell: Cell, path: Path, hit: int) -> float:
     The bound uses only the largest speeds that the vehicles can still reach.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
-        hit: index of a further pair that counts as hit already; -1: only the pairs marked in the path.
+        hit: index of a further pair that is treated as if it had already had its impact already; -1: only the pairs
+            marked in the path.
 
     """
     N, P = cell.speed.shape[0], cell.gap.shape[0]
@@ -70,12 +72,12 @@ def rough_rest(cell: Cell, own: Floats, backwards: float, since: float, path: Pa
     """Return an upper bound (m2/s2) on the sum of squared closing speeds of all first impacts that are still to come.
 
     Args:
-        cell: the box of worlds.
-        own: [N] largest speed of each vehicle without an impact, m/s.
+        cell: a box of uncertain worlds, as affine forms.
+        own: [N] largest speed that each vehicle can reach without an impact, m/s.
         backwards: largest backward speed of any vehicle now, m/s.
         since: present time, s after the first decision.
         path: worlds of the box with the same impacts so far; only its marks of pairs that had an impact are read.
-        hit: index of a further pair that counts as hit; -1: none.
+        hit: index of a further pair that is treated as if it had already had its impact; -1: none.
 
     """
     P, e = cell.gap.shape[0], cell.restitution

@@ -1,12 +1,13 @@
-"""Pairs that stay in contact in a box of worlds: they bounce a little, move as one body, and later separate.
+"""Pairs that stay in contact, in a box of worlds: the vehicles bounce a little, then move as one body, and later
+separate.
 
-The state of a pair in contact is the motion of its centre of mass, as affine forms, and limits on how far both vehicles
-deviate from it. While both vehicles move forward, only their commands act on the pair. The centre of mass then follows
-the commands alone, no matter how often the two vehicles collide.
+The state of a pair in contact is the motion of its centre of mass, as affine forms, and limits on how far the two
+vehicles deviate from this motion. While both vehicles move forward, only their commands act on the pair. The centre of
+mass then follows the commands alone, no matter how often the two vehicles collide.
 
-A world *creeps* as soon as one of the two vehicles stands or moves backwards: the brakes of that vehicle then hold it
-instead of slowing the pair, and only limits on the speeds are known. A *flight* is the time between two impacts of the
-pair.
+A world *creeps* as soon as one of the two vehicles stands or moves backwards: the brakes of that vehicle then hold the
+vehicle instead of slowing the pair, and the state contains only limits on the speeds. A *flight* is the time between
+two impacts of the pair.
 """
 
 from __future__ import annotations
@@ -52,7 +53,8 @@ UNEVEN = 3.0  # largest ratio of closing to separating speed in a flight, for bo
 def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
     """Return speed, acceleration or distance of the centre of mass of pair ``p``, as an affine form [W].
 
-    ``front`` and ``rear`` are the values of the two vehicles; ``cell`` has their shares of the mass.
+    ``front`` and ``rear`` are the values of the two vehicles; ``cell`` has the share of each vehicle in the mass of the
+    pair.
     """
     out = product(cell.share[p, 1], front)
     add(out, 1.0, product(cell.share[p, 0], rear))
@@ -61,7 +63,8 @@ def common(cell: Cell, p: int, front: Floats, rear: Floats) -> Floats:
 
 @compiled(apart=True)
 def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if both commands act.
+    """Return the smallest and the largest closing acceleration (m/s2) of pair ``p`` if the commands of both vehicles
+    act.
 
     ``motion`` is the motion of all vehicles in the present piece (time interval of constant command).
     """
@@ -72,7 +75,7 @@ def pressing_together(motion: Motion, p: int) -> tuple[float, float]:
 
 @compiled(apart=True)
 def apart(touch: Floats) -> float:
-    """Return the largest difference between the two speeds of a pair in contact, m/s.
+    """Return the largest possible difference between the speeds of the two vehicles of a pair in contact, m/s.
 
     ``touch`` [TOUCH_WIDTH] is the state of the pair, a row of ``Path.touch``.
     """
@@ -81,10 +84,9 @@ def apart(touch: Floats) -> float:
 
 @compiled(apart=True)
 def faster(cell: Cell, p: int) -> float:
-    """Return the largest ratio of the front vehicle's speed after an impact of pair ``p`` to the rear vehicle's speed
-    before.
-
-    The result is at least 1. ``cell`` has the coefficient of restitution and the shares of mass.
+    """Return the largest possible ratio v / u, for an impact of pair ``p``: v is the front vehicle's speed after the
+    impact, u the rear vehicle's speed before it. The result is at least 1. ``cell`` has the coefficient of restitution
+    and the shares of mass.
     """
     return float(max(1.0, (1.0 + cell.restitution) * high(cell.share[p, 0])))
 
@@ -92,7 +94,7 @@ def faster(cell: Cell, p: int) -> float:
 @compiled(apart=True)
 def backwards(cell: Cell, p: int) -> float:
     """Return the largest backward speed of the rear vehicle of pair ``p`` after an impact, as a multiple of its speed
-    before.
+    before the impact.
 
     The result is at least 0. ``cell`` has the coefficient of restitution and the shares of mass.
     """
@@ -101,7 +103,7 @@ def backwards(cell: Cell, p: int) -> float:
 
 @compiled(apart=True)
 def stray(cell: Cell, touch: Floats, p: int) -> float:
-    """Return the largest difference (m/s) between the speed of a pair's centre of mass and the speed in its affine
+    """Return the largest difference (m/s) between the true speed of a pair's centre of mass and the speed in its affine
     form.
 
     The result is above 0 only if one of the two vehicles may stand or move backwards. The speed in the affine form then
@@ -110,7 +112,7 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
     faster.)
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
 
@@ -120,10 +122,11 @@ def stray(cell: Cell, touch: Floats, p: int) -> float:
 
 @compiled(apart=True)
 def blur(cell: Cell, path: Path, p: int, side: int) -> float:
-    """Return the largest difference (m/s) between a vehicle's speed and the affine form of its pair in contact.
+    """Return the largest difference (m/s) between the speed of a vehicle in contact and the speed of its pair's centre
+    of mass.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         side: 0 for the front vehicle of the pair, 1 for the rear one.
@@ -147,11 +150,11 @@ def begin_touch(touch: Floats) -> None:
 def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
     """Move pair ``p``, which is in contact, through the present piece (time interval of constant command).
 
-    Before the call ``motion`` has each vehicle as if it were alone. After the call it has the two vehicles as one body,
-    or apart if they separate.
+    Before the call ``motion`` describes each vehicle as if it were alone. After the call ``motion`` describes the two
+    vehicles as one body, or as two if they separate.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
             place.
         motion: motion of each vehicle in the present piece; changed in place.
@@ -191,12 +194,11 @@ def move_together(cell: Cell, path: Path, motion: Motion, p: int, length: float)
 
 @compiled(apart=True)
 def dip_of(cell: Cell, vague: float, length: float) -> float:
-    """Return how much (m/s) a speed within a piece may be below its values at both ends of the piece.
-
-    The speed falls below them only if the vehicle's acceleration changes its sign within the piece.
+    """Return by how much (m/s) a vehicle's speed within a piece may be below its smaller value at the two ends of the
+    piece. The speed falls below this value only if the vehicle's acceleration changes its sign within the piece.
 
     Args:
-        cell: the box of worlds.
+        cell: a box of uncertain worlds, as affine forms.
         vague: largest deviation of the acceleration from its mean, m/s2.
         length: length of the piece (time interval of constant command), s.
 
@@ -206,8 +208,7 @@ def dip_of(cell: Cell, vague: float, length: float) -> float:
 
 @compiled(apart=True)
 def own_pulls(motion: Motion, p: int) -> tuple[float, float]:
-    """Return the smallest and the largest acceleration (m/s2) by the commands of both vehicles of pair ``p`` in a
-    piece.
+    """Return the smallest and the largest acceleration (m/s2) that the two vehicles of pair ``p`` command in a piece.
 
     ``motion`` is the motion of all vehicles in the piece (time interval of constant command).
     """
@@ -220,12 +221,12 @@ def creep(cell: Cell, touch: Floats, p: int, slowest: float, weakest: float, har
     """Update the state of a pair in contact for worlds in which one of its vehicles may stand or move backwards.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         slowest: smallest speed of the centre of mass in the piece, m/s.
-        weakest: smallest acceleration by either command, m/s2.
-        hardest: largest acceleration by either command, m/s2.
+        weakest: smallest acceleration that either vehicle commands, m/s2.
+        hardest: largest acceleration that either vehicle commands, m/s2.
         length: length of the piece, s.
 
     """
@@ -255,7 +256,7 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
     the rear vehicle's speed.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
             place.
         motion: motion of each vehicle in the present piece; changed in place.
@@ -277,10 +278,11 @@ def come_to_rest(cell: Cell, path: Path, motion: Motion, p: int, length: float) 
 
 @compiled(apart=True)
 def part(cell: Cell, path: Path, motion: Motion, p: int, length: float) -> None:
-    """Separate pair ``p``, which was in contact and opens in the present piece. Afterwards both vehicles move alone.
+    """Separate the vehicles of pair ``p``, which was in contact and whose gap opens in the present piece. Afterwards
+    both vehicles move alone.
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         path: worlds of the box with the same impacts so far, in their state at the start of the piece; changed in
             place.
         motion: motion of each vehicle in the present piece; changed in place.
@@ -313,14 +315,15 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
     """Update the relative speed and the gap of pair ``p``, which is in contact, over the present piece.
 
     An impact never increases the relative speed, so this speed grows by at most the closing acceleration of the
-    commands. While the closing acceleration is between b- (``least``) and b+ (``most``), both above 0, the relative
-    speed does not grow. A *flight* (the time between two impacts) with gap g and relative speed w has a gap of at most
-    ``h = g + w^2 / (2 b-)`` and ends with a closing speed of at most ``sqrt(2 b+ h)``. The next flight starts with e
-    times this speed, where e is the restitution. So the relative speed decreases from flight to flight if ``e sqrt(b+ /
-    b-) < 1``. (If one vehicle stands or moves backwards, its brakes hold it, which makes flights shorter and slower.)
+    commands. While the closing acceleration lies between b- (``least``) and b+ (``most``), and b- > 0, the relative
+    speed does not grow. A *flight* (the time between two impacts) that has gap g and relative speed w at some moment
+    has a gap of at most ``h = g + w^2 / (2 b-)`` and ends with a closing speed of at most ``sqrt(2 b+ h)``. The next
+    flight starts with e times this speed, where e is the restitution. So the relative speed decreases from flight to
+    flight if ``e sqrt(b+ / b-) < 1``. (If one vehicle stands or moves backwards, its brakes hold it. This makes flights
+    shorter, and their speeds smaller.)
 
     Args:
-        cell: the box of worlds, with the commands and the pieces (time intervals of constant command).
+        cell: a box of uncertain worlds (affine forms), with the commands of each piece (time of constant command).
         touch: [TOUCH_WIDTH] state of the pair in contact, a row of ``Path.touch``; changed in place.
         p: index of the pair; vehicle ``p`` is in front, vehicle ``p + 1`` behind.
         least: smallest closing acceleration, m/s2.
@@ -357,8 +360,8 @@ def bounce(cell: Cell, touch: Floats, p: int, least: float, most: float, length:
 def begin_run(touch: Floats, e: float, softest: float, hardest: float, least: float, most: float) -> None:
     """Start a new phase of a contact, because the closing acceleration of the pair has changed.
 
-    The new phase covers the accelerations of the old and the new phase if the relative speed then still decreases from
-    impact to impact. Otherwise the new phase covers only its own accelerations.
+    The limits of the new phase span the accelerations of the old and the new phase if the relative speed then still
+    decreases from impact to impact. Otherwise they span only the accelerations of the new phase.
 
     Args:
         touch: state of the pair in contact, a row of ``Path.touch``; changed in place.

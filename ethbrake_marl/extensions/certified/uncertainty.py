@@ -1,11 +1,11 @@
-"""Uncertainty: an interval around each quantity of a world, and the members that represent the worlds in these
-intervals.
+"""Uncertainty: an interval around each uncertain quantity of a world, and the *members* that represent all worlds in
+these intervals.
 
 The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
-quantity's unit, or a share of x. The interval is cut to possible values: no latency, speed or gap below 0, no speed
-above the vehicle's limit. The *box* of a world is the set of all combinations of values in its intervals. The *members*
-of a world are the reported world and every corner of its box: 2^d corners for d uncertain numbers. Mode ``robust``
-proves its bound for the members (``docs/extensions/certified.md``).
+quantity's unit, or a share of x. Impossible values are cut off from the interval: latencies, speeds and gaps below 0,
+and speeds above the vehicle's limit. The *box* of a world is the set of all combinations of values in its intervals.
+The *members* of a world are the reported world and every corner of its box: 2^d corners for d uncertain numbers. The
+bound of shield mode ``robust`` is proven for the members (``docs/internals/proofs/shield-corners.md``).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ _Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, index
 
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """Intervals around the reported quantities of a world. ``parse_uncertainty`` reads them from a text.
+    """Intervals around the reported quantities of a world. ``parse_uncertainty`` makes an uncertainty from a text.
 
     Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
     """
@@ -125,7 +125,7 @@ class Uncertainty:
     def moves_together(self) -> bool:
         """True if one uncertain number (friction) changes several quantities.
 
-        The largest and smallest gaps and speeds are then not always in corners.
+        The largest and smallest gaps and speeds may then occur in worlds that are no corners.
         """
         return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
 
@@ -133,10 +133,10 @@ class Uncertainty:
         """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
 
         The *box* of a world is the set of all combinations of values in its intervals. The corners are in the order of
-        binary numbers, with the first interval as the lowest bit. Intervals of width 0 add no corners. Friction has
-        eight values instead of two ends, because it changes all capacities together and harm is not monotone in it.
-        Raises ``InvalidInput`` for a vehicle that does not exist, a capacity or mass that may be 0, or more than
-        ``MOST_CORNERS`` corners.
+        binary numbers, with the first interval as the lowest bit. Intervals of width 0 add no corners. For friction
+        eight values are used instead of the two ends of its interval, because friction changes all capacities together
+        and harm may rise or fall with it. Raises ``InvalidInput`` for a vehicle that does not exist, a capacity or mass
+        that may be 0, or more than ``MOST_CORNERS`` corners.
         """
         sides = self._sides(worlds)
         ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
@@ -152,20 +152,20 @@ class Uncertainty:
 
     @staticmethod
     def interleaved(parts: list[Worlds]) -> Worlds:
-        """Merge M lists of n worlds each into one list [n * M].
+        """Merge M batches of n worlds each into one batch [n * M].
 
-        The merged list begins with world 0 of every list, followed by world 1 of every list, and so on.
+        World 0 of every batch comes first, then world 1 of every batch, and so on.
         """
         order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
         return Worlds.concatenate(parts).take(order)
 
     def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
-        """Draw one world from the box of intervals around each of ``worlds``, [n].
+        """For each of ``worlds`` [n], draw one world from the box of intervals around it.
 
         Args:
             worlds: the reported worlds, [n].
             rng: source of randomness.
-            corners: True: draw a corner; False: draw uniformly from the interior.
+            corners: True: draw one of the corners of the box; False: draw uniformly from the whole box.
 
         """
         sides = self._sides(worlds)
@@ -177,7 +177,7 @@ class Uncertainty:
     def _sides(self, worlds: Worlds) -> list[_Side]:
         """Return the uncertain numbers of ``worlds``, each with its smallest and its largest value, [n].
 
-        An uncertain number is one quantity of one vehicle or pair (index from 0).
+        Each uncertain number belongs to one quantity and one vehicle or pair (index from 0).
         """
         sides: list[_Side] = []
         for interval in self.intervals:
@@ -216,7 +216,8 @@ class Uncertainty:
 
 
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Parse a text of ``quantity=half-width`` entries with commas between them, for instance ``UNCERTAINTY_EXAMPLE``.
+    """Make an uncertainty from a text: entries ``quantity=half-width``, separated by commas, as in
+    ``UNCERTAINTY_EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of its value. ``.vehicle_2`` or ``.pair_1`` after
     the quantity limits the entry to one vehicle or pair. Blanks around entries and ``=`` are ignored. Raises
@@ -241,9 +242,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
 
 
 def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1].
-
-    Capacities are the values on a dry road.
+    """Return the reported values of one of ``QUANTITIES``: [n, N], for gaps [n, P], for friction [n, 1]. Capacities are
+    those on a dry road.
     """
     if quantity.endswith("_rate_mps3"):
         return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
@@ -264,8 +264,8 @@ def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | 
     Args:
         worlds: the reported worlds, [n].
         sides: the uncertain numbers, from ``_sides``.
-        share: returns the position of the uncertain number with a given index, a number or [n]: 0 is the smallest
-            value, 1 the largest.
+        share: function that gets the index of an uncertain number and returns its position in the interval, a number or
+            [n]: 0 is the smallest value, 1 the largest.
 
     """
     changed: dict[str, Any] = {}

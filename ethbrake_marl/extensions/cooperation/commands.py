@@ -56,7 +56,7 @@ def ablate_command(
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Train policies at several levels of cooperation, and compare them in the same worlds.
+    """Compare several levels of cooperation in the same worlds.
 
     The command first prints how long it will take. It writes ablation.html, ablation.md, ablation.csv, ablation.json
     and three figures. After an interruption, repeat the command to continue.

@@ -1,8 +1,8 @@
 """Write recorded episodes as a Minari dataset or a Parquet file.
 
-``dataset.recover_environment()`` of a Minari dataset makes the environment, in which the recorded actions repeat the
-episodes bit for bit. ``env.reset(seed=seed, options=options)`` starts the world of an episode, with the ``seed`` and
-``options`` in the metadata of the episode.
+With a Minari dataset, ``dataset.recover_environment()`` makes the environment. In this environment, the recorded
+actions repeat the episodes bit for bit. To start the world of an episode, call ``env.reset(seed=seed,
+options=options)`` with the ``seed`` and ``options`` in the metadata of the episode.
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ def check_folder(path: Path, *, force: bool = False) -> None:
         if not force:
             raise AlreadyExists(f"{path}: already exists; give another name, or replace it with force (--force)")
         if path.is_symlink() or not (path / DATA / "metadata.json").is_file():
-            raise InvalidInput(f"{path}: is not a Minari dataset, so force does not replace it; give another name")
+            raise InvalidInput(f"{path}: force replaces only Minari datasets, and this is none; give another name")
     if not path.parent.is_dir():
         raise InvalidInput(f"{path}: the folder {path.parent} does not exist; create it first")
     try:
         check_writable(path.parent)
     except OSError as error:
-        raise InvalidInput(f"{path}: cannot be written ({error.strerror})") from None
+        raise InvalidInput(f"{path}: the folder cannot be written ({error.strerror})") from None
 
 
 @contextmanager
@@ -89,8 +89,8 @@ def minari_folder(
     Args:
         path: path of the folder, named ``NAME-vNUMBER``.
         task: scenario, seed, reward and observation of the recordings.
-        told: metadata (result of ``tell``), stored as JSON under the key ``ethbrake_marl`` at the end of the block.
-            Entries may be added in the block.
+        told: metadata (result of ``tell``), which are stored as JSON under the key ``ethbrake_marl`` when the block
+            ends. Entries may still be added to ``told`` inside the block.
         force: whether an existing dataset is replaced.
 
     """
@@ -128,10 +128,12 @@ def minari_folder(
 
 
 def env_spec(task: Task) -> EnvSpec:
-    """Return the Gymnasium spec from which ``gymnasium.make`` makes the environment of a recording.
+    """Return a Gymnasium spec.
 
-    The spec contains only plain data, so it can be stored as JSON. Raises ``InvalidInput`` unless the scenario has
-    exactly one learner.
+    From this spec, ``gymnasium.make`` makes the environment in which recorded actions can be repeated.
+
+    The spec contains only plain data, so it can be stored as JSON. Raises ``InvalidInput`` if the scenario does not
+    have exactly one learner.
     """
     names = [task.scenario.vehicle_names[i] for i in task.scenario.learners]
     check_one_learner(
@@ -165,7 +167,7 @@ def _episodes(recording: Recording) -> Iterator[dict[str, Any]]:
 
 
 def _infos(recording: Recording, vehicle: int) -> dict[str, NDArray[Any]]:
-    """Return the infos of the environment for ``vehicle`` (0 = front): an array [T + 1, n, ...] for each name."""
+    """Return the environment's infos for ``vehicle`` (0 = front): name of the info -> array [T + 1, n, ...]."""
     infos = {name: recording.told(name)[:, :, vehicle] for name in recording.reports[0].columns()}
     cost = np.stack([each.cost for each in recording.reports])
     news = [each.known_from_s[:, vehicle] for each in recording.reports if each.known_from_s is not None]
@@ -217,21 +219,21 @@ def write_dataset(
 ) -> DatasetSummary:
     """Let agents drive the first worlds of a list, and write their episodes as a Parquet file or a Minari dataset.
 
-    An environment that receives the recorded actions repeats the episodes bit for bit. docs/extensions/datasets.md
-    describes the content. Before the work begins, the function raises ``InvalidInput`` for an invalid argument,
-    ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a library is not installed. It
-    raises ``PhysicsError`` if the physics can simulate no world of the list.
+    If an environment starts in a recorded world and gets the recorded actions, it repeats the episode bit for bit.
+    docs/extensions/datasets.md describes the content. Before it begins to record, the function raises ``InvalidInput``
+    if an argument is invalid, ``AlreadyExists`` if ``path`` exists and ``force`` is false, and ``MissingExtra`` if a
+    library is not installed. Later it raises ``PhysicsError`` if the physics cannot simulate any of the worlds.
 
     Args:
         path: file (``.parquet``) or folder (``NAME-v0``) to write.
-        agents: agent specs as on the command line, or a mapping from names to agents or teams. The agents drive the
-            learners of the scenario. They are not changed.
+        agents: agent specs as on the command line, or a mapping from names to agents or teams. Each agent drives the
+            learners of the scenario. The agents are not changed.
         scenario: scenario, or its name or path.
-        episodes: number of worlds, from the first world of the list on.
+        episodes: number of worlds that each agent drives: worlds 0 to ``episodes`` - 1 of the list.
         seed: seed of the list of worlds.
         format: ``parquet`` or ``minari``; None: the ending of ``path`` selects the format.
         reward: reward to record.
-        observation: observation to record; None: ``observation_for(scenario)``.
+        observation: features to record as observation; None: the features that ``observation_for(scenario)`` returns.
         force: whether an existing dataset is replaced.
         on_progress: function that is called with the name of an agent and the number of worlds recorded so far.
 
@@ -284,7 +286,7 @@ def check_dataset(
 ) -> DatasetFormat:
     """Check that a dataset of this scenario can be written to ``path``, and return its format.
 
-    Raises the exceptions that ``write_dataset`` raises before its work begins.
+    Raises the exceptions that ``write_dataset`` raises before it begins to record.
 
     Args:
         path: file or folder to write.
@@ -300,12 +302,12 @@ def check_dataset(
         raise unknown_name("format", chosen, get_args(DatasetFormat))
     if is_file != (chosen == "parquet"):
         right = "a file ending in .parquet" if chosen == "parquet" else "a folder called NAME-vNUMBER"
-        raise InvalidInput(f"{target}: a dataset in the format {chosen} is {right}; give such a name")
+        raise InvalidInput(f"{target}: a dataset in the format {chosen} must be {right}; change the name or the format")
     for package in _NEEDED_PACKAGES[chosen]:
         need(package)
     if not scenario.learners:
         raise InvalidInput(
-            f"scenario {scenario.name!r} has no learner to record: scenario.with_learners(['vehicle_2'])"
+            f"scenario {scenario.name!r} has no learner to record; use scenario.with_learners(['vehicle_2'])"
         )
     if chosen == "parquet":
         check_target(target, force=force)

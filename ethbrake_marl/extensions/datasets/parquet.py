@@ -31,8 +31,8 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 
     Args:
         path: path of the file.
-        told: metadata (result of ``tell``), stored as JSON under the key ``ethbrake_marl`` at the end of the block.
-            Entries may be added in the block.
+        told: metadata (result of ``tell``), which are stored as JSON under the key ``ethbrake_marl`` when the block
+            ends. Entries may still be added to ``told`` inside the block.
 
     """
     with naming_extras():
@@ -48,7 +48,9 @@ def parquet_dataset(path: Path, told: Mapping[str, Any]) -> Iterator[Callable[[R
 
 
 def decision_columns(recording: Recording) -> Columns:
-    """Return the columns of the table for a recording, by name. Each row is one decision, ordered by world.
+    """Return the rows of the file for one recording, as a dictionary: name of the column -> values.
+
+    Each row is one decision. The rows are ordered by world, then by time.
 
     docs/extensions/datasets.md describes the columns.
     """
@@ -56,11 +58,11 @@ def decision_columns(recording: Recording) -> Columns:
     before = recording.told
 
     def each(values: NDArray[Any]) -> NDArray[Any]:
-        """Return ``values`` [T or T + 1, n, ...] with one row per decision before the end of an episode."""
+        """Return one row for each decision of each episode, taken from ``values`` [T or T + 1, n, ...]."""
         return values[: running.shape[1]].swapaxes(0, 1)[running]
 
     def whole(values: NDArray[Any]) -> NDArray[Any]:
-        """Return ``values`` [n], which have one value per episode, repeated for every decision of the episode."""
+        """Repeat each of ``values`` [n], one per episode, for every decision of the episode."""
         return np.repeat(values, recording.decisions)
 
     in_force, chosen = before("command_in_force_mps2"), before("chosen_command_mps2")[1:]

@@ -1,11 +1,12 @@
-"""Record episodes in which an agent's commands are replaced by the actions of a learner in the environment.
+"""Record episodes of any agent as if a learner in the environment had driven: with actions instead of commands.
 
 An agent's commands are float64 numbers in m/s2. A learner's action is a float32 number in [-1, 1], so most commands
-have no exact action. Recording therefore simulates each world twice. In the first episode, the agent drives, and its
-commands are rounded to actions. In the second episode, the learners take these actions. The second episode is recorded,
-so an environment repeats it bit for bit. If two vehicles almost miss each other, the last bit of an action can decide
-whether they have an impact. Therefore, if rounding to the nearest action changes the harm of a world, rounding down and
-rounding up are tried, too. Each world keeps the rounding that changes its harm least.
+cannot be expressed exactly by an action. Therefore each world is simulated twice. First the agent drives the world, and
+the agent's commands are rounded to actions. Then the world is simulated again with these actions as the actions of
+learners. The second episode is recorded. An environment that gets the recorded actions repeats this episode bit for
+bit. If two vehicles almost miss each other, the last bit of an action can decide whether they have an impact.
+Therefore, if rounding to the nearest action changes the harm of a world, the code also tries to round all actions down,
+and all actions up. For each world, the rounding that changes its harm least is used.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ SLACK = 1e-6  # m2/s2; if rounding to the nearest action changes harm by less, n
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Settings of a recording: scenario, seed of the worlds, reward and observation."""
+    """Settings of a recording: the scenario, the seed of the worlds, the reward and the observed features."""
 
     scenario: Scenario  # scenario of the worlds; its learners are recorded
     seed: int  # seed from which the worlds are drawn
@@ -52,7 +53,7 @@ class Recording:
     """Recorded episodes of ``n`` worlds.
 
     In the shapes, ``T`` is the number of decisions in the longest episode, ``L`` the number of learners, and ``F`` the
-    number of observed features. Values after the end of an episode have no meaning.
+    number of observed features. An episode shorter than T ends earlier in the arrays; the later values have no meaning.
     """
 
     agent: str  # name of the agent
@@ -70,23 +71,26 @@ class Recording:
 
     @property
     def learners(self) -> tuple[int, ...]:
-        """Indices (0 = front) of the L recorded learners."""
+        """Indices (0 = front) of the L learners that are recorded."""
         return self.task.scenario.learners
 
     @cached_property
     def running(self) -> Bools:
-        """True for decisions before the end of the episode, [n, T]."""
+        """Whether each decision belongs to its episode, [n, T]; False after the end of the episode."""
         mask: Bools = np.arange(len(self.steps)) < self.decisions[:, np.newaxis]
         return mask
 
     def told(self, column: str) -> Floats:
-        """Return the values of the info with the name ``column``, such as ``time_s``, [T + 1, n, N]."""
+        """Return the values of one info of the environment, [T + 1, n, N].
+
+        ``column`` is the name of the info, such as ``time_s``.
+        """
         return np.stack([each.columns()[column] for each in self.reports])
 
     def terms(self) -> dict[str, Floats]:
-        """Return the values of each term of the reward, without its weight: an array [T + 1, n, L] for each name.
+        """Return the unweighted values of each term of the reward: name of the term -> array [T + 1, n, L].
 
-        The values with index t + 1 belong to step t. The values with index 0 are 0.
+        The first index is the time: values at index t + 1 belong to step t, and values at index 0 are 0.
         """
         shape = (len(self.index), self.task.scenario.vehicles)
         terms = {}
@@ -98,14 +102,15 @@ class Recording:
 
 
 def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Recording:
-    """Let an agent drive the learners of the scenario, and record the episodes with the rounded actions.
+    """Let an agent drive the learners of the scenario, and record the episodes.
 
     The commands of the agent are rounded to float32 actions, and the recorded episodes use these actions. Raises
-    ``PhysicsError`` with the worlds that the physics cannot simulate, and the exceptions of ``episode_engine``.
+    ``PhysicsError``, which names the worlds, if the physics cannot simulate some worlds. Also raises the exceptions of
+    ``episode_engine``.
 
     Args:
         sample: worlds at the alert.
-        driver: agent or team that drives.
+        driver: agent or team that drives the learners.
         name: name of the agent in the recording.
         task: scenario, seed, reward and observation of the recording.
 
@@ -145,14 +150,14 @@ def record_episodes(sample: Sample, driver: Driver, name: str, task: Task) -> Re
 
 
 def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -> tuple[Float32s, Floats]:
-    """Round commands to float32 actions such that the harm changes least.
+    """Round commands to float32 actions: to the nearest, down or up, whichever changes the harm of the world least.
 
     Returns the rounded actions, [T, n, L], and the change of the harm of each world, [n] m2/s2.
 
     Args:
         commanded: commands as exact actions in [-1, 1] (float64), [T, n, L].
         worlds: worlds at the alert, [n].
-        evaluated: harm of the episodes with the exact commands.
+        evaluated: harm of the episodes that were simulated with the exact commands.
         task: scenario, seed, reward and observation of the recording.
 
     """
@@ -172,7 +177,7 @@ def _rounded(commanded: Floats, worlds: Worlds, evaluated: Ledger, task: Task) -
 def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) -> Floats:
     """Return the difference between the harm with ``actions`` [T, n, L] and the harm ``evaluated``, [n] m2/s2.
 
-    The result is the larger one of the differences in first-impact harm and total harm.
+    The result is the absolute difference in first-impact harm or in total harm, whichever is larger.
     """
     engine = _learners_engine(worlds, task)
     step = 0
@@ -186,9 +191,11 @@ def _off_by(actions: Float32s, worlds: Worlds, evaluated: Ledger, task: Task) ->
 
 
 def _learners_engine(worlds: Worlds, task: Task) -> Engine:
-    """Return an engine in which learners take actions, as in an environment. The engine is at the alert of ``worlds``.
+    """Return an engine in which learners take actions, as in an environment.
 
-    ``task`` holds the scenario, reward, observation and seed of the engine.
+    The engine starts with ``worlds`` at the alert.
+
+    ``task`` contains the scenario, reward, observation and seed for the engine.
     """
     engine = Engine(
         task.scenario,

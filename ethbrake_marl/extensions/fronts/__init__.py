@@ -1,1 +1,1 @@
-"""The command ``study front``: harm of each vehicle for many choices of whose harm counts."""
+"""The command ``study front``: the harm that each vehicle bears if the vehicles' harms are weighted in many ways."""

@@ -19,7 +19,7 @@ DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front
 def front_command(
     output: FolderOption,
     scenario: Annotated[
-        str, typer.Option(metavar="NAME|PATH", help="Scenario whose learners are searched.")
+        str, typer.Option(metavar="NAME|PATH", help="Scenario whose learners the command controls.")
     ] = "paper-random",
     agents: Annotated[
         str | None,
@@ -32,27 +32,27 @@ def front_command(
     weights: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="W1,W2,...", help="One weight per vehicle. May be given several times.", show_default="a grid"
+            metavar="W1,W2,...", help="One weight for each vehicle. The option may be repeated.", show_default="a grid"
         ),
     ] = None,
     steps: Annotated[
-        int, typer.Option(help="Number of steps between the weights 0 and 1 in the grid.", min=1, max=50)
+        int, typer.Option(help="Number of steps from weight 0 to weight 1 in the default grid.", min=1, max=50)
     ] = 5,
     episodes: Annotated[int, typer.Option(help="Number of worlds.", min=2)] = 500,
-    seed: Annotated[int, typer.Option(help="Seed of the evaluation list.", min=0)] = 7,
-    budget: Annotated[int, typer.Option(help="Number of candidates per world and choice of weights.", min=1)] = 3000,
+    seed: Annotated[int, typer.Option(help="Seed of the list of worlds.", min=0)] = 7,
+    budget: Annotated[int, typer.Option(help="Profiles to try per world and choice of weights.", min=1)] = 3000,
     settings: SettingsOption = None,
     jobs: JobsOption = 1,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show how much harm each vehicle bears for many choices of whose harm counts.
+    """Show each vehicle's harm for many choices of whose harm counts.
 
-    For each choice of weights, the command searches every world for the least weighted harm. It compares the result
-    with agents (one learner only), with full braking, and with maximin, which minimises the largest harm of a vehicle.
-    The default weights are a grid, equal weights, and corners. In a corner, the harm of one vehicle counts first, and
-    the harm of the others decides between equal choices. Writes front.json, front.png and, for three vehicles,
-    front-ternary.png.
+    For each choice of weights, the search looks in every world for the commands with the least weighted harm. The
+    result is compared with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if
+    there is one learner, with agents. The default weights are a grid, equal weights, and one corner for each vehicle.
+    In a corner, one vehicle has the weight 1 and all other vehicles have a tiny weight. The command writes front.json,
+    front.png and, for three vehicles, front-ternary.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np

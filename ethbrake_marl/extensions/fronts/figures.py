@@ -1,4 +1,4 @@
-"""Figures of a front: a ternary plot of each vehicle's share of the harm, and the sum of harm against the largest."""
+"""Figures of a front: ternary plot of the vehicles' shares of harm, and plot of the largest harm against the sum."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Json = dict[str, Any]
 
 
 def front_figures(results: Json) -> dict[str, Figure]:
-    """Return the figures of ``results``, the content of ``front.json``, by file name.
+    """Return the figures of a front by file name. ``results`` is the content of ``front.json``.
 
-    The ternary plot is included only if there are three vehicles.
+    There is a ternary plot only if the line has three vehicles.
     """
     figures = {"front.png": sum_figure(results)}
     if len(results["vehicles"]) == 3:
@@ -42,7 +42,7 @@ def front_figures(results: Json) -> dict[str, Figure]:
 
 
 def sum_figure(results: Json) -> Figure:
-    """Draw the mean harm of the line against the mean harm of the vehicle that bears most.
+    """Draw the largest mean harm of a vehicle against the sum of all vehicles' mean harm.
 
     There is one point for each choice of weights. ``results`` is the content of ``front.json``.
     """
@@ -62,7 +62,7 @@ def sum_figure(results: Json) -> Figure:
 
 
 def ternary_figure(results: Json) -> Figure:
-    """Draw the share of the harm that each of three vehicles bears. The colour of a point is the harm of the line.
+    """Draw which shares of the harm the three vehicles bear. The colour of a point shows the sum of their harm.
 
     ``results`` is the content of ``front.json``.
     """
@@ -105,13 +105,16 @@ def ternary_figure(results: Json) -> Figure:
 
 
 def _places(shares: Floats) -> Floats:
-    """Return the coordinates of points in the triangle, [2, k], given the shares of the three vehicles, [k, 3]."""
+    """Return the coordinates, [2, k], of k points in the triangle whose corners are the vehicles.
+
+    Row k of ``shares`` [k, 3] contains the shares of harm that the three vehicles bear.
+    """
     places: Floats = (shares[:, :, np.newaxis] * _CORNERS).sum(axis=1).T
     return places
 
 
 def _series(results: Json) -> list[tuple[str, Floats, dict[str, Any]]]:
-    """Return the name, mean harm [W, N] (m2/s2) and style of the front, of full braking, maximin, and of each agent."""
+    """Return a tuple (name, mean harm [W, N] in m2/s2, style) for the front, full braking, maximin, and each agent."""
     count = results["harm_count"]
 
     def harm(points: Sequence[Mapping[str, Any]]) -> Floats:

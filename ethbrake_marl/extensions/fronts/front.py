@@ -1,7 +1,7 @@
 """The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
-Each world is searched independently. The means over the list form the convex part of the Pareto front of mean harm. The
-points are results of a search, without proven bounds.
+Because each world is searched by itself, the means over the list are points of the convex part of the Pareto front of
+mean harm. The points are the best that a search found. No bounds are proven.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ Progress = Callable[[int, int], None]  # called with the number of finished sear
 
 
 class Front(NamedTuple):
-    """Best command profiles of n worlds for W choices of weights, and the harm that each vehicle bears under them."""
+    """Best profiles in n worlds for each of W choices of weights, and the harm that each vehicle bears under them."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: HarmCount  # harm count that is weighted, ``first`` or ``total``
@@ -64,7 +64,7 @@ class Front(NamedTuple):
     def amounts(self) -> Floats:
         """Weighted harm of each world, [W, n] m2/s2: ``N sum_i w_i h_i / sum_i w_i``, as in the objective ``weighted``.
 
-        Here ``w_i`` is the weight of vehicle i and ``h_i`` its harm.
+        Here ``N`` is the number of vehicles, ``w_i`` the weight of vehicle i and ``h_i`` its harm.
         """
         return np.stack(
             [amounts_of(each, row) for each, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
@@ -73,21 +73,21 @@ class Front(NamedTuple):
     def mean(self, harm_count: HarmCount | None = None) -> Floats:
         """Return the mean harm of each vehicle over the worlds, [W, N] m2/s2.
 
-        ``harm_count`` is ``first`` or ``total``; None: the count that is weighted.
+        ``harm_count`` is ``first`` or ``total``; None: the count that the search minimised.
         """
         mean: Floats = self.borne[harm_count or self.harm_count].mean(axis=1)
         return mean
 
     def nondominated(self) -> Bools:
-        """Return True for profiles that no other profile of the same world dominates, [W, n].
+        """Return whether each profile is not dominated by another profile of the front for the same world, [W, n].
 
-        A profile dominates another one if no vehicle bears more harm and at least one vehicle bears less.
+        A profile dominates another profile if no vehicle bears more harm and at least one vehicle bears less.
         """
         return nondominated(self.borne[self.harm_count].transpose(1, 0, 2)).T
 
 
 def amounts_of(borne: Floats, weights: Floats) -> Floats:
-    """Return the weighted harm of n worlds, [n] m2/s2.
+    """Return the weighted harm of each of n worlds, [n] m2/s2, as in ``Front.amounts``.
 
     ``borne`` is the harm of each vehicle, [n, N] m2/s2. ``weights`` [N] are the weights of the vehicles.
     """
@@ -108,11 +108,11 @@ def search_front(
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    In every world, the result for a choice of weights has at most the weighted harm of ``CONSTANTS`` constant commands,
-    of the results for other weights, of the shipped profile, and of ``agents``. With one learner, this also holds for
-    every shipped policy that can drive the learner. The result for a world does not depend on ``threads`` or on the
-    other worlds. Raises ``InvalidInput`` in the cases of ``checked_weights``, ``best_harm`` and ``make_agents``, and if
-    ``agents`` are given for several learners.
+    In every world, the result for a choice of weights has at most the weighted harm of each of these: ``CONSTANTS``
+    constant commands, the results for other weights and, with one learner, the profile shipped for this world,
+    ``agents`` and every shipped policy that can drive the learner. The result for a world depends neither on
+    ``threads`` nor on the other worlds. Raises the exceptions of ``checked_weights``, ``best_harm`` and
+    ``make_agents``, and ``InvalidInput`` if ``agents`` are given but there are several learners.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -126,11 +126,11 @@ def search_front(
         worlds: worlds at t = 0, [n].
         weights: weights of the vehicles' harm, [W, N].
         harm_count: harm count that is weighted, ``first`` or ``total``.
-        budget: number of candidates per world and choice of weights.
+        budget: number of profiles to try for each world and choice of weights.
         seed: seed of the random search.
         threads: number of threads.
-        agents: specs of agents for the one learner, such as ``universal``. For each choice of weights, the agent drives
-            every world in the scenario with this ``harm_weight`` and the objective ``preference``.
+        agents: specs of agents for the one learner, such as ``universal``. For each choice of weights, the agents drive
+            every world, in the scenario with these weights as ``harm_weight`` and with the objective ``preference``.
         on_progress: function that is called with the number of finished searches and the number of all searches. There
             are two searches for each world and choice of weights.
 
@@ -164,16 +164,16 @@ def search_front(
 
 
 def least_largest(scenario: Scenario, worlds: Worlds, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
-    """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle.
+    """Search for commands that minimise the largest harm of a vehicle, and return the harm of each vehicle under them.
 
-    The result is an array [n, N] in m2/s2 for each harm count. The search is ``best_harm`` with the objective
-    ``maximin``. In every world, the largest harm is at most the largest harm at any point of ``front``.
+    The result is an array [n, N] in m2/s2 for each harm count. The function uses ``best_harm`` with the objective
+    ``maximin``. In every world, the largest harm of a vehicle is at most as large as under any profile of ``front``.
 
     Args:
         scenario: scenario of the worlds.
         worlds: worlds at t = 0, [n].
         front: front of the same worlds.
-        budget: number of candidates per world.
+        budget: number of profiles to try in each world.
         threads: number of threads.
 
     """
@@ -194,7 +194,7 @@ def _joined_borne(parts: Sequence[Borne]) -> Borne:
 
 
 class Preferring(NamedTuple):
-    """Scenario with fixed weights of the vehicles' harm, and agents made for this scenario."""
+    """Scenario with one choice of weights of the vehicles' harm, and agents made for this scenario."""
 
     scenario: Scenario  # scenario with fixed ``harm_weight`` and the objective ``preference``
     agents: Mapping[str, Driver]  # agents that are compared with the front, by spec
@@ -204,13 +204,13 @@ class Preferring(NamedTuple):
     def of(
         cls, scenario: Scenario, weights: Floats, agents: Sequence[str], silent: Sequence[str], harm_count: HarmCount
     ) -> Preferring:
-        """Return the scenario with the weights ``weights`` [N], and the agents made from their specs."""
+        """Return the scenario with ``weights`` [N], and agents for it from the specs ``agents`` and ``silent``."""
         fixed = scenario.replace(harm_weight=weights.tolist(), objective="preference")
         made = (make_agents(specs, fixed, harm_count=harm_count) for specs in (agents, silent))
         return cls(fixed, *made)
 
     def weighted(self, worlds: Worlds) -> Worlds:
-        """Return the worlds with their ``harm_weight`` replaced by the weights of this scenario."""
+        """Return the worlds with the weights of this scenario as their ``harm_weight``."""
         weight = np.broadcast_to(np.array(self.scenario.harm_weight, np.float64), worlds.speeds_mps.shape).copy()
         return replace(worlds, vehicles=replace(worlds.vehicles, harm_weight=weight))
 
@@ -233,15 +233,17 @@ def _searched(
     preferring: Sequence[Preferring],
     tell: Callable[[int], None],
 ) -> Front:
-    """Return the front of some worlds. There are two rounds, with one search per choice of weights in each round.
+    """Return the front of some worlds.
+
+    Each choice of weights is searched twice: the second search starts from the results of all first searches.
 
     Args:
         worlds: worlds at t = 0, [n].
-        task: scenario, controlled vehicles and harm count that is weighted.
+        task: scenario, controlled vehicles, and the harm count to minimise.
         weights: weights of the vehicles' harm, [W, N].
         effort: keyword arguments ``budget``, ``seed`` and ``threads`` of ``search_profiles``.
-        preferring: scenario and agents for each choice of weights.
-        tell: function that is called after each search with the number of worlds.
+        preferring: scenario and agents for each of the W choices of weights.
+        tell: function that is called after each search with the number of worlds that were searched.
 
     """
     problem, pool = task_problem(worlds, task), Pool()
@@ -276,7 +278,7 @@ def _searched(
 
 
 def observes_weights(agent: Driver) -> bool:
-    """Return whether the commands of an agent may depend on the weights.
+    """Return whether the commands of an agent may depend on the weights of the vehicles' harm.
 
     The result is False only for trained policies that do not observe the weights.
     """
@@ -285,14 +287,17 @@ def observes_weights(agent: Driver) -> bool:
 
 
 class Pool:
-    """Collection of profiles of the same worlds, from which the best profile is chosen for any weights."""
+    """Collection of profiles for the same worlds, from which the best ones for any weights can be chosen."""
 
     def __init__(self) -> None:
         self._profiles: list[Profiles] = []
         self._borne: dict[HarmCount, list[Floats]] = {count: [] for count in HARM_COUNTS}
 
     def add(self, problem: ProfileProblem, profiles: Profiles) -> Borne:
-        """Add one profile for each world of ``problem``. Return the harm of each vehicle, [n, N] m2/s2, by count."""
+        """Add one profile for each world of ``problem``.
+
+        Return the harm of each vehicle under these profiles, [n, N] m2/s2, by harm count.
+        """
         self._profiles.append(profiles)
         all_borne = problem.borne(profiles)
         for count, borne in all_borne.items():
@@ -300,10 +305,10 @@ class Pool:
         return all_borne
 
     def choice(self, weights: Floats, harm_count: HarmCount) -> Ints:
-        """Return the index of the profile with the least weighted harm in each world, [n].
+        """Return, for each world, the number of the added profile with the least weighted harm, [n].
 
-        Among equal profiles, the profile with the least sum of harm is chosen. ``weights`` [N] are the weights of the
-        vehicles' harm under ``harm_count``.
+        If several profiles have the least weighted harm, the one with the least sum of harm is chosen. ``weights`` [N]
+        are the weights of the vehicles, and ``harm_count`` is the count of harm that is weighted.
         """
         borne = np.stack(self._borne[harm_count])
         amounts = amounts_of(borne.reshape(-1, len(weights)), weights).reshape(borne.shape[:2])
@@ -312,7 +317,10 @@ class Pool:
         return np.asarray(np.where(amounts == least, whole, np.inf).argmin(axis=0))
 
     def best(self, weights: Floats, harm_count: HarmCount) -> Profiles:
-        """Return the profile with the least weighted harm in each world, [n]; for the arguments see ``choice``."""
+        """Return the profile with the least weighted harm in each of the n worlds.
+
+        The arguments are those of ``choice``.
+        """
         chosen = self.choice(weights, harm_count)
         parts = [(k, np.flatnonzero(chosen == k)) for k in np.unique(chosen)]
         padded = Profiles.padded([self._profiles[k].take(rows) for k, rows in parts], 1)
@@ -320,9 +328,12 @@ class Pool:
         return Profiles(*(np.concatenate(each)[back] for each in zip(*padded, strict=True)))
 
     def least(self, weights: Floats, harm_count: HarmCount) -> tuple[Borne, tuple[Profiles, ...]]:
-        """Return the harm, [W, n, N] m2/s2, and the profiles, W times [n], with the least weighted harm.
+        """Return the profiles with the least weighted harm for each of W choices of weights.
 
-        ``weights`` [W, N] are W choices of weights of the vehicles' harm under ``harm_count``.
+        The first result is the harm of each vehicle under these profiles, [W, n, N] m2/s2; the second is the W
+        profiles.
+
+        ``weights`` [W, N] are the choices of weights, and ``harm_count`` is the count of harm that is weighted.
         """
         chosen = [self.choice(row, harm_count) for row in weights]
         at = np.arange(len(chosen[0]))

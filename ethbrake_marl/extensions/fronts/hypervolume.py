@@ -1,4 +1,4 @@
-"""Nondominated points, and the volume that a set of points dominates."""
+"""Which of several points are nondominated, and the volume of the region that the points dominate."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of 
 
 
 def nondominated(points: Floats) -> Bools:
-    """Return True for points that no other point dominates, [..., Q].
+    """Return whether each of Q points is nondominated, which means that no other point dominates it, [..., Q].
 
     Smaller coordinates are better. A point dominates another point if it is at most as large in every coordinate, and
-    smaller in at least one. ``points`` [..., Q, N] are Q points with N coordinates.
+    smaller in at least one. ``points`` [..., Q, N] contains the N coordinates of the Q points.
     """
     one, other = points[..., :, np.newaxis, :], points[..., np.newaxis, :, :]
     beaten = (other <= one).all(axis=-1) & (other < one).any(axis=-1)
@@ -22,11 +22,10 @@ def nondominated(points: Floats) -> Bools:
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Return the volume of the region that the points dominate, up to the reference point.
+    """Return the volume of the region between the points and the reference point, which the points dominate.
 
-    Smaller coordinates are better. A point that is not below the reference in every coordinate adds no volume. The
-    result is exact: the volume is sliced along the last coordinate (Zitzler 1999, "hypervolume by slicing
-    objectives").
+    Smaller coordinates are better. A point counts only if it is below the reference point in every coordinate. The
+    result is exact: the volume is sliced along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.fronts.hypervolume import hypervolume
@@ -43,12 +42,12 @@ def hypervolume(points: Floats, reference: Floats) -> float:
     """
     if len(reference) > MOST_DIMENSIONS:
         raise InvalidInput(
-            f"hypervolume: {len(reference)} coordinates; give points with at most {MOST_DIMENSIONS} coordinates"
+            f"hypervolume: the points have {len(reference)} coordinates, but at most {MOST_DIMENSIONS} are allowed"
         )
     finite = np.isfinite(points).all() and np.isfinite(reference).all()
     if points.ndim != 2 or points.shape[1] != len(reference) or not finite:
         shapes = f"points {points.shape}, reference {reference.shape}"
-        raise InvalidInput(f"hypervolume: {shapes}: give finite numbers with the shapes [Q, N] and [N]")
+        raise InvalidInput(f"hypervolume: {shapes}: these must be finite numbers of the shapes [Q, N] and [N]")
     return _volume(points[(points < reference).all(axis=1)], reference)
 
 

@@ -1,4 +1,4 @@
-"""Results of a front: means with intervals, hypervolumes, and comparison with agents."""
+"""Results of a front: mean harms with intervals, hypervolumes, and a comparison with agents."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ def front_results(
 ) -> Json:
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
-    All means have 95 % intervals over worlds, or over recordings if the worlds come from recordings. The ``ratio`` of
-    an agent is its mean weighted harm divided by the mean weighted harm of the front, or null if the latter is 0. The
-    entry ``above`` is the mean difference between the two.
+    All means have 95 % intervals over worlds, or over recordings if the worlds come from recordings. For each choice of
+    weights, an agent's ``ratio`` is its mean weighted harm divided by that of the front, or null if that of the front
+    is 0. An agent's ``above`` is its mean weighted harm minus that of the front.
 
     Args:
         front: front to describe.
         scenario: scenario of the worlds.
-        sample: worlds of the front.
-        beside: harm of each vehicle, [n, N] m2/s2 by harm count, by name: ``full_brake``, and others such as
-            ``maximin``.
-        seed: seed of the list of worlds; None: unknown.
+        sample: worlds for which the front was searched.
+        beside: further results to include: name (``full_brake``, which is required, or others such as ``maximin``) ->
+            harm count -> harm of each vehicle, [n, N] m2/s2.
+        seed: seed of the list of worlds; None: the seed is unknown.
 
     """
     least, by = front.amounts, sample.clusters
@@ -90,18 +90,21 @@ def _vehicles(borne: Borne, by: Texts | None) -> Mapping[str, list[Json]]:
 
 
 def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None) -> list[Json]:
-    """Return the hypervolumes of the mean harm of the front and of each agent, for two reference points.
+    """Return the hypervolumes of the front and of each agent, for two reference points.
+
+    The points are the vehicles' mean harms for each choice of weights.
 
     The first reference point is the mean harm of full braking: only points that are better than full braking for every
-    vehicle contribute. The second reference point is the largest mean harm of each vehicle, under full braking or at
-    any point of the front: points that are worse than full braking for some vehicle contribute, too. ``share`` is an
-    agent's hypervolume divided by the front's hypervolume. Intervals are percentiles over ``RESAMPLES`` resamples of
-    the worlds, or of the clusters. Raises ``InvalidInput`` if an agent has the name ``front``.
+    vehicle contribute. The second reference point contains, for each vehicle, its largest mean harm under full braking
+    or at any point of the front: points that are worse than full braking for some vehicle contribute, too. ``share`` is
+    an agent's hypervolume divided by the front's hypervolume. The 95 % intervals are percentiles over ``RESAMPLES``
+    resamples of the worlds, or of the clusters if they are given. Raises ``InvalidInput`` if an agent has the name
+    ``front``.
 
     Args:
         front: front with the harm of the agents.
         full_brake: harm of each vehicle if the learners brake fully, [n, N] m2/s2.
-        clusters: name of each world's cluster, [n]; None: all worlds are independent.
+        clusters: name of the cluster (recording) to which each world belongs, [n]; None: all worlds are independent.
 
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
@@ -135,9 +138,9 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Texts | None = None
 
 
 def _interval(values: Floats) -> Json | None:
-    """Return the first of ``values`` with the 2.5 % and 97.5 % percentiles of the other values, as plain data.
+    """Return ``values[0]``, with the 2.5 % and 97.5 % percentiles of all other values as its interval, as plain data.
 
-    Returns None unless all values are finite.
+    Returns None if a value is not finite.
     """
     if not np.isfinite(values).all():
         return None
@@ -156,7 +159,7 @@ def full_braking(scenario: Scenario, sample: Sample) -> Borne:
 
 
 def front_sheet(results: Json) -> Sheet:
-    """Return a table of the harm of each vehicle for each choice of weights, and the ratios of the agents.
+    """Return a table with a row for each choice of weights: harm of each vehicle, and ``ratio`` of each agent.
 
     ``results`` is the content of ``front.json``.
     """

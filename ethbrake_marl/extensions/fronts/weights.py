@@ -21,8 +21,8 @@ SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides be
 def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     """Return a grid of W evenly spaced choices of weights that sum to 1, [W, N].
 
-    Two neighbouring rows differ by one step. Raises ``InvalidInput`` if ``steps`` is below 1, or if there are more than
-    ``MOST`` rows.
+    Between two neighbouring rows, the weight of one vehicle rises by one step and that of another falls by one step.
+    Raises ``InvalidInput`` if ``steps`` is below 1, or if the grid would have more than ``MOST`` rows.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -38,7 +38,7 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
     if number > MOST:
         raise InvalidInput(
             f"{steps} steps: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
-            f" {MOST:,} are allowed; give fewer steps, or list the weights"
+            f" {MOST:,} are allowed; give fewer steps, or give a list of weights"
         )
 
     def shares(number: int, left: int) -> Iterator[list[int]]:
@@ -54,18 +54,18 @@ def weight_grid(vehicles: int, steps: int = STEPS) -> Floats:
 
 
 def corners(vehicles: int) -> Floats:
-    """Return N choices of weights, [N, N]: in row i, the harm of vehicle i counts first.
+    """Return N choices of weights, [N, N]. In row i, vehicle i has the weight 1.
 
-    The harm of the other vehicles decides only between equal choices.
+    All other vehicles have the weight ``SLIGHT``, so their harm matters only if the harm of vehicle i is almost equal.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 
 
 def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) -> Floats:
-    """Return weights of the vehicles' harm as an array [W, N].
+    """Check W choices of weights of the N vehicles' harm, and return them as an array [W, N].
 
-    Raises ``InvalidInput`` if there are no rows, or if a row does not have one weight for each vehicle, has a weight
-    that is neither 0 nor from 1e-6 to 1e6, or has only zeros.
+    Raises ``InvalidInput`` if there are no rows, if a row does not contain one weight for each vehicle, if a weight is
+    neither 0 nor from 1e-6 to 1e6, or if a row contains only zeros.
     """
     rows = [checked_numbers("weights", row) for row in weights]
     for k, row in enumerate(rows):
@@ -73,7 +73,7 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
         if row.shape != (vehicles,) or not (good.all() and row.any()):
             text = ",".join(f"{weight:g}" for weight in row.ravel())
             raise InvalidInput(
-                f"weights[{k}] = {text}: the weights must be {vehicles} numbers, one per vehicle, each 0 or from 1e-6"
+                f"weights[{k}] = {text}: give {vehicles} numbers, one for each vehicle, each 0 or from 1e-6"
                 " to 1e6 and not all 0, for instance 1,4,1"
             )
     if not rows:
@@ -82,9 +82,9 @@ def checked_weights(weights: Sequence[Sequence[float]] | Floats, vehicles: int) 
 
 
 def parsed_weights(texts: Sequence[str], vehicles: int) -> Floats:
-    """Return weights that are written as texts such as ``1,4,1``, as an array [W, N].
+    """Convert W texts such as ``1,4,1``, each with the weights of N vehicles, into an array [W, N].
 
-    Raises ``InvalidInput`` for a text that is not a list of numbers, and in the cases of ``checked_weights``.
+    Raises ``InvalidInput`` if a text is not a list of numbers, and the exceptions of ``checked_weights``.
     """
     rows = []
     for text in texts:

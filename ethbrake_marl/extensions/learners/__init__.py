@@ -1,1 +1,1 @@
-"""Learning algorithms of this project: vine, mixtures of experts, rollout classification."""
+"""Learning algorithms of this project: vine (also with a mixture of experts) and rollout classification."""

@@ -1,4 +1,4 @@
-"""Actor of ``vine``: a network in training, and a copy with the running average of its weights, which drives."""
+"""Actor of ``vine``: a network in training, and a copy of it with averaged weights, which the trained policy uses."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from ethbrake_marl.training.networks import ACTIVATIONS, sb3_names, tensors_of
 class Deterministic(BasePolicy):
     """Base class of policies without exploration noise: actions are the network's outputs, clipped to [-1, 1].
 
-    A subclass defines ``forward``, and either ``means`` or ``act``. For a recipe of ``vine`` with ``focus`` above 0 it
-    also defines ``expect``. In all methods, F is the number of features of an observation.
+    A subclass defines ``forward``, and either ``means`` or ``act``. For a recipe of ``vine`` with ``focus`` above 0,
+    the subclass also defines ``expect``. In all methods, ``rows`` is the number of observations, and F is the number of
+    features of an observation.
     """
 
     def means(self, observation: Float32s) -> Float32s:
@@ -34,7 +35,7 @@ class Deterministic(BasePolicy):
         raise NotImplementedError
 
     def expect(self, observation: Float32s) -> Floats:
-        """Return the expected absolute gradient of the return with respect to the action, [rows].
+        """Return the predicted absolute gradient of the return with respect to the action, [rows].
 
         ``observation`` [rows, F] are the observations.
         """
@@ -45,7 +46,10 @@ class Deterministic(BasePolicy):
         return np.clip(self.means(observation), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of the averaged weights, by their names in a policy bundle that ``network`` describes."""
+        """Return copies of the averaged weights, by name.
+
+        The names are those in a policy bundle whose network is ``network``.
+        """
         return tensors_of(self, network)
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> Tensor:
@@ -54,14 +58,14 @@ class Deterministic(BasePolicy):
 
 
 class AveragedActor(Deterministic):
-    """Actor with two copies of its network: one in training (``learning``), and the running average of its weights.
+    """Actor whose network exists twice: ``learning`` is in training, ``average`` has a running average of its weights.
 
-    A trained policy uses the averaged weights. They have the names that Stable-Baselines3's PPO gives its weights.
+    A trained policy uses the averaged weights. These weights have the names that they have in Stable-Baselines3's PPO.
 
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: function from the share of the training that remains (1 to 0) to the learning rate.
+        rate: learning rate as a function of the share of the training that remains (1 to 0).
         recipe: recipe of the training, which also describes the network.
 
     """
@@ -94,7 +98,10 @@ class AveragedActor(Deterministic):
             learns.copy_(mean)
 
     def take_over(self, tensors: Mapping[str, Float32s]) -> None:
-        """Copy the weights of a policy bundle into both copies of the network. ``tensors`` maps name to weights."""
+        """Copy the weights of a policy bundle into both copies of the network.
+
+        ``tensors`` maps the name of each tensor to its weights.
+        """
         state = self.state_dict()
         for name, theirs in sb3_names(self._spec).items():
             state[theirs].copy_(torch.from_numpy(tensors[name]))

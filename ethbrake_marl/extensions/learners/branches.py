@@ -1,8 +1,8 @@
-"""Branches: copies of a running episode that are played to the end with different actions.
+"""Branches: copies of a running episode. Each copy is simulated to its end with slightly different actions.
 
-In a branch, an offset is added to one learner's actions for a few steps. After these steps the policy acts without an
-offset. Two branches that start in the same state differ only in the offset. Their physics and their random messages are
-the same, bit for bit.
+In a branch, an offset is added to one learner's actions for a few steps. After these steps the policy's actions are
+used without an offset. Two branches that start in the same state differ only in the offset: their random numbers (for
+lost messages) are the same.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ class Offsets(NamedTuple):
 
 
 def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Play every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
+    """Simulate every branch (copy of a running episode) to its end, with an offset added to one learner's actions.
 
     Args:
-        engine: engine whose n rows are the branches to play; it is changed.
+        engine: engine whose n rows are the branches; the engine is changed.
         act: policy of all learners: a function from observations to actions.
-        offsets: offset of each row, with its learner and its number of steps.
+        offsets: for each row, the offset, the learner that gets the offset, and the number of steps.
         gamma: discount of one time step.
 
-    Returns two arrays [n]. The first is the discounted return, from the start of the branch, of the learner with the
-    offset (NaN for a row whose simulation failed). The second is the change of that learner's action after clipping to
-    [-1, 1], summed over the steps. If harm is the only term of the reward, a row ends as soon as all its vehicles are
-    at rest for good.
+    Returns two arrays [n]. The first array contains the discounted return, from the start of the branch, of the learner
+    with the offset (NaN for a row whose simulation failed). The second array contains the change of this learner's
+    action after clipping to [-1, 1], summed over the steps. If harm is the only term of the reward, a row ends as soon
+    as all its vehicles are at rest and will stay at rest.
 
     """
     moved, most = np.zeros(engine.n), int(offsets.steps.max(initial=0))
@@ -73,19 +73,20 @@ def play_to_the_end(engine: Engine, act: Act, offsets: Offsets, gamma: float) ->
 
 
 def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) -> Floats:
-    """Play every row of an engine to the end of its episode, and return each learner's discounted return, [n, L].
+    """Simulate every row (world) of an engine to its end, and return each learner's discounted return, [n, L].
 
-    n is the number of rows, L of learners, F of features, m of rows that still run.
+    In the shapes, n is the number of rows (worlds), m of rows that still run, L of learners, and F of observed
+    features.
 
     Args:
-        engine: engine whose rows are played; it is changed.
-        decide: function of the observations [m, L, F], the numbers of the rows that still run [m], and the number of
-            steps so far. It returns the learners' actions [m, L].
+        engine: engine whose rows (worlds) are simulated; the engine is changed.
+        decide: function with three arguments: the observations [m, L, F], the numbers of the rows that still run [m],
+            and the number of steps so far. The function returns the actions of the learners, [m, L].
         gamma: discount of one time step.
-        at_least: number of steps that every row makes before it may end early.
+        at_least: number of steps that every row runs before it may end early.
 
-    If harm is the only term of the reward, a row ends early as soon as all its vehicles are at rest for good. The
-    return is NaN for a row whose simulation failed.
+    If harm is the only term of the reward, a row ends early as soon as all its vehicles are at rest and will stay at
+    rest. The return is NaN for a row whose simulation failed.
 
     """
     vehicles = np.array(engine.learners, np.int64)
@@ -108,10 +109,10 @@ def play_on(engine: Engine, decide: Decide, gamma: float, *, at_least: int = 0) 
 
 
 def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
-    """Play every row of an engine to the end of its episode, and return all observations and states on the way.
+    """Simulate every row (world) of an engine to its end, and return the observations and states of all steps.
 
     ``act`` is the policy of all learners. Returns the observations [m, L, F] and the states of the worlds at the m
-    decisions of all rows, in the order of time. L is the number of learners, F the number of features.
+    decisions of all rows, ordered by time. L is the number of learners, F the number of features.
     """
     seen_then, moments = [], []
 
@@ -125,11 +126,11 @@ def visit(engine: Engine, act: Act) -> tuple[Observations, State]:
 
 
 def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
-    """Return for each of ``rows`` [m] whether all vehicles stand and will keep standing, [m] bool.
+    """Return whether all vehicles of a row are at rest and will stay at rest, [m] bool, for each of ``rows`` [m].
 
-    ``before`` [m, columns] is the packed state of these rows one step earlier. A row counts as standing only if nothing
-    has changed since, and if no latency that ends later can change the observation: a policy may act differently on a
-    new observation.
+    ``before`` [m, columns] is the packed state of these rows one step earlier. The result is True only if nothing has
+    changed in this step and if no latency is still running. The end of a latency may change the observation, and then a
+    policy may move the vehicles again.
     """
     if engine.packed.has_messages or engine.in_pieces:
         return np.zeros(len(rows), np.bool_)  # a message may still change the observation, or a profile the command
@@ -140,12 +141,12 @@ def _stands_for_good(engine: Engine, before: Floats, rows: Ints) -> Bools:
 
 @compiled
 def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, stands: Bools) -> None:
-    """Write into ``stands`` [m], for each of ``rows`` [m], whether all vehicles are at rest for good.
+    """Write into ``stands`` [m], for each of ``rows`` [m], whether all vehicles are at rest and will stay at rest.
 
     Args:
         state: packed state of all rows of an engine.
-        before: [m, columns] packed state of ``rows`` one step earlier.
-        params: packed constants of all rows.
+        before: [m, columns] packed state of ``rows`` one time step earlier.
+        params: packed constants of the worlds in all rows.
         rows: [m] numbers of the rows to check.
         stands: [m] array for the result; it is overwritten.
 
@@ -168,7 +169,7 @@ def find_standing(state: Floats, before: Floats, params: Floats, rows: Ints, sta
 
 
 def counted_harm(engine: Engine, count: HarmCount) -> Floats:
-    """Return the harm so far that each learner of an engine minimises, [n, L] m2/s2.
+    """Return the harm so far that each of the L learners of an engine should make small, [n, L] m2/s2.
 
     This harm is the learner's objective if the reward has objectives, else the harm of the whole line. ``count`` is the
     count of harm: ``first`` (each pair's first impact) or ``total`` (all impacts).
@@ -181,14 +182,14 @@ def counted_harm(engine: Engine, count: HarmCount) -> Floats:
 
 
 def other_count(count: HarmCount) -> HarmCount:
-    """Return the other count of harm: ``total`` (all impacts) for ``first`` (first impacts), and the reverse."""
+    """Return the count of harm that is not ``count``: ``total`` for ``first``, and ``first`` for ``total``."""
     return "total" if count == "first" else "first"
 
 
 def moving_rows(moments: State) -> Bools:
-    """Return for each of the n states ``moments`` whether at least one vehicle moves, [n] bool.
+    """Return, for each of the n states ``moments``, whether at least one vehicle moves, [n] bool.
 
-    Training leaves out states in which all vehicles stand, because actions have no effect in them.
+    A training ignores states in which all vehicles are at rest, because actions have no effect there.
     """
     column = moments.packed.column
     moving: Bools = (moments.motion[:, column.speed : column.command] != 0.0).any(axis=1)

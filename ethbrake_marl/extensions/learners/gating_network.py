@@ -19,17 +19,17 @@ from ethbrake_marl.training.networks import ACTIVATIONS
 
 
 class AveragedGatingNetwork(nn.Module):
-    """Gating network: it chooses one of K experts (networks that drive) from an observation of F features.
+    """Gating network: from an observation of F features it chooses which of K experts (networks) acts.
 
-    The network exists twice. ``learning`` is in training. ``average`` has the running average of the weights of
-    ``learning``, and chooses.
+    The network exists twice: ``learning`` is in training; ``average`` has the running average of its weights, and makes
+    the choice.
 
-    A memory stores the last M decisions at which the experts were compared. For each decision it stores the observation
-    and the extra cost of each expert: its cost minus the cost of the best expert.
+    A memory stores the last M decisions at which the experts were compared: the observation, and the extra cost of each
+    expert. The extra cost is the cost of the expert minus the cost of the cheapest expert.
 
     Args:
         inputs: number F of features of an observation.
-        rate: function from the share of the training that remains (1 to 0) to the learning rate.
+        rate: learning rate as a function of the share of the training that remains (1 to 0).
         recipe: recipe with the key ``experts``.
 
     """
@@ -54,7 +54,7 @@ class AveragedGatingNetwork(nn.Module):
         self.register_buffer("compared", torch.zeros(1, dtype=torch.int64))
 
     def remember(self, seen: Float32s, more: Float32s) -> None:
-        """Add m decisions to the memory: observations ``seen`` [m, F] and extra costs ``more`` [m, K]."""
+        """Add m decisions to the memory: observations ``seen`` [m, F] and the experts' extra costs ``more`` [m, K]."""
         places = torch.arange(int(self.compared), int(self.compared) + len(seen)) % len(self.seen)
         self.seen[places], self.more[places] = torch.from_numpy(seen), torch.from_numpy(more)
         self.compared += len(seen)

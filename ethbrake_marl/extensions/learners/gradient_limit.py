@@ -1,4 +1,4 @@
-"""Recipe setting ``gradient_limit: auto``: choose the gradient limit and the smallest offset from recent gradients."""
+"""Recipe setting ``gradient_limit: auto``: compute the gradient limit and the smallest offset from recent gradients."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ NARROWEST = 4.0  # least ratio of the largest offset to the smallest; takes prec
 
 
 def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit for gradients with which clipping lowers the sum of absolute gradients by ``share``.
+    """Return the limit at which clipping gradients lowers the sum of their absolute values by the fraction ``share``.
 
     ``sizes`` [n] are absolute gradients. For example, clipping ``[1, 1, 4]`` at 2 lowers the sum from 6 to 4, which is
-    one third less. The limit for the share 1/3 is therefore 2.
+    one third less. Therefore the limit for these gradients and ``share`` = 1/3 is 2.
     """
     rising = np.sort(sizes)
     remaining = (
@@ -32,14 +32,14 @@ def limit_that_cuts(sizes: Floats, share: float) -> float:
 def smallest_offset(measured: Floats, least: float, most: float) -> float:
     """Return the smallest offset (change of an action) with which gradients should be measured.
 
-    A smooth harm gives similar gradients at all offsets. A harm that jumps gives larger gradients at smaller offsets.
-    The result is the offset at which the root mean square of the gradients is expected to be ``SPREAD`` times as large
-    as at ``most``. It is at most ``most / NARROWEST`` and at least ``least``. If gradients are not larger at small
-    offsets, the result is ``least``.
+    If the harm is a smooth function of the action, all offsets give similar gradients. If the harm jumps, smaller
+    offsets give larger gradients. The result is the offset at which the root mean square of the gradients should be
+    ``SPREAD`` times as large as at the offset ``most``. The result is at most ``most / NARROWEST`` and at least
+    ``least``. If gradients are not larger at small offsets, the result is ``least``.
 
     Args:
-        measured: [n, 2] absolute gradient, and the offset with which it was measured (0: no measurement yet). The half
-            of the measurements with the smaller offsets is compared with the other half.
+        measured: [n, 2] absolute gradient, and the offset with which the gradient was measured (0: not measured yet).
+            The half of these rows with the smaller offsets is compared with the half with the larger offsets.
         least: lower end of the range of offsets.
         most: upper end of the range of offsets.
 

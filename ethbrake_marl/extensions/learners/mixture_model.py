@@ -1,4 +1,4 @@
-"""Training of a mixture of experts: several networks that drive, and a gating network that chooses one of them."""
+"""Training of a mixture of experts: several networks, and a gating network that chooses which of them acts."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class ExpertsModel(VineModel):
-    """Model that trains a mixture of experts: several networks that drive, and a gating network that chooses.
+    """Model that trains a mixture of experts: several networks, and a gating network that chooses which of them acts.
 
-    The training has four stages. It trains the first expert in all worlds, then each other expert in worlds that are
-    selected for this expert, then the gating network, then all networks jointly.
+    The training has four stages. They train the first expert in all worlds, then each other expert in worlds that are
+    selected for this expert, then the gating network, and at last all networks jointly.
 
     Args:
         environment: environment of the training.
@@ -92,14 +92,14 @@ class ExpertsModel(VineModel):
         update_learning_rate(optimizers, rate)
 
     def _enter(self, stage: Stage, number: int) -> None:
-        """Prepare a stage of the training that begins, or is resumed, at update ``number``.
+        """Prepare a stage of the training. The stage begins, or is resumed, at update ``number``.
 
-        If the stage trains an expert after the first one, select the worlds for its training. Let this expert imitate
-        templates (random braking profiles) that do better than the earlier experts.
+        If the stage trains an expert other than the first one, the method lets this expert imitate templates (random
+        braking profiles) that do better than the earlier experts, and selects the worlds for its training.
 
-        The preparation depends on the earlier experts only. A resumed training therefore repeats it exactly.
+        The preparation depends only on the earlier experts, so a resumed training repeats the preparation exactly.
 
-        Raises ``NoBetterTemplate`` if no template does better, or no world is suitable.
+        Raises ``NoBetterTemplate`` if no template does better than the earlier experts, or if no world is selected.
         """
         self._stage, self._own = stage, None
         if stage.trains != "other":
@@ -114,7 +114,7 @@ class ExpertsModel(VineModel):
         self._own = own_worlds(engine, self.plan, explored, pupil.act, gamma)
         if len(shown.action) == 0 or len(self._own.motion) == 0:
             raise NoBetterTemplate(
-                f"experts: no use for expert {stage.network + 1}: in none of the {self.plan.worlds:,} worlds does one"
+                f"experts: expert {stage.network + 1} is useless: in none of the {self.plan.worlds:,} worlds does one"
                 f" of the {self.plan.templates} templates exceed the return of the earlier experts by"
                 f" {self.plan.gain:g}; set fewer networks, or leave out experts"
             )
@@ -122,7 +122,7 @@ class ExpertsModel(VineModel):
             self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
 
     def _imitate(self, pupil: AveragedActor, shown: Shown, seed: int) -> None:
-        """Train the expert ``pupil`` to imitate the actions of ``shown``; ``seed`` determines the order of batches."""
+        """Train the expert ``pupil`` to imitate the actions of ``shown``; ``seed`` sets the order of decisions."""
         pupil.optimizer = adam(self.lr_schedule(1.0), pupil.learning)
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
@@ -135,10 +135,11 @@ class ExpertsModel(VineModel):
         follow(pupil.average, pupil.learning, 0.0)
 
     def _compare(self, seen: Float32s, moments: State) -> tuple[Float32s, Floats, Float32s]:
-        """Let each of the K experts play to the end of the episode from B of the visited decisions; return the costs.
+        """From B of the visited decisions, let each of K experts drive to the end of the episode; return the costs.
 
-        The cost of an expert is minus its return, plus ``tie_break`` times its harm in the count of harm that the
-        reward does not use. The B decisions are drawn from those at which the experts take different actions.
+        The cost of an expert is minus its return, plus ``tie_break`` times its harm. This harm is counted in the way
+        (first impacts or all impacts) that the reward does not use. The B decisions are drawn from the decisions at
+        which the experts choose different actions.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
@@ -166,12 +167,13 @@ class ExpertsModel(VineModel):
     def _train_gate(self, seen: Float32s, costs: Floats, importance: Float32s | None = None) -> None:
         """Train the gating network to choose the cheapest expert.
 
-        A wrong choice counts in the loss in proportion to its extra cost over the cheapest expert.
+        In the loss, a wrong choice has a weight in proportion to its extra cost: its cost minus the cost of the
+        cheapest expert.
 
         Args:
             seen: [B, F] observations.
             costs: [B, K] cost of each expert.
-            importance: [B] factor of each decision in the loss; None: 1.
+            importance: [B] factor of each decision in the loss; None: all factors are 1.
 
         """
         importance = np.ones(len(seen), np.float32) if importance is None else importance

@@ -9,7 +9,10 @@ from ethbrake_marl.training.recipe import Fraction, Layers, NonNegative, Positiv
 
 
 class Shares(FileModel):
-    """Share (0 to 1) of all updates for each stage of training a mixture of experts. The four shares sum to 1."""
+    """Share (0 to 1) of all updates that each stage of the training of a mixture of experts gets.
+
+    The four shares sum to 1.
+    """
 
     pretraining_first: Fraction  # share for the first expert, which is trained in all worlds
     pretraining_others: Fraction  # share for the other experts together; each is trained in worlds selected for it
@@ -25,11 +28,11 @@ class Shares(FileModel):
 
 
 class ExpertsPlan(FileModel):
-    """Settings of a mixture of experts: several networks that drive, and a gating network that chooses one of them.
+    """Settings of a mixture of experts: several networks, and a gating network that chooses which of them acts.
 
-    Each expert after the first is pre-trained in two steps. First, it imitates templates (random braking profiles) in
-    worlds in which a template does better than all earlier experts. Then it is trained in the worlds in which it is
-    nearly as good as the best earlier expert, or better.
+    Each expert after the first is pre-trained in two steps. First, the new expert imitates templates (random braking
+    profiles) in worlds in which a template does better than all earlier experts. Then the new expert is trained in the
+    worlds in which it is better than the best earlier expert, or nearly as good.
     """
 
     networks: int = Field(ge=2, le=16, description="number of experts")

@@ -1,4 +1,4 @@
-"""Policy made of several actors (experts) and a gating network that chooses one of them at each decision."""
+"""Policy made of several actors (experts) and a gating network, which chooses one of the actors at each decision."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ExpertsPolicy(Deterministic):
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: function from the share of the training that remains (1 to 0) to the learning rate.
+        rate: learning rate as a function of the share of the training that remains (1 to 0).
         recipe: recipe with the key ``experts``.
 
     """

@@ -23,10 +23,10 @@ class Stage(NamedTuple):
 
 
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training in their order. A stage may be empty.
+    """Return the stages of a training, earliest first. A stage may contain no updates.
 
     Args:
-        plan: value of the recipe's key ``experts``, with the share of each stage.
+        plan: value of the recipe's key ``experts``, which contains the share of each stage.
         updates: number of updates in the whole training.
 
     """

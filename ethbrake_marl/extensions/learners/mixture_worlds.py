@@ -1,4 +1,4 @@
-"""Selection of worlds and templates for a new expert of a mixture.
+"""Selection of worlds and templates with which a new expert of a mixture is trained.
 
 A *template* is a random braking profile. A new expert imitates templates that do better than all earlier experts.
 """
@@ -44,7 +44,7 @@ class Shown(NamedTuple):
 
 
 def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float) -> Explored:
-    """Let every earlier expert drive in the first ``plan.worlds`` worlds of the training; return the best results.
+    """Let every earlier expert drive the first ``plan.worlds`` worlds of the training; return the best results.
 
     Args:
         engine: engine of the training; it is not changed.
@@ -64,17 +64,17 @@ def explore(engine: Engine, plan: ExpertsPlan, acts: Sequence[Act], gamma: float
 def drive_from(
     engine: Engine, start: State, act: Act, gamma: float, count: HarmCount | None = None
 ) -> tuple[Floats, Floats]:
-    """Let one policy drive from n states to the end of each episode; return its return and harm.
+    """Let one policy drive from each of n states to the end of the episode, and return its returns and harms.
 
     Args:
         engine: engine of the training; it is not changed.
-        start: the n states at which the policy begins.
+        start: the n states from which the policy drives.
         act: policy: a function from observations [rows, F] to actions [rows].
         gamma: discount of one time step.
-        count: impacts that count as harm, ``first`` or ``total``; None: the count of the reward.
+        count: count of harm, ``first`` or ``total``; None: the count that the reward uses.
 
-    Returns two arrays [n] for the first learner: its return (NaN for a row whose simulation failed), and the harm
-    (m2/s2) that it minimises.
+    Returns two arrays [n] for the first learner: its return (NaN if the simulation failed), and the harm that it should
+    make small (m2/s2).
 
     """
     rows = engine.branch(start)
@@ -84,10 +84,10 @@ def drive_from(
 
 
 def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma: float, seed: int) -> Shown:
-    """Draw templates (random braking profiles), and return the decisions of the templates that beat all experts.
+    """Draw templates (random braking profiles), and return the decisions of those that do better than all experts.
 
-    For each world, ``plan.templates`` templates are drawn. The best of them is returned if its return exceeds the best
-    expert's by more than ``plan.gain``.
+    For each world, ``plan.templates`` templates are drawn. The decisions of the best of these templates are returned if
+    its return exceeds that of the best expert by more than ``plan.gain``.
 
     Args:
         engine: engine of the training; it is not changed.
@@ -133,9 +133,9 @@ def show_templates(engine: Engine, plan: ExpertsPlan, explored: Explored, gamma:
 def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, gamma: float) -> State:
     """Return the starting states of the worlds in which a new expert is to be trained.
 
-    A world is selected if the return of the new expert is less than ``plan.margin`` below the return of the best
-    earlier expert. Two kinds of worlds are left out: worlds in which both returns are equal, and worlds in which an
-    earlier expert does no harm.
+    A world is selected if the return of the new expert is larger than the return of the best earlier expert minus
+    ``plan.margin``. Worlds in which the two returns are equal, or in which an earlier expert does no harm, are not
+    selected.
 
     Args:
         engine: engine of the training; it is not changed.
@@ -152,4 +152,4 @@ def own_worlds(engine: Engine, plan: ExpertsPlan, explored: Explored, act: Act, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """Raised if no template (random braking profile) does better than the earlier experts; a new one is of no use."""
+    """Raised if no template (random braking profile) does better than the earlier experts: a new one is useless."""

@@ -11,7 +11,7 @@ from torch.optim import Optimizer
 
 
 class Adam(torch.optim.Adam):
-    """Torch's optimiser Adam without torch's decorators. Its results are the same, bit for bit.
+    """Torch's optimiser Adam without torch's decorators. The results are the same as with them, bit for bit.
 
     The decorators would import torch's compiler, which takes 1 to 3 s of processor time.
     """
@@ -41,7 +41,7 @@ def follow(average: Iterable[Tensor], learning: nn.Module, keep: float) -> None:
     Args:
         average: averaged weights in the order of ``learning.parameters()``; they are changed.
         learning: network in training, whose weights are averaged.
-        keep: share of the average that remains, from 0 to 1.
+        keep: weight of the old average, from 0 to 1.
 
     """
     for mean, learns in zip(average, learning.parameters(), strict=True):

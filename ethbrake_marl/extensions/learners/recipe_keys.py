@@ -12,7 +12,7 @@ from ethbrake_marl.training.recipe import Rate
 
 
 class OffsetRange(FileModel):
-    """Range from which a distance between two actions is drawn. The logarithm of the distance is uniform.
+    """Range from which a distance between two actions is drawn. The logarithm of the distance is uniformly distributed.
 
     Actions are numbers from -1 (full braking) to 1.
     """
@@ -24,7 +24,7 @@ class OffsetRange(FileModel):
     @classmethod
     def _in_order(cls, value: float, info: ValidationInfo) -> float:
         if "smallest" in info.data and not value >= info.data["smallest"]:
-            raise ValueError(f"must be at least smallest, which is {info.data['smallest']:g}")
+            raise ValueError(f"must be at least as large as smallest, which is {info.data['smallest']:g}")
         return value
 
 

@@ -20,7 +20,7 @@ class RolloutClassification(Algorithm):
     """The algorithm rollout classification. One actor drives all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model for a training. It learns in ``environment``.
+        """Return a new model for a training. The model learns in ``environment``.
 
         The untrained model acts as the first policy of the recipe's key ``policies``; without this key it brakes fully.
         """
@@ -31,9 +31,9 @@ class RolloutClassification(Algorithm):
         return RolloutClassificationModel(environment, recipe, weights)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by their names in a policy bundle.
+        """Return copies of an actor's averaged weights, by name.
 
-        ``network`` describes the network in the bundle.
+        The names are those in a policy bundle whose network is ``network``.
         """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors

@@ -1,4 +1,7 @@
-"""Actor that scores a number of actions and takes the best one. A memory stores the costs of tried actions."""
+"""Actor that gives each of several actions a score, and takes the action with the highest score.
+
+A memory stores the costs of tried actions.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ from ethbrake_marl.training.networks import ACTIVATIONS, copy_of, tensors_of_lay
 class _TorchActor(Actor):
     """``Actor`` (the network of a policy) with the matrix products of torch instead of numpy.
 
-    It is three times as fast. Its outputs differ from those of ``Actor`` by rounding.
+    This class is three times as fast as ``Actor``. The outputs of the two classes differ only by rounding.
     """
 
     @torch.no_grad()
@@ -43,22 +46,23 @@ class _TorchActor(Actor):
 
 
 class ChoosingActor(Deterministic):
-    """Actor whose network scores a number of choices; it takes the choice with the highest score.
+    """Actor whose network gives each of several choices a score. The actor takes the choice with the highest score.
 
-    Choices are numbered. A number below ``first`` means a trained policy, which then decides on the action. Each
-    other number means an action; the actions are evenly spaced from -1 to 1. The network ``learning`` is in training.
-    The network ``average`` has the running average of its weights, and drives.
+    Choices are numbered. The choices are numbered. A number below ``first`` stands for a trained policy, which then
+    decides on the action. Each larger number stands for an action; these actions are evenly spaced from -1 to 1. The
+    network ``learning`` is in training. The network ``average`` has the running average of its weights, and chooses
+    when the actor drives.
 
-    A memory stores the last M decisions at which C choices were tried. The *extra cost* of a choice is its cost minus
-    the cost of the best tried choice. F is the number of features.
+    A memory stores the last M decisions at which C choices were compared. The *extra cost* of a choice is its cost
+    minus the cost of the cheapest choice at the same decision. F is the number of features.
 
     Args:
         observation_space: Gymnasium space of an observation.
         action_space: Gymnasium space of an action.
-        rate: function from the share of the training that remains (1 to 0) to the learning rate.
+        rate: learning rate as a function of the share of the training that remains (1 to 0).
         recipe: recipe of the training.
-        policies: weights by name of each trained policy that the actor can choose.
-        members: number of scenarios in the mixture on which the actor is trained; 1 without a mixture.
+        policies: weights of each trained policy that the actor can choose, by name of the tensor.
+        members: number of scenarios in the mixture on which the actor is trained; 1 if the scenario is no mixture.
 
     """
 
@@ -101,10 +105,10 @@ class ChoosingActor(Deterministic):
 
     @torch.no_grad()
     def choose(self, observation: Float32s) -> Ints:
-        """Return the number of the choice with the highest score, [rows], for each of the observations [rows, F].
+        """Return, for each of the observations [rows, F], the number of the choice with the highest score, [rows].
 
-        A number below the attribute ``first`` means a policy. A larger number means an action: ``first`` is the action
-        -1, the largest number is the action 1, and the numbers between them are evenly spaced.
+        A number below the attribute ``first`` stands for a policy. The numbers from ``first`` on stand for actions that
+        are evenly spaced from -1 to 1.
         """
         chosen: Ints = self.average(torch.from_numpy(observation)).argmax(dim=1).numpy()
         return chosen
@@ -126,8 +130,8 @@ class ChoosingActor(Deterministic):
 
         Args:
             seen: [m, F] observations.
-            tried: [m, C] numbers of the tried choices, as from ``choose``; the actor itself took column 0.
-            more: [m, C] extra cost of each tried choice over the best one.
+            tried: [m, C] numbers of the tried choices, as from ``choose``; column 0 is the choice of the actor itself.
+            more: [m, C] extra cost of each tried choice.
 
         """
         places = torch.arange(int(self.known), int(self.known) + len(seen)) % len(self.seen)
@@ -138,14 +142,14 @@ class ChoosingActor(Deterministic):
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Draw decisions from the memory for several gradient steps.
 
-        Yields, for each gradient step, the rows of the decisions in the memory and their importance (weight in the
-        loss), both [count].
+        Yields, for each gradient step, the row numbers of the drawn decisions in the memory, [count], and their
+        importance (weight in the loss), [count].
 
         Args:
             batches: number of gradient steps.
-            count: number of decisions for each step.
-            focus: share of the decisions that are drawn in proportion to the largest extra cost of a tried choice; the
-                rest is drawn uniformly.
+            count: number of decisions for each gradient step.
+            focus: share of the decisions that are drawn in proportion to their largest extra cost; the rest is drawn
+                uniformly.
 
         """
         known = min(int(self.known), len(self.seen))
@@ -159,15 +163,15 @@ class ChoosingActor(Deterministic):
             yield torch.from_numpy(rows[part]), torch.from_numpy(importance[part])
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Return the loss at decisions of the memory: the expected extra cost of a choice, plus a convex term.
+        """Return the loss at some decisions of the memory: the expected extra cost of the choice, plus a convex term.
 
-        The expected extra cost uses the softmax of the scores as probabilities. Its gradient nearly vanishes where a
-        probability is close to 0 or 1. The convex term has a gradient there too. It lowers the score of every tried
-        choice except the best one, in proportion to the extra cost.
+        The expected extra cost uses the softmax of the scores as probabilities. The gradient of this expectation nearly
+        vanishes if a probability is close to 0 or 1. The gradient of the convex term does not. The convex term lowers
+        the score of every tried choice except the cheapest one, in proportion to the extra cost.
 
         Args:
-            some: row numbers of the decisions in the memory.
-            importance: factor of each decision.
+            some: row numbers of these decisions in the memory.
+            importance: factor of each decision in the loss.
             guide: weight of the convex term.
 
         """

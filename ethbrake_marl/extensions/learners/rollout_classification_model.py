@@ -34,7 +34,7 @@ class RolloutClassificationModel(VineModel):
     Args:
         environment: environment of the training.
         recipe: recipe of the training.
-        policies: weights by name of each trained policy that the actor can choose.
+        policies: weights of each trained policy that the actor can choose, by name of the tensor.
 
     """
 
@@ -82,15 +82,17 @@ class RolloutClassificationModel(VineModel):
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
 
     def _try_actions(self, seen: Float32s, moments: State) -> tuple[Float32s, Ints, Floats]:
-        """Try C choices (actions, or policies that act) at B of the visited decisions, each to the end of its episode.
+        """At B of the visited decisions, try C choices: actions, or policies that act.
+
+        Each choice is simulated to the end of the episode.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
 
-        Returns three arrays: the observations [B, F], the numbers of the choices [B, C] as from
-        ``ChoosingActor.choose``, and the costs of the choices [B, C]. The actor itself takes the choice in column 0. A
-        cost is minus the return; the recipe's keys ``tie_break``, ``caution`` and ``relative`` modify it.
+        Returns three arrays: the observations [B, F], the numbers of the choices [B, C] (numbered as in
+        ``ChoosingActor``), and the costs of the choices [B, C]. Column 0 contains the choice of the actor itself. The
+        cost of a choice is minus the return, changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
 
         """
         recipe, actor, learners = self.recipe, self.policy, len(self.engine.learners)
@@ -146,7 +148,9 @@ class RolloutClassificationModel(VineModel):
         return observed[rows], tried, costs
 
     def _usual(self, rows: Ints, least: Floats) -> Floats:
-        """Update the mean cost of each scenario of a mixture; return the mean cost of each decision's scenario, [B].
+        """Update the mean cost of each scenario of a mixture.
+
+        Return the mean cost of the scenario of each of B decisions, [B].
 
         The result is at least ``LEAST_USUAL``, because costs are divided by it.
 

@@ -23,7 +23,7 @@ from ethbrake_marl.training.recipes import BATCH_SIZE, NETWORK
 
 
 class ChoosingShape(Shape):
-    """Network of an actor that scores a number of actions, evenly spaced from -1 to 1."""
+    """Network of an actor that gives each of several actions a score. The actions are evenly spaced from -1 to 1."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
@@ -32,7 +32,7 @@ class ChoosingShape(Shape):
     )
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
-        """Return the description, for a policy bundle, of an actor that takes the action with the highest score.
+        """Return the description of the network for a policy bundle; the actor takes the action with the highest score.
 
         Args:
             observation_size: number of features of an observation.
@@ -49,7 +49,8 @@ class RolloutClassificationRecipe(TrainingRecipe):
     """Recipe of rollout classification: the policy learns from several actions, each tried to the end of its episode.
 
     The policy chooses among ``network.choices`` actions, evenly spaced from -1 to 1, and the trained ``policies``. A
-    round is ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a round, these choices are tried:
+    round consists of ``n_envs x n_steps`` decisions and an update. At ``tried`` decisions of a round, these choices are
+    tried:
 
     - the choice of the policy itself;
     - for each range of ``near``, one action below and one action above the action of the policy;
@@ -138,7 +139,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the description of the network, and of the policies that it may choose, for a policy bundle.
+        """Return the description, for a policy bundle, of the network and of the policies that it can choose.
 
         ``observation_size`` is the number of features of an observation.
         """
@@ -148,11 +149,13 @@ class RolloutClassificationRecipe(TrainingRecipe):
 
     @cached_property
     def loaded_policies(self) -> tuple[Policy, ...]:
-        """The trained policies that the key ``policies`` names. They are loaded once.
+        """The trained policies that the key ``policies`` names.
+
+        The policies are loaded when this property is first used.
 
         A policy that itself chooses between policies is replaced by these policies.
 
-        Raises ``InvalidInput`` with the name of a policy that cannot be used.
+        Raises ``InvalidInput``, which names the policy, if a policy cannot be used.
         """
         loaded: list[Policy] = []
         for name in self.policies:
@@ -161,7 +164,7 @@ class RolloutClassificationRecipe(TrainingRecipe):
             policy = load_policy(path) if path else load_shipped(kind)
             by = policy.manifest.algorithm
             if path and kind not in ("policy", by):
-                raise InvalidInput(f"recipe {self.name!r}: policies: {name}: was trained by {by}; write {by}@{path}")
+                raise InvalidInput(f"recipe {self.name!r}: policies: {name} was trained by {by}; write {by}@{path}")
             loaded += policy.among or [policy]
         if loaded and not self.drawn <= len(loaded):
             raise InvalidInput(

@@ -1,8 +1,8 @@
 """Scout: a small network that predicts at which decisions the action matters. More branches start at such decisions.
 
-A branch takes as long where the action has no effect as where it has one. Decisions are therefore drawn with unequal
-probabilities. A decision that is drawn more often gets a smaller weight in the loss, which keeps the expected loss the
-same (importance sampling).
+A branch (a copy of the episode with another action) takes as much time if the action has no effect as if it has a large
+effect. Therefore decisions at which the action matters are drawn with a higher probability. A decision with a higher
+probability gets a smaller weight in the loss, so the expected loss stays the same (importance sampling).
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ WIDTH = 64  # units of the hidden layer
 
 
 class Scout(nn.Module):
-    """Small network that predicts from an observation how much the action matters.
+    """Small network that predicts from an observation how much the action at a decision matters.
 
-    It learns the absolute value of the measured gradient, or the measured difference in cost. This value is called the
-    *size* below. ``inputs`` is the number F of features of an observation.
+    The network learns to predict the *size* of a decision: the absolute value of the measured gradient, or the measured
+    difference in cost. ``inputs`` is the number F of features of an observation.
     """
 
     def __init__(self, inputs: int) -> None:
@@ -35,7 +35,7 @@ class Scout(nn.Module):
         nn.init.zeros_(last.bias)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Return the logarithm of the expected size, [rows], for observations [rows, F]; at most 20."""
+        """Return the logarithm of the expected size, at most 20, for observations [rows, F]. The shape is [rows]."""
         logarithm: Tensor = self.layers(observation)[:, 0].clamp(max=20.0)
         return logarithm
 
@@ -46,9 +46,9 @@ class Scout(nn.Module):
         return size
 
     def loss(self, observation: Tensor, size: Tensor, importance: Tensor) -> Tensor:
-        """Return a loss that is smallest if the network predicts the mean size.
+        """Return a loss that is least if the network predicts the mean size.
 
-        Large sizes have less influence on this loss than on a squared error.
+        Large sizes influence this loss less than they would influence a squared error.
 
         Args:
             observation: [rows, F] observations.
@@ -69,8 +69,8 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
         count: number of rows to draw.
         focus: share of the rows that is drawn in proportion to ``expected``; the rest is drawn uniformly.
 
-    Returns the numbers of the rows [count], and their importance [count]: 1 / (n x probability of the row). The
-    expected importance is 1.
+    Returns the numbers of the drawn rows [count], and their importance [count]: ``1 / (n p)``, where p is the
+    probability with which the row is drawn. The expected importance is 1.
 
     """
     n = len(expected)
@@ -82,17 +82,21 @@ def draw_rows(expected: Floats, count: int, focus: float) -> tuple[Ints, Float32
 def choose_rows(
     observed: Float32s, rows: Ints, count: int, focus: float, expect: Callable[[Float32s], Floats] | None
 ) -> tuple[Ints, Float32s]:
-    """Draw ``count`` of the decisions ``rows`` at which to try actions; decisions that matter are drawn more often.
+    """Draw ``count`` of the decisions ``rows``, at which actions will be tried.
+
+    Decisions that matter are drawn more often.
 
     Args:
         observed: [n, F] observations at all decisions.
         rows: row numbers of the decisions to draw from.
         count: number of decisions to draw.
-        focus: share of the decisions drawn in proportion to ``expect``, with replacement (see ``draw_rows``). 0: all
-            decisions are drawn uniformly, without replacement.
-        expect: function from observations [rows, F] to expected sizes [rows]; None: as with ``focus`` 0.
+        focus: share of the decisions that are drawn in proportion to ``expect``, with replacement (see ``draw_rows``).
+            0: all decisions are drawn uniformly and without replacement.
+        expect: function from observations [rows, F] to expected sizes [rows]; None: decisions are drawn as for
+            ``focus`` = 0.
 
-    Returns the row numbers of the drawn decisions, and their importance (1 if they are drawn uniformly).
+    Returns the row numbers of the drawn decisions, and the importance of each: its weight in the loss, 1 if the
+    decisions are drawn uniformly.
 
     """
     if focus == 0.0 or expect is None or len(rows) == 0:

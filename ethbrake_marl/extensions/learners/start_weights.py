@@ -1,4 +1,4 @@
-"""Copy the weights of a trained policy into a training that observes further features."""
+"""Use the weights of a trained policy at the start of a training that observes these and further features."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ethbrake_marl.training.training import Training
 def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]]:
     """Return the weights of a trained policy by name, with added weights for the further features of a training.
 
-    The added weights are 0. Raises ``InvalidInput`` if the training does not observe a feature of the policy, or if
-    the two networks differ.
+    The added weights are 0. Raises ``InvalidInput`` if the training lacks a feature that the policy observes, or if the
+    networks of policy and training differ.
     """
     recipe, wanted = training.recipe, training.recipe.network_spec(training.observation.size)
     network = policy.manifest.network
@@ -26,8 +26,8 @@ def widened(policy: Policy, training: Training) -> dict[str, NDArray[np.float32]
     for name in ("policy_hidden", "activation", "output"):
         if getattr(network, name) != getattr(wanted, name):
             raise InvalidInput(
-                f"recipe {recipe.name!r}: network: {name} is {getattr(wanted, name)}, but {getattr(network, name)} in"
-                " the policy to start from; change the recipe to the value of the policy"
+                f"recipe {recipe.name!r}: network.{name} is {getattr(wanted, name)}, but {getattr(network, name)} in"
+                " the policy of the key start; change the recipe to the value of the policy"
             )
     return padded(policy, training, "start")
 
@@ -40,8 +40,8 @@ def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np
 
     Args:
         policy: trained policy.
-        training: training that begins with the weights.
-        key: key of the recipe that names the policy, for the error message.
+        training: training that begins with these weights.
+        key: key of the recipe under which the policy is named, for the error message.
 
     """
     names = [feature.name for feature in training.observation.features]
@@ -49,7 +49,7 @@ def padded(policy: Policy, training: Training, key: str) -> dict[str, NDArray[np
     missing = [name for name in known if name not in names]
     if missing:
         raise InvalidInput(
-            f"recipe {training.recipe.name!r}: observation: lacks {', '.join(missing[:5])}, which the policy of the key"
+            f"recipe {training.recipe.name!r}: observation lacks {', '.join(missing[:5])}, which the policy of the key"
             f" {key} observes; list all features of this policy"
         )
     weights = {name: tensor.copy() for name, tensor in policy.tensors.items() if not name.startswith("value.")}

@@ -1,4 +1,7 @@
-"""Targets for the actor, computed from measured gradients, at most one trust radius away from its outputs."""
+"""Targets for the actor's outputs, computed from measured gradients.
+
+A target is at most one trust radius away from the output.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from ethbrake_marl.policies.network_spec import Float32s
 
 
 class Tried(NamedTuple):
-    """B decisions at which a higher and a lower action were tried, and the gradients measured from the two returns."""
+    """B decisions at which a higher and a lower action were tried, with the gradients measured from the two returns."""
 
     seen: Float32s  # [B, F] observations
     mean: Float32s  # [B] output of the actor, before clipping to [-1, 1]
@@ -19,20 +22,21 @@ class Tried(NamedTuple):
 
 
 def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32s, Float32s]:
-    """Return targets [B] for the actor's outputs, and the weights [B] of their squared errors in the loss.
+    """Return targets [B] for the actor's outputs at B decisions, and the weights [B] of the squared errors in the loss.
 
-    For an output ``m`` with the gradient ``g``: ``weight = (|g| / radius) + anchor`` and ``target = m + (g / weight)``.
-    The target is less than ``radius`` away from ``m`` for every gradient. At ``m``, the loss
-    ``(weight / 2) * (output - target)^2`` has the slope ``-g``, as gradient ascent on the return requires.
+    For an output ``m`` at which the return has the measured gradient ``g``: ``weight = (|g| / radius) + anchor`` and
+    ``target = m + (g / weight)``. The target is less than ``radius`` away from ``m`` for every gradient. At ``output =
+    m``, the loss ``(weight / 2) * (output - target)^2`` has the slope ``-g``. So a step that lowers the loss raises the
+    return.
 
-    If an output is already at or beyond a bound of [-1, 1], it gets no target farther out, because clipping would leave
-    the action unchanged.
+    If an output is already at or beyond -1 or 1, the target is not farther out than the output, because actions are
+    clipped to [-1, 1].
 
     Args:
         tried: decisions and measured gradients.
-        radius: trust radius: limit of the distance from an output to its target.
-        anchor: least weight, above 0. A larger anchor brings the target closer to the output, most of all for a small
-            gradient.
+        radius: trust radius, which no distance from an output to its target reaches.
+        anchor: weight of a decision with the gradient 0, above 0. A larger ``anchor`` brings the target closer to the
+            output, especially if the gradient is small.
 
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))

@@ -1,4 +1,4 @@
-"""The algorithm ``vine``: measure gradients of the return by continuing from the same state with two actions.
+"""The algorithm ``vine``: continue from the same state with two actions, and measure the gradient of the return.
 
 The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers.
 """
@@ -23,16 +23,16 @@ from ethbrake_marl.training.training import Training
 
 
 class Vine(Algorithm):
-    """The algorithm vine: it measures gradients of the return, and trains an actor with them.
+    """The algorithm vine, which measures gradients of the return and trains an actor with them.
 
-    One actor drives all learners. If there is one learner, a mixture of experts may drive it instead.
+    The same actor drives all learners. If there is one learner, a mixture of experts may drive it instead.
     """
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a new model for a training. It learns in ``environment``.
+        """Return a new model for a training.
 
-        Its first weights are copied from the policy that the recipe's key ``start`` names. Without this key they are
-        random.
+        The model learns in ``environment``. The initial weights are copied from the policy that the recipe's key
+        ``start`` names; without this key they are random.
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
@@ -47,17 +47,17 @@ class Vine(Algorithm):
         return model
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by their names in a policy bundle.
+        """Return copies of an actor's averaged weights, by name.
 
-        ``network`` describes the network in the bundle.
+        The names are those in a policy bundle whose network is ``network``.
         """
         tensors: dict[str, Float32s] = actor.tensors(network)
         return tensors
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the model's optimisers by name: ``policy``, or ``network_1``, ``network_2``, ... and ``gate``.
+        """Return the model's optimisers by name.
 
-        The names ``network_K`` and ``gate`` belong to a mixture of experts.
+        The name is ``policy``. For a mixture of experts, the names are ``network_1``, ``network_2``, ... and ``gate``.
         """
         if not isinstance(model, ExpertsModel):
             return {"policy": model.policy.optimizer}

@@ -69,7 +69,10 @@ class VineModel(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train until the learners have made ``total_timesteps`` decisions. The arguments are Stable-Baselines3's."""
+        """Train until the learners have made ``total_timesteps`` decisions.
+
+        The arguments are those of Stable-Baselines3's method ``learn``.
+        """
         total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total:
@@ -90,7 +93,7 @@ class VineModel(BaseAlgorithm):
         self._train(actor, self._try_out(seen, moments, actor))
 
     def _visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive in all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each one.
+        """Drive all worlds for ``n_steps`` decisions with the policy ``act``; call ``callback`` after each decision.
 
         Returns the observations [n_steps, rows, F], and the states of the worlds at these decisions.
         """
@@ -112,14 +115,14 @@ class VineModel(BaseAlgorithm):
         return np.stack(seen), State.join(moments)
 
     def _try_out(self, seen: Float32s, moments: State, actor: Deterministic) -> Tried:
-        """Try a higher and a lower action at some of the visited decisions, each to the end of its episode.
+        """At some of the visited decisions, try a higher and a lower action, both to the end of the episode.
 
         Args:
             seen: [steps, rows, F] observations at the visited decisions.
             moments: states of the worlds at these decisions.
             actor: policy to whose actions the offsets are added.
 
-        Returns the decisions at which actions were tried, with the measured gradients.
+        Returns the decisions at which the two actions were tried, with the measured gradients.
 
         """
         recipe, learners = self.recipe, len(self.engine.learners)
@@ -153,7 +156,7 @@ class VineModel(BaseAlgorithm):
         return Tried(then, actor.means(then), gradient[good].astype(np.float32), importance[good])
 
     def _train(self, actor: AveragedActor, tried: Tried) -> None:
-        """Train the actor on the decisions and gradients of ``tried``, with targets within the trust radius."""
+        """Train the actor on the decisions and gradients of ``tried``, with the targets of ``trusted_targets``."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)

@@ -26,7 +26,7 @@ _RIGHT_START = "must be the name of a shipped policy, for instance ppo, or ppo@P
 
 
 class ActorShape(Shape):
-    """Network of an actor. There is no critic."""
+    """Network of an actor. The algorithm vine needs no critic."""
 
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"  # activation function of the hidden layers
@@ -36,10 +36,10 @@ class ActorShape(Shape):
 
 
 class VineRecipe(TrainingRecipe):
-    """Recipe of vine: a higher and a lower action are tried at some decisions, each to the end of its episode.
+    """Recipe of vine: at some decisions, a higher and a lower action are tried, and both are simulated to the end.
 
-    A round has ``n_envs x n_steps`` decisions. The two actions are tried at ``tried`` of these decisions. The policy
-    learns from the difference of the two returns.
+    A round of the training has ``n_envs x n_steps`` decisions. The two actions are tried at ``tried`` of these
+    decisions. The policy learns from the difference of the two returns.
 
     ``start`` names the trained policy whose weights the training begins with; without this key the weights are random.
     ``start: ppo`` means the shipped policy ``ppo`` or ``ppo-...`` that was trained on the scenario of this training. If
@@ -97,7 +97,7 @@ class VineRecipe(TrainingRecipe):
     def _automatic_or_fixed(cls, value: Any, check: Callable[[Any], Any]) -> Any:
         with suppress(ValueError):
             return check(value)
-        raise ValueError("must be auto or a finite number above 0")
+        raise ValueError("must be 'auto' or a finite number above 0")
 
     @model_validator(mode="after")
     def _keys_fit(self) -> VineRecipe:
@@ -128,9 +128,9 @@ class VineRecipe(TrainingRecipe):
         return next((name for name in names if load_shipped(name).manifest.scenario.get("name") == scenario.name), None)
 
     def begins(self, scenario: Scenario) -> str:
-        """Return a phrase on the initial weights for messages: a policy such as ``ppo``, or ``random weights``.
+        """Return the origin of the initial weights, for messages: a policy such as ``ppo``, or ``random weights``.
 
-        If ``start`` names a policy that is not shipped for ``scenario``, the phrase says so.
+        If the weights are random because no policy ``start`` is shipped for ``scenario``, the phrase says so.
         """
         why = "" if self.start is None else f", because no {self.start} is shipped for scenario {scenario.name!r}"
         return self.policy_to_start_from(scenario) or f"random weights{why}"
@@ -139,8 +139,8 @@ class VineRecipe(TrainingRecipe):
         """Raise ``InvalidInput`` if the recipe has a mixture of experts and the training has several learners."""
         if self.experts is not None and learners != 1:
             raise InvalidInput(
-                f"recipe {self.name!r}: experts: a mixture of experts can drive one learner only, but the scenario has"
-                f" {learners}; leave out experts"
+                f"recipe {self.name!r}: experts: a mixture of experts can drive only one learner, but the scenario has"
+                f" {learners} learners; leave out experts"
             )
 
 

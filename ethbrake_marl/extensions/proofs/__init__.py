@@ -1,1 +1,1 @@
-"""Proven lower bounds on harm: no command of the controlled vehicles does less harm."""
+"""Proven lower bounds on harm: no commands of the controlled vehicles lead to less harm."""

@@ -6,7 +6,7 @@ stays behind the largest trajectory.
 
 Symbols: the index l marks the front vehicle (leader), f the controlled vehicle (follower), r the rear vehicle. A gap is
 in m, a speed v in m/s, a braking capacity a > 0 and a driving capacity u >= 0 in m/s2. Time 0 is the moment at which
-the controlled vehicle may act; the leader brakes by then. docs/internals/proofs/avoidable-contact.md derives every
+the controlled vehicle may act; the leader already brakes then. docs/internals/proofs/avoidable-contact.md derives every
 formula. The formulas use only + - * / and sqrt, so they give the same bits on every machine.
 """
 
@@ -39,10 +39,9 @@ REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, RESULT_WIDTH = range(7)  # columns 
 
 @compiled
 def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> float:
-    """Return the part of the gap (m) that remains if the follower brakes fully from now on.
-
-    The front vehicle also brakes fully. A negative result means that the two vehicles make contact. If the follower
-    comes to rest last, the stopping distances decide; otherwise the gap is smallest when both speeds are equal.
+    """Return the smallest gap (m) if the follower and the front vehicle both brake fully from now on. A negative result
+    means that the two vehicles make contact. If the follower comes to rest last, the smallest gap is the gap at rest;
+    otherwise the gap is smallest when both speeds are equal.
 
     Args:
         gap: gap between the two vehicles, m.
@@ -63,14 +62,14 @@ def spare_gap(gap: float, v_l: float, a_l: float, v_f: float, a_f: float) -> flo
 def drive_before_braking(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float
 ) -> tuple[float, float, bool]:
-    """Return how long a vehicle can drive if full braking afterwards must still keep it behind the leader.
+    """Return how long a vehicle can drive before it must brake fully to stay behind the leader.
 
     While it drives, the vehicle has the constant acceleration ``u >= 0``. The leader is the vehicle in front; it brakes
     from now on. Requires ``spare_gap >= 0``.
 
     The results are the duration of the drive (s), the time at which the gap becomes 0 (s), and whether both vehicles
-    still move at that time. If both move, ``a_f > a_l`` and their speeds are equal; otherwise the follower stops at the
-    standing leader. Both times are infinite if the follower never moves.
+    still move at that time. If both move then, ``a_f > a_l`` and their speeds are equal; otherwise the follower stops
+    at the standing leader. The duration and the time are infinite if the follower never moves.
 
     Args:
         gap: gap to the leader, m.
@@ -105,7 +104,7 @@ def drive_before_braking(
 def largest_behind(
     gap: float, v_l: float, a_l: float, v_f: float, a_f: float, u: float, limit: float
 ) -> tuple[float, float, bool]:
-    """Return how long a vehicle with a speed limit can drive if full braking afterwards must keep it behind the leader.
+    """Return how long a vehicle with a speed limit can drive before it must brake fully to stay behind the leader.
 
     The leader is the vehicle in front; it brakes from now on. The further results are the time at which the gap becomes
     0 (s), and whether both vehicles still move at that time.
@@ -168,8 +167,8 @@ def leader_at_onset(
     """Return the gap to the leader (m) and the speed of the leader (m/s) at ``start``, if the follower coasts until
     then.
 
-    The leader brakes by then. Until then the gap is a concave function of time: if it is not negative at ``start``, it
-    was not negative before.
+    The leader brakes from ``onset_l`` on, which is not after ``start``. Until ``start`` the gap is a concave function
+    of time: if it is not negative at ``start``, it was not negative before.
 
     Args:
         gap: gap now, m.
@@ -218,7 +217,7 @@ def plan_behind(
     """Write to ``plan`` the trajectory of vehicle i that is farthest ahead, but stays ``keep`` metres behind vehicle i
     - 1.
 
-    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle in front at that distance.
+    Vehicle i drives as hard as it can, then brakes fully, then follows the vehicle in front at the distance ``keep``.
 
     Args:
         gap: [P] gaps, m.
@@ -276,8 +275,8 @@ def decide_world(
 
     Columns of the verdict: REASON (AVOIDABLE, EARLY, FRONT or REAR), MARGIN (m; as in ``Avoidability``), SPARE (m; part
     of the gap that remains under full braking), DRIVE (s; end of the drive), TOUCH (s; end of the full braking after
-    the drive), FOLLOW (m/s2; the command after the braking). Both times count from the moment at which vehicle ``i``
-    may act.
+    the drive), FOLLOW (m/s2; the command after the braking). DRIVE and TOUCH count from the moment at which vehicle
+    ``i`` may act.
 
     Args:
         gap: [P] gaps, m.
@@ -350,12 +349,12 @@ class Avoidability:
     The *largest trajectory* of the controlled vehicle is farther ahead at every time than any other trajectory that
     stays behind the front vehicle. ``margin_m`` is the smallest gap between the largest trajectory and the rear
     vehicle. (For two vehicles of which the rear one is controlled, ``margin_m`` is the part of the gap that remains
-    under full braking.) ``margin_m`` is negative if contact is unavoidable: for the reason *front* it is minus the
-    missing gap, for the reason *early* minus the overlap before the vehicle may act.
+    under full braking.) ``margin_m`` is negative if contact is unavoidable: it is then minus the missing gap if the
+    reason is *front*, and minus the overlap before the vehicle may act if the reason is *early*.
 
-    ``switch_s`` and ``command_mps2`` are a witness: commands that cause no impact in the physics. Each command applies
-    from its absolute time on, until the time of the next command. An infinite time means that the command never
-    applies. Both arrays are NaN in worlds where contact is unavoidable.
+    ``switch_s`` and ``command_mps2`` are times and commands that show how to avoid contact: in a simulation they cause
+    no impact. Each command applies from its absolute time on, until the time of the next command. An infinite time
+    means that the command never applies. Both arrays are NaN in worlds where contact is unavoidable.
     """
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even

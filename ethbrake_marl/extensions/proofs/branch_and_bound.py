@@ -34,9 +34,9 @@ _TRIED = 8  # number of first contacts evaluated before the search
 def gentlest_between(kind: int, at: Floats, early: float, late: float) -> float:
     """Return the smallest closing speed (m/s) of first contacts between the times ``early`` and ``late``.
 
-    Later first contacts can be gentler. The exception is a leader (front vehicle) that brakes harder than the
-    controlled vehicle: the smallest closing speed may then rise with time, at most at the difference of both braking
-    capacities.
+    The smallest closing speed never rises with the time of the contact, with one exception: if the leader (front
+    vehicle) brakes harder than the controlled vehicle, it may rise by at most the difference of the two braking
+    capacities in each second.
 
     Args:
         kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
@@ -80,10 +80,10 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
     """Return a lower bound (m/s2) on the difference between the command during a first contact and the best command
     after it.
 
-    If the first contact is with the front vehicle, a gentle contact needs braking before it. Driving after the contact
-    softens the impact from behind. If the first contact is with the rear vehicle, driving is best before the contact
-    and braking after it. The command is the same in the whole decision step, so it cannot be the best one before and
-    after.
+    If the first contact is with the front vehicle, braking before the contact makes it gentle, and driving after the
+    contact softens the impact from behind. If the first contact is with the rear vehicle, driving is best before the
+    contact and braking after it. The command is the same in the whole decision step, so it cannot be the best one both
+    before and after the contact.
 
     Args:
         kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
@@ -91,7 +91,7 @@ def lacking(kind: int, at: Floats, early: float, late: float, softest: float, ha
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        softest: smallest closing speed that any command reaches in this time, m/s.
+        softest: smallest closing speed that any command reaches between ``early`` and ``late``, m/s.
         hard: largest closing speed of the first contact, m/s.
         begin: start of the decision step, s.
 
@@ -146,9 +146,8 @@ def harm_of(
 
 @compiled
 def room_for(heap: Floats, count: int, harm: float) -> int:
-    """Make room on the heap for a cell with bound ``harm``, and return the index of the free row.
-
-    The function fills in only the column ``HARM`` of the row. Row 0 always holds the cell with the smallest bound.
+    """Insert a row for a cell with bound ``harm`` into the heap, and return the index of the row. The function fills in
+    only the column ``HARM`` of this row. Row 0 of the heap is always the cell with the smallest bound.
 
     Args:
         heap: [CELLS, NEAR] cells ordered as a binary heap; changed in place.
@@ -214,8 +213,8 @@ def divide(
 ) -> tuple[int, float]:
     """Replace the cell with the smallest bound by its two halves.
 
-    Returns the new number of cells, and the bound (m2/s2) of one single contact in the cell. The smallest bound of all
-    contacts is not above this value.
+    Returns the new number of cells, and the bound (m2/s2) for one single contact in the cell. The smallest bound of all
+    contacts is at most this second result.
 
     Args:
         kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or
@@ -266,7 +265,8 @@ def least_harm(
         last: latest time of the contact, s.
         floor: known lower bound on the harm of the other pair, m2/s2.
         best: smallest harm of a first contact found so far, m2/s2.
-        enough: harm (m2/s2) that is proven in another way; the function returns 0 if some contact does no more harm.
+        enough: lower bound (m2/s2) that is proven in another way; the function returns 0 if the bound of some contact
+            is not above it.
         plan: working memory for the motion of one vehicle, from ``empty_plan`` (``empty_legs`` with brake build-up).
         other: second working memory of the same kind.
         heap: working memory for the cells of the search, [CELLS, NEAR].

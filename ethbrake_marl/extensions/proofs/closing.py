@@ -40,15 +40,14 @@ def least_on_piece(constant: float, pressing: float, since: float, until: float)
 @compiled(apart=True)
 def least_before(at: Floats, met: float, squared: float) -> float:
     """Return the smallest closing speed (m/s) of a pair's first contact until ``met``, for a leader that follows a
-    script.
-
-    At time t the closing speed is at least ``c(t) + (g(t) / t)``. Here c and g are closing speed and gap of the extreme
-    motions: both vehicles brake fully. ``g(t) / t`` is the additional speed that closes the gap by time t.
+    script. At the time t of the contact the closing speed is at least ``c(t) + (g(t) / t)``. Here c(t) and g(t) are
+    closing speed and gap if both vehicles brake fully. ``g(t) / t`` is the additional speed that the follower needs to
+    close this gap by time t.
 
     Args:
         at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.
         met: time at which the extreme motions lead to contact, s.
-        squared: squared closing speed of the extreme motions at that time, m2/s2.
+        squared: squared closing speed of the extreme motions at the time ``met``, m2/s2.
 
     """
     if met <= 0.0:
@@ -78,7 +77,7 @@ def least_before(at: Floats, met: float, squared: float) -> float:
 def least_closing_of_pair(at: Floats, until: float, plan: Floats, other: Floats) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a pair's first contact, and the latest time of that contact (s).
 
-    The results are 0 and infinity if contact before ``until`` is not certain.
+    The results are 0 and infinity if no contact is certain.
 
     Args:
         at: [PAIR_WIDTH] one pair, columns ``PAIR_GAP`` to ``FOLLOWER_A``.

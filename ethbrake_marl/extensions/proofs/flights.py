@@ -1,4 +1,4 @@
-"""Bound how much faster than the centre of mass of a pair one vehicle of the pair can be after their first contact.
+"""Bound how much faster than the centre of mass of a pair one of its vehicles can be after the pair's first contact.
 
 A *flight* is a time in which the two vehicles are apart. ``share`` is the partner's share of the mass of both vehicles.
 ``press`` is the acceleration (m/s2) at which the two vehicles close under the best command. ``reach`` is the part of
@@ -15,12 +15,14 @@ from ethbrake_marl.physics.jit import compiled
 
 @compiled
 def flight_lead(share: float, press: float, reach: float, opening: float, flight: float) -> float:
-    """Return the speed (m/s) that the controlled vehicle gains by a flight, less the speed that the flight costs.
+    """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains by it, minus the speed that it
+    costs.
 
-    A *flight* is a time in which the two vehicles are apart. The gain is measured against the speed of their centre of
-    mass. For a flight of length L and opening speed o, the lead is ``share (press L - o) - G``. G is the smallest loss
-    of speed with which the vehicles stay apart for the time L: ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``,
-    where G grows by at most ``reach`` a second. The result is -inf if no command keeps the vehicles apart for so long.
+    A *flight* is a time in which the two vehicles are apart. The gain is the speed of the controlled vehicle minus the
+    speed of the centre of mass of both vehicles. For a flight of length L and opening speed o, the lead is ``share
+    (press L - o) - G``. G is the speed that the vehicle must give up so that the vehicles stay apart for the time L,
+    namely the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``. In each second the vehicle can give
+    up at most ``reach``. The result is -inf if no command keeps the vehicles apart for so long.
 
     Args:
         share: partner's share of the mass of both vehicles, 0 to 1.
@@ -76,7 +78,7 @@ def lead(
     """Return the largest ``flight_lead`` (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
     A *flight* is a time in which the two vehicles are apart. The result is the maximum over all opening speeds up to
-    ``opening``, because a smaller opening speed may give a larger lead if flights are cut short.
+    ``opening``, because with a limit on the length of the flight a smaller opening speed may have a larger lead.
 
     Args:
         share: partner's share of the mass of both vehicles, 0 to 1.
@@ -103,9 +105,8 @@ def lead(
 
 @compiled
 def decays(share: float, press: float, reach: float, bounce: float) -> bool:
-    """Return whether giving up acceleration to make a later bounce larger never pays.
-
-    If the result is True, ``reach`` limits the speed that the vehicle can gain in any flight.
+    """Return whether the vehicle never gains by giving up acceleration in order to bounce more strongly later. If the
+    result is True, ``reach`` limits the speed that the vehicle can gain in any flight.
 
     Args:
         share: partner's share of the mass of both vehicles, 0 to 1.
@@ -131,8 +132,8 @@ def largest_lead(
     """Return an upper bound (m/s) on how much faster the controlled vehicle is than the centre of mass of a pair.
 
     The pair is the controlled vehicle and the neighbour of its first contact. The motion of the centre of mass is
-    computed for the best command from the first contact on. In the *window* (the rest of the decision step) the earlier
-    command still applies instead, which costs the speed ``lost``.
+    computed for the best command from the first contact on. In fact the earlier command still applies in the *window*
+    (the rest of the decision step), which costs the speed ``lost``.
 
     A *flight* is a time in which the pair is apart. The bound is the maximum over three cases: the last flight before
     the contact with the other neighbour began with the first impact, within the window, or after the window.
@@ -172,20 +173,19 @@ def largest_lead(
 def widest_flight(
     share: float, slack: float, press: float, drive: float, bounce: float, closing: float, back: float, time: float
 ) -> float:
-    """Return the largest ``sqrt(p^2 + 2 press s)`` (m/s) while a vehicle and a partner that brakes harder are apart.
-
-    p is the speed at which the two vehicles separate (m/s), s the gap between them (m). The result is infinite if no
-    bound is known.
+    """Return the largest ``sqrt(p^2 + 2 press s)`` (m/s) during the flights of a vehicle and a partner that brakes
+    harder. p is the speed at which the two vehicles separate (m/s), s the gap between them (m). The result is infinite
+    if no bound is known.
 
     Args:
         share: partner's share of the mass of both vehicles, 0 to 1.
         slack: braking capacity of the partner minus braking capacity of the vehicle, m/s2.
         press: acceleration at which the two vehicles close under the best command, m/s2.
-        drive: largest acceleration by a command, m/s2.
+        drive: largest acceleration that the vehicle can command, m/s2.
         bounce: coefficient of restitution.
         closing: closing speed of the first impact, m/s.
         back: backward speed of the vehicle after that impact, m/s.
-        time: length of the time for which the bound holds, s.
+        time: duration for which the bound holds, s.
 
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:

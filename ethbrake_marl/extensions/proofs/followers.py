@@ -1,8 +1,8 @@
-"""Bound the harm at the other pair that must follow a first contact of the controlled vehicle.
+"""After a first contact of the controlled vehicle with one neighbour, bound the harm with the other neighbour.
 
 The time and the closing speed of the first contact determine the state of all three vehicles at that time. Afterwards
 the extreme command (full drive or full braking) is best for the centre of mass of the two vehicles in contact. The
-controlled vehicle is faster or slower than this centre of mass only until it returns to its partner;
+controlled vehicle moves faster or slower than this centre of mass only until it meets the first neighbour again;
 ``flights.largest_lead`` bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
 
 The functions bound all first contacts between the times ``early`` and ``late`` at once, starting from the state at
@@ -52,15 +52,15 @@ def least_closing(
 ) -> float:  # fmt: skip
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
-    The controlled vehicle had contact with its first neighbour before. Take the closing speed of the second neighbour
-    relative to the centre of mass of the controlled vehicle and its first neighbour. The result is this speed, minus
-    the largest difference between the controlled vehicle and the centre of mass (``largest_lead``). In the *window* the
-    command of the earlier decision still applies, which costs the speed ``lost``. Times count from the first contact,
-    in s.
+    The controlled vehicle had contact with its first neighbour before. The result has two parts: the closing speed of
+    the second neighbour relative to the centre of mass of the controlled vehicle and its first neighbour, minus the
+    largest difference between the speeds of the controlled vehicle and this centre of mass (``largest_lead``). In the
+    *window* the command of the earlier decision still applies, which costs the speed ``lost``. Times count from the
+    first contact, in s.
 
     Args:
         start: closing speed of the second neighbour relative to the centre of mass at the first contact, m/s.
-        slope: rate of change of this closing speed, m/s2.
+        slope: rate of change of the closing speed ``start``, m/s2.
         turn: first time at which the rate changes, s.
         bend: change of the rate at ``turn``, m/s2.
         other_turn: second time at which the rate changes, s.
@@ -97,7 +97,8 @@ def pushed_by_leader(
     """Return the smallest closing speed (m/s) at the rear pair after a first contact with the front vehicle (leader).
 
     The bound uses the centre of mass of the leader and the controlled vehicle. The result is 0 if nothing is proven. If
-    the leader stands, a later first contact differs only in its time, so ``late``, ``end`` and ``lack`` are not used.
+    the leader stands at ``early``, later first contacts lead to the same motion, only later. The function then ignores
+    ``late``, ``end`` and ``lack``.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -195,8 +196,8 @@ def after_front(
 ) -> float:
     """Return the smallest squared closing speed (m2/s2) at the rear pair after a first contact with the front vehicle.
 
-    The result is the largest of several bounds. Bounds that use the centre of mass of both vehicles do not hold if an
-    obstacle may throw the vehicles back; they are then left out.
+    The result is the largest of several bounds. If an obstacle may throw the vehicles back, the bounds that use the
+    centre of mass of both vehicles do not hold and are left out.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -233,9 +234,8 @@ def after_front(
 @compiled
 def obstacle_harm(at: Floats, late: float, closing: float) -> float:
     """Return the smallest squared speed (m2/s2) at which the front vehicle hits the obstacle after a push from behind.
-
-    After the push only its own brakes slow the front vehicle. The result is 0 if the front vehicle already stands at
-    the obstacle, because the push is then one impact of both vehicles and the obstacle.
+    After the push nothing but its own brakes slows the front vehicle. The result is 0 if the front vehicle already
+    stands at the obstacle, because the push is then one impact of both vehicles and the obstacle.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -288,7 +288,7 @@ def pushed_by_rear(
     at: Floats, early: float, late: float, closing: float, end: float, lack: float, gap: float, plan: Floats,
     other: Floats,
 ) -> float:  # fmt: skip
-    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle has hit the controlled one.
 
     The bound uses the centre of mass of the controlled vehicle and the rear vehicle. The braking capacity of the
     controlled vehicle must be at least the braking capacity of the rear vehicle.
@@ -327,10 +327,11 @@ def pushed_by_rear(
 
 @compiled(apart=True)
 def slowed_by_rear(at: Floats, early: float, closing: float, gap: float, plan: Floats, other: Floats) -> float:
-    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle hit the controlled one.
+    """Return the smallest closing speed (m/s) at the front pair after the rear vehicle has hit the controlled one.
 
-    The bound uses that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of the controlled
-    vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing speed may rise.
+    The bound follows from the fact that the controlled vehicle stays ahead of the rear vehicle. The braking capacity of
+    the controlled vehicle must be at least the braking capacity of the rear vehicle. The result is 0 if the closing
+    speed may rise.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

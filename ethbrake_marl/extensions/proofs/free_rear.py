@@ -1,9 +1,9 @@
-"""Find the smallest harm over all first contacts with a rear vehicle that may act freely.
+"""Find the smallest harm over all first contacts of the controlled vehicle with a rear vehicle that may do anything.
 
-The rear vehicle is at least as far ahead and at least as fast as under its own full braking. The *lead* of the rear
-vehicle is the distance (m) by which it is farther ahead than under full braking. A first contact has a time, a lead and
-a closing speed; a *cell* is a range of each. The search halves cells until the smallest bound of any cell is close to
-the smallest harm found so far. docs/internals/proofs/team-bound.md has the proof.
+Whatever it does, the rear vehicle is at least as far ahead and at least as fast as if it braked fully. The *lead* of
+the rear vehicle is the distance (m) by which it is farther ahead than under full braking. A first contact has a time, a
+lead and a closing speed; a *cell* is a range of each. The search halves cells until the smallest bound of any cell is
+close to the smallest harm found so far. docs/internals/proofs/team-bound.md has the proof.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def gained(near: float, time: float, since: float, power: float) -> float:
     """Return the smallest speed (m/s) by which the rear vehicle is faster at ``time`` than under its own full braking.
 
     Args:
-        near: distance by which the rear vehicle is farther ahead than under full braking, m.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         time: time of the comparison, s.
         since: time from which on the rear vehicle may brake less than fully, s.
         power: largest acceleration that it can gain over full braking, m/s2; infinite if other vehicles push it.
@@ -105,8 +105,8 @@ def after_behind(
 ) -> float:  # fmt: skip
     """Return the smallest squared closing speed (m2/s2) at the front pair after a first contact with the rear vehicle.
 
-    The bound starts from one state at ``early``. After each of these contacts, the controlled vehicle is always at
-    least as far ahead and at least as fast as it would be from this state.
+    The bound is computed for one motion, which starts from a state at ``early``. After each of the contacts, the
+    controlled vehicle is at every time at least as far ahead and as fast as in this motion.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -115,7 +115,7 @@ def after_behind(
         near: smallest lead of the rear vehicle over its own full braking, m.
         far: largest such lead, m.
         hard: largest closing speed of the first contact, m/s.
-        faster: smallest speed by which the rear vehicle is faster than under full braking, m/s.
+        faster: smallest difference between the rear vehicle's speed and its speed under full braking, m/s.
         moved: working memory for a second world, [LINE.WIDTH].
         plan: working memory for the motion of one vehicle, from ``empty_plan``.
         other: second working memory of the same kind.
@@ -197,9 +197,9 @@ def try_behind(
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         time: time of the contact, s.
-        near: distance by which the rear vehicle is farther ahead than under full braking, m; raised if no contact has
-            it.
-        far: largest such distance, m.
+        near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m; raised if no
+            contact has it.
+        far: largest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound
             of the front pair alone, m2/s2) and ``BEST`` (smallest harm found so far, m2/s2). The function lowers
             ``BEST``.

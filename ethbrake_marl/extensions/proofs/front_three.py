@@ -1,8 +1,9 @@
 """Bound the harm of the first three vehicles: Vehicle 1 is scripted, Vehicle 2 controlled, Vehicle 3 may do anything.
 
-First contacts with the leader are bounded as for one controlled vehicle (``lower_bound.front_first``), because a rear
-vehicle that arrives earlier never lowers the harm. First contacts with the rear vehicle have their own search
-(``free_rear.meetings_behind``). docs/internals/proofs/team-bound.md has the proofs.
+For first contacts with the leader, the bound for one controlled vehicle also holds here (``lower_bound.front_first``):
+it assumes that the rear vehicle brakes fully, and a rear vehicle that arrives earlier never lowers the harm. For first
+contacts with the rear vehicle there is a separate search (``free_rear.meetings_behind``).
+docs/internals/proofs/team-bound.md has the proofs.
 """
 
 from __future__ import annotations
@@ -65,10 +66,10 @@ def all_at_once(at: Floats, first: float, last: float, pair: Floats, plan: Float
 
 @compiled(apart=True)
 def late_meetings(at: Floats, first: float, stand: float, plan: Floats, other: Floats) -> int:
-    """Return whether the rear vehicle may first reach the controlled one after ``stand``, as a code.
+    """Return a code: can the first contact of rear and controlled vehicle come after ``stand``?
 
-    Code 0: no. Code 1: yes, but the harm is then at least the harm of some first contact with the front vehicle. Code
-    2: yes, and nothing is proven about the harm.
+    Code 0: no. Code 1: yes, but the harm is then at least as large as for some first contact with the front vehicle.
+    Code 2: yes, and nothing is proven about the harm.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -99,7 +100,7 @@ def combined_bound_of_team(
 ) -> float:  # fmt: skip
     """Return a lower bound (m2/s2) on the harm of the first three vehicles in a world with unavoidable contact.
 
-    The bound covers first contacts with either neighbour. The result is 0 if the harm may come after ``until``.
+    The bound covers first contacts with either neighbour. The result is 0 if some of the harm may come after ``until``.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -107,7 +108,7 @@ def combined_bound_of_team(
         front: bound on the harm of the front pair alone, m2/s2.
         rear: bound on the harm of the rear pair alone, m2/s2.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest acceleration that the rear vehicle can gain over full braking, m/s2.
+        power: largest difference between the rear vehicle's acceleration and full braking, m/s2.
         pair: working memory for a pair, [PAIR_WIDTH].
         moved: working memory for a second world, [LINE.WIDTH].
         plan: working memory for the motion of one vehicle, from ``empty_plan``.

@@ -1,4 +1,6 @@
-"""Columns of a world in the proofs, and the undisturbed motion of its front and rear vehicle."""
+"""Columns of the arrays that describe worlds in the proofs, and the motion of front and rear vehicle if nothing pushes
+them.
+"""
 
 from __future__ import annotations
 

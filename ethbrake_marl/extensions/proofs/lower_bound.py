@@ -63,7 +63,8 @@ _PARTS = 8  # number of parts into which the times of soft contacts are divided
 def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
     """Return the smallest squared closing speed (m2/s2) at the rear pair's first contact, and its latest time (s).
 
-    The controlled vehicle reaches both values by full drive. The time is infinite if full drive avoids contact.
+    Full drive of the controlled vehicle leads to exactly this closing speed and this time. The time is infinite if full
+    drive avoids contact.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -102,15 +103,15 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
     """Return the latest time (s) of a first contact with one neighbour that comes before any contact with the other
     one.
 
-    The function bisects the time, because a later first contact leaves less room to the other neighbour: a later
-    contact with the front vehicle needs a shorter drive before it, so the rear vehicle comes nearer; a later contact
-    with the rear vehicle needs shorter braking, so the front vehicle comes nearer.
+    The function bisects the time, because a later first contact brings the other neighbour nearer. For a later contact
+    with the front vehicle the controlled vehicle drives for a shorter time, so the rear vehicle comes nearer. For a
+    later contact with the rear vehicle it brakes for a shorter time, so it comes nearer to the front vehicle.
 
     Args:
         kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         first: time of a first contact before which the other neighbour has not arrived, s.
-        last: latest time of a contact with this neighbour, s; the result is at most this.
+        last: latest time of a contact with this neighbour, s; the result is at most ``last``.
         plan: working memory for the motion of one vehicle, from ``empty_plan``.
         other: second working memory of the same kind.
 
@@ -128,7 +129,8 @@ def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, o
 
 @compiled(apart=True)
 def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest contact (s) with the front vehicle, and the latest one (s) before the rear vehicle arrives.
+    """Return the time (s) of the latest contact with the front vehicle, and of the latest one before the rear vehicle
+    arrives.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed.
@@ -154,11 +156,12 @@ def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple
 def front_first(
     at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
 ) -> float:
-    """Return a lower bound (m2/s2) on the harm if the front vehicle, or both neighbours at once, are contacted first.
+    """Return a lower bound (m2/s2) on the harm if the first contact is with the front vehicle or with both neighbours
+    at once.
 
     The result is at most ``best``. In a contact of all three vehicles at once, the closing speeds of the two pairs add
     up to the closing speed W of front and rear vehicle. The front pair's part of W is at least its smallest closing
-    speed at that time. This case counts only if a first contact with the front vehicle can come so late.
+    speed at that time. This case is included only if a first contact with the front vehicle can come at that time.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -277,7 +280,7 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
     Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. If the rear
     vehicle brakes harder than the controlled one, by b (m/s2), it was faster than the controlled one by at least ``b
-    t`` at every time t before the contact. This is true only after the rear vehicle's onset.
+    t`` at every time t before the contact. Here t counts only while the rear vehicle brakes, from its onset on.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -302,7 +305,8 @@ def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
 
 @compiled(apart=True)
 def last_rest(at: Floats) -> tuple[float, float]:
-    """Return when (s) all harm of the combined bound has happened, and when (s) the rear vehicle comes to rest.
+    """Return the time (s) by which all harm in the combined bound has happened, and the time (s) when the rear vehicle
+    rests.
 
     The rear vehicle comes to rest at the second time if it brakes fully and no other vehicle pushes it.
 
@@ -402,8 +406,8 @@ def lower_bound(
     error (``rounding``). The combined bound is 0 where contact can be avoided. Harm that may come only after the
     horizon counts as 0. The function covers the same lines as ``avoidability``.
 
-    With brake build-up, the bound holds for any command at any time and is looser. ``contact``, the verdict on
-    avoidable contact, is then None, even if brakes build up in only one of the worlds.
+    With brake build-up, the bound holds for commands that change at any time, and it is smaller. ``contact``, the
+    verdict on avoidable contact, is then None, even if brakes build up in only one of the worlds.
 
     Args:
         worlds: the worlds now, [n].
@@ -413,9 +417,10 @@ def lower_bound(
         horizon_s: time until which harm counts, s after the alert.
         scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
             brake fully.
-        time_step_s: time between two decisions, s. The bound is then larger, but holds only for commands that change at
-            decisions: the first decision when the vehicle may act, then one every ``time_step_s``, as for every agent.
-            The computation takes ten times as long. None: commands may change at any time.
+        time_step_s: time between two decisions, s. With a time step the bound is larger, but it holds only for commands
+            that change at decisions. The first decision comes when the vehicle may act, and the next ones every
+            ``time_step_s`` after it, as for every agent. The computation takes ten times as long. None: commands may
+            change at any time.
 
     Raises ``InvalidInput`` for other lines, for an unknown ``harm_count``, for a time step below ``LEAST_TIME_STEP_S``,
     and for a horizon that is not finite or lies before the vehicle may act.

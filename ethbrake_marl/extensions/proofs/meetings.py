@@ -1,7 +1,7 @@
 """Compute the gentlest first contact of the controlled vehicle with a neighbour at a given time.
 
-Times count from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) brakes by then.
-The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
+Times count from the moment at which the controlled vehicle (f) may act. The front vehicle (leader, l) already brakes at
+time 0. The rear vehicle (r) coasts until its onset and then brakes. All speeds and gaps are at least 0.
 docs/internals/proofs/lower-bound.md has the proofs.
 """
 
@@ -29,8 +29,8 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and the length of the
     drive.
 
-    The controlled vehicle arrives at this place and time most slowly if it drives first (for the second result, in s),
-    and then brakes.
+    The controlled vehicle arrives at the place of the contact at ``time`` most slowly if it drives first (for the
+    second result, in s), and then brakes.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -104,8 +104,9 @@ def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
     """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and the length of the
     braking.
 
-    The controlled vehicle arrives at this place and time with the largest speed if it brakes first (for the second
-    result, in s), and then drives. The second result is infinite if the vehicle reaches its speed limit by ``time``.
+    The controlled vehicle arrives at the place of the contact at ``time`` with the largest speed if it brakes first
+    (for the second result, in s), and then drives. The second result is infinite if the vehicle reaches its speed limit
+    by ``time``.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

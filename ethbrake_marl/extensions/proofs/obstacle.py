@@ -1,4 +1,4 @@
-"""Bound the harm that must follow a first contact if an obstacle is ahead of the leader.
+"""Bound the harm that must follow a first contact if an obstacle is ahead of the leader (the front vehicle).
 
 ``beyond`` is the squared speed (m2/s2) at which the leader hits the obstacle. This speed limits how far ahead the
 leader can be at any time. Positions count from the controlled vehicle's position at its onset. Masses are in units of
@@ -41,7 +41,7 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
     (m/s2).
 
     Masses are in units of the controlled vehicle's mass. The third result is the largest deceleration of the centre of
-    mass before the rear vehicle's onset, the fourth the further deceleration by the brakes of the rear vehicle.
+    mass before the rear vehicle's onset. The fourth is the additional deceleration by the rear vehicle's brakes.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -56,7 +56,7 @@ def all_three(at: Floats) -> tuple[float, float, float, float]:
 def leader_pushed(at: Floats, early: float, beyond: float) -> tuple[float, float]:
     """Return the speed (m/s) of the front vehicle after a push, and the time (s) at which it then hits the obstacle.
 
-    The push is such that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
+    The push is just strong enough that the front vehicle hits the obstacle with the speed ``sqrt(beyond)``.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -79,7 +79,7 @@ def least_beyond(
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: time of the push, s.
-        late: time for which ``place`` and ``speed`` hold, s.
+        late: time at which the vehicles have ``place`` and ``speed``, s.
         place: smallest position of the centre of mass of all three vehicles at ``late``, m.
         speed: speed of this centre of mass at ``late``, m/s.
         least: bound that is known already, m2/s2; the result is at least this.
@@ -124,7 +124,8 @@ def slowest(at: Floats, early: float, late: float, faster: float) -> tuple[float
 
 @compiled
 def last_drive(room: float, speed: float, brakes: float, drive: float, time: float) -> float:
-    """Return how long (s) a vehicle must drive at the end of ``time``, after braking, to travel ``room`` metres in all.
+    """Return how long (s) a vehicle must drive, after braking first, to travel ``room`` metres in ``time`` seconds in
+    all.
 
     The result is infinite if the vehicle cannot travel so far.
 
@@ -323,7 +324,7 @@ def beyond_rear(
     at: Floats, early: float, late: float, closing: float, least: float, plan: Floats, other: Floats
 ) -> float:
     """Return the smallest squared speed (m2/s2) of the front vehicle at the obstacle if the first contact is with the
-    rear.
+    rear vehicle.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

@@ -1,8 +1,8 @@
 """Simulate two vehicles with piecewise constant acceleration: their smallest gap and their first contact.
 
 A *plan* is the motion of one vehicle, an array [2, PIECES]. Row ENDS has the end of each piece (s from now; the last
-piece never ends), row ACCELERATIONS the acceleration in it (m/s2). A vehicle that brakes to rest stays at rest. The
-motion has no time steps, because each piece has a closed form.
+piece never ends), row ACCELERATIONS the acceleration in it (m/s2). A vehicle that brakes to rest stays at rest. No time
+steps are needed, because the motion in each piece has a closed form.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ PIECES = 4
 
 @compiled
 def empty_plan() -> Floats:
-    """Return an uninitialised plan, [2, PIECES]. Row 0 is for the ends of the pieces (s), row 1 for accelerations
-    (m/s2).
+    """Return an uninitialised plan, [2, PIECES]. The caller fills row 0 with the ends of the pieces (s), row 1 with
+    accelerations (m/s2).
     """
     return np.empty((2, PIECES))
 

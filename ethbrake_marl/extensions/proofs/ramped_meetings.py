@@ -1,9 +1,10 @@
 """First contacts with brake build-up, the harm that must follow them, and functions that all lower bounds share.
 
-``sign`` is 1 for first contacts with the leader and -1 for first contacts with the rear vehicle. The second case is the
-mirror image of the first. A *force* is an acceleration (m/s2). The controlled vehicle's force times ``sign`` first
-rises and later falls: it drives and then brakes towards the leader, and does the reverse towards the rear vehicle.
-``place`` is a position times ``sign`` (m). docs/internals/proofs/lower-bound-cases.md has the proofs.
+``sign`` is 1 for first contacts with the leader and -1 for first contacts with the rear vehicle. The functions treat
+contacts with the rear vehicle as the mirror image of contacts with the leader. A *force* is an acceleration (m/s2). The
+controlled vehicle's force times ``sign`` first rises and later falls: it drives and then brakes towards the leader, and
+does the reverse towards the rear vehicle. ``place`` is a position times ``sign`` (m).
+docs/internals/proofs/lower-bound-cases.md has the proofs.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def range_of(sign: float, at: Floats) -> tuple[float, float, float, float]:
     down.
 
     A *force* is an acceleration (m/s2); rates are in m/s3. The least force is negative and is returned without its
-    minus sign. With ``sign`` 1 the largest force is full drive, with -1 it is full braking.
+    minus sign. If ``sign`` is 1, the largest force is full drive; if ``sign`` is -1, it is full braking.
 
     Args:
         sign: 1 or -1.
@@ -73,7 +74,7 @@ def fill_controlled(at: Floats, sign: float, switch: float, time: float, final: 
     """Write a plan of the controlled vehicle: ``sign`` times its force rises as fast as possible until ``switch``, then
     falls.
 
-    A *force* is an acceleration (m/s2). The force also falls as fast as possible.
+    A *force* is an acceleration (m/s2). After ``switch`` it falls as fast as possible.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
@@ -162,7 +163,8 @@ def gentlest_ramped(kind: int, at: Floats, time: float) -> float:
 def slack_of(
     kind: int, at: Floats, early: float, late: float, v: float, hard: float, plan: Floats
 ) -> tuple[float, float]:
-    """Return the largest distance (m) to the neighbour at ``early``, and the largest excess of the closing speed then.
+    """Return the largest distance (m) to the neighbour and the largest excess of the closing speed (m/s), both at
+    ``early``.
 
     The excess (m/s) is the closing speed at ``early`` minus ``hard``. The first contact comes between ``early`` and
     ``late``.
@@ -330,7 +332,7 @@ def meet_ramped(kind: int, at: Floats, sign: float, plan: Floats, other: Floats)
     """Return time (s) and closing speed (m/s) of the contact with a neighbour under full drive or full braking.
 
     Brakes build up at finite rates. The time is infinite and the speed 0 if there is no contact. The third result is
-    the smallest closing speed (m/s) of any motion of the pair whose gap is never larger than in this one.
+    the smallest closing speed (m/s) over all motions of the pair whose gap is never larger than in this motion.
 
     Args:
         kind: neighbour of the first contact, ``RAMPED_FRONT`` or ``RAMPED_REAR``.
@@ -379,7 +381,7 @@ class LowerBound:
     def impact_proven(self) -> Bools:
         """Worlds in which every command of the controlled vehicle certainly leads to an impact: boolean mask, [n].
 
-        False means that no impact is proven. It does not mean that an impact can be avoided.
+        False means that no impact is proven; an impact may be unavoidable nevertheless.
         """
         return np.asarray(self.harm > 0.0, np.bool_)
 
@@ -448,11 +450,12 @@ def rounding(worlds: Worlds, vehicle: int | Ints, way_m: Floats | float = 0.0) -
 
     A segment of motion rounds each speed twice and each gap five times. A round of impacts rounds each speed by up to 8
     eps of the largest speed. Each segment and each round changes D by at most 8 eps S (eps = 2^-52). These errors add
-    up and do not multiply, because the proofs compare a motion with itself. ``BOUND_EPS`` covers 500 segments and
-    rounds: an episode of 8 s has 80 steps, and the bound's own arithmetic is a few hundred roundings.
+    up and do not multiply, because the proofs compare a motion only with the formulas for this same motion.
+    ``BOUND_EPS`` allows for 500 segments and rounds. This is enough: an episode of 8 s has 80 steps, and the
+    computation of the bound rounds a few hundred times.
 
-    With several controlled vehicles (a team), the largest speed is a speed limit if any of them may drive, and the
-    largest closing acceleration uses the strongest drive.
+    With several controlled vehicles (a team), V is the largest speed limit if any of them may drive, and A includes the
+    largest driving capacity.
 
     Args:
         worlds: the worlds, [n].

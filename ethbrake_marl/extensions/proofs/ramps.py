@@ -3,7 +3,7 @@
 A *force* is an acceleration (m/s2). A *plan* is the motion of one vehicle, an array [3, LEGS]. Row ENDS has the end of
 each leg (s from now; the last leg never ends), row FORCES the force at its start (m/s2), row JERKS the rate of change
 (m/s3). A vehicle at rest stays there until its force is above 0. A vehicle at its speed limit keeps that speed until
-its force is below 0. The motion has no time steps, because the gap is a sequence of cubic polynomials.
+its force is below 0. No time steps are needed, because the gap is piecewise a cubic polynomial of time.
 docs/internals/proofs/lower-bound-cases.md has the proof, under "Brakes that build up".
 """
 
@@ -72,8 +72,8 @@ def fill_switch(
         rise: rate at which the force rises, m/s3; may be infinite.
         low: least force, without its minus sign.
         fall: rate at which the force falls, m/s3.
-        switch: time at which the force begins to fall, s. With an infinite ``rise``, a value from -1 to 0 means that
-            the force falls at once, from the share ``1 + switch`` of the way from ``force`` to ``high``.
+        switch: time at which the force begins to fall, s. If ``rise`` is infinite, ``switch`` may be from -1 to 0: the
+            force then jumps to ``force + (1 + switch) (high - force)`` and falls at once.
         time: time at which the force is ``final``, s.
         final: force at ``time``; -inf: no condition.
 
@@ -209,8 +209,8 @@ def meeting(
 
     The results are inf, 0, 0 if there is no contact. The forced closing speed is the smallest value of ``w + (gap -
     slack) / t`` until the contact, with t counted from ``since``. It is also a lower bound on the closing speed of
-    other motions of the pair. The gap of such a motion may be smaller by ``slack`` at ``since``. Its closing speed must
-    exceed the closing speed here by an amount that never decreases.
+    other motions of the pair. The gap of such a motion may be smaller by ``slack`` at ``since``. For the bound to hold,
+    the other motion's closing speed minus the closing speed here must never decrease.
 
     Args:
         gap: gap at ``since``, m.

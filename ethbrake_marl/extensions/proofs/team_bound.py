@@ -1,7 +1,7 @@
 """``team_bound``: a proven lower bound on the harm of every world, whatever several controlled vehicles do.
 
 If Vehicle 2 is the first controlled vehicle, the first three vehicles are bounded together. If Vehicle 1 is controlled
-and an obstacle is ahead, the obstacle is treated as a first vehicle that nothing moves.
+and an obstacle is ahead, the obstacle is treated as the first vehicle of the line, which nothing can move.
 docs/internals/proofs/team-bound.md has the proofs.
 """
 
@@ -146,9 +146,10 @@ def team_bound(
         horizon_s: time until which harm counts, s after the alert.
         scripts: script name of each other vehicle, by index. Every script must be full_brake. None: all other vehicles
             brake fully.
-        time_step_s: time between two decisions, s. The bound then holds only for commands that change at decisions: the
-            first decision when the first of the vehicles may act, then one every ``time_step_s``. The bound is larger
-            if Vehicle 2 is the first to act. None: commands may change at any time.
+        time_step_s: time between two decisions, s. With a time step the bound holds only for commands that change at
+            decisions. The first decision comes when the first controlled vehicle may act, and the next ones every
+            ``time_step_s`` after it. The bound is then larger if Vehicle 2 is the first controlled vehicle that may
+            act. None: commands may change at any time.
 
     Raises ``InvalidInput`` for vehicles that are empty, unknown or repeated, another script, an unknown harm count, a
     time step below ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the first of the vehicles may
@@ -224,7 +225,8 @@ def team_bound(
 
 
 def _pair_bound(columns: Mapping[int, Floats | float], until: Floats, counts: Bools) -> Floats:
-    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 in worlds where its next impact does not count.
+    """Return the bound on the harm of one pair alone, [n] m2/s2; 0 in worlds where the pair's next impact does not
+    count.
 
     Args:
         columns: values of each column of a pair (``PAIR_GAP`` to ``FOLLOWER_A``); columns that are left out are 0.

@@ -53,10 +53,11 @@ def from_data_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Create a scenario from recorded traffic: highD, exiD, NGSIM, OpenACC, or a table of trajectories.
+    """Create a scenario from recorded traffic.
 
-    Vehicles that follow each other in a lane become rows of the scenario. A row has the speeds of the vehicles, and the
-    gaps between them from bumper to bumper.
+    The formats are highD, exiD, NGSIM, OpenACC, and any table of trajectories. Vehicles that follow each other in a
+    lane become rows of the scenario. A row has the speeds of the vehicles, and the gaps between them from bumper to
+    bumper.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.extensions.recorded.scenario import scenario_from_data

@@ -1,4 +1,4 @@
-"""HTML reports of evaluations, figures, and films of episodes."""
+"""HTML reports of evaluations; figures; films of episodes."""
 
 from typing import TYPE_CHECKING
 

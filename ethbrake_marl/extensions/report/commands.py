@@ -29,7 +29,7 @@ def watch_command(
     settings: SettingsOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Write a film of agents that drive one world, in real time.
+    """Write a real-time film of agents that drive the same world.
 
     The film shows the road to scale, the commands, the impacts and the harm.
     """

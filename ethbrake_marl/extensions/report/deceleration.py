@@ -40,7 +40,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class DecelerationCurve:
-    """Harm in one world at K constant decelerations of one vehicle, in increasing order."""
+    """Harm in one world as a function of the constant deceleration of one vehicle, at K increasing decelerations."""
 
     task: Task  # scenario, and the one controlled vehicle
     world: Worlds  # world at the alert, n = 1
@@ -62,10 +62,10 @@ class DecelerationCurve:
 def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> DecelerationCurve:
     """Compute predicted, first-impact and total harm of one world at many constant decelerations of one vehicle.
 
-    The decelerations are ``points`` evenly spaced values and the breakpoints of the pairwise closed form. The
-    prediction assumes that all other vehicles brake fully. In the simulation, the other vehicles follow the scripts of
-    the scenario. Raises ``InvalidInput`` unless there is exactly one world, ``points`` is at least 2, and the command
-    of every script is fixed at the alert.
+    The decelerations are ``points`` evenly spaced values, and the values at which the predicted harm (the pairwise
+    closed form) has a kink or jump. The prediction assumes that all other vehicles brake fully. In the simulation, the
+    other vehicles follow the scripts of the scenario. Raises ``InvalidInput`` if there is not exactly one world, if
+    ``points`` is below 2, or if a script reacts to what happens after the alert.
 
     Args:
         world: world at the alert, n = 1.
@@ -75,7 +75,7 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
     """
     if world.n != 1:
         raise InvalidInput(
-            f"deceleration_curve: {world.n} worlds; give exactly one world, for instance worlds.take([0])"
+            f"deceleration_curve: world has {world.n} worlds; give exactly one, for instance worlds.take([0])"
         )
     if not points >= 2:
         raise InvalidInput(f"deceleration_curve: points = {points}: the number of points must be at least 2")
@@ -107,17 +107,17 @@ def deceleration_curve(world: Worlds, task: Task, *, points: int = POINTS) -> De
 
 
 def regimes_of(worlds: Worlds, pair: int, deceleration_mps2: Floats) -> NDArray[np.str_]:
-    """Return the way in which one pair of vehicles first meets in each world, [n].
+    """Return how one pair of vehicles makes its first contact in each world, [n].
 
-    Each vehicle of the pair coasts during its latency and then brakes with a constant deceleration. The other vehicles
-    have no effect. The values are ``early`` (the pair meets before the front vehicle brakes), ``A`` (the rear vehicle
-    still coasts), ``A'`` (the rear vehicle coasts and the front vehicle is at rest), ``B`` (both vehicles brake), ``C``
-    (the rear vehicle brakes and the front vehicle is at rest) and ``none`` (the pair never meets). The formulas are in
-    docs/internals/proofs/constant-deceleration.md.
+    Each vehicle of the pair coasts during its latency and then brakes with a constant deceleration. All other vehicles
+    are ignored. The values are ``early`` (contact before the front vehicle brakes), ``A`` (the front vehicle brakes,
+    the rear vehicle coasts), ``A'`` (the front vehicle is at rest, the rear vehicle coasts), ``B`` (both vehicles
+    brake), ``C`` (the front vehicle is at rest, the rear vehicle brakes) and ``none`` (no contact). Formulas for each
+    value are in docs/internals/proofs/constant-deceleration.md.
 
     Args:
         worlds: worlds at the alert, [n].
-        pair: index of the pair, which consists of the vehicles ``pair`` and ``pair + 1``.
+        pair: index of the pair of the vehicles with the indices ``pair`` and ``pair + 1``.
         deceleration_mps2: constant deceleration of each vehicle, [n, N] m/s2.
 
     """
@@ -159,12 +159,13 @@ _REGIMES = {  # colour and meaning of each regime
 def deceleration_figure(curve: DecelerationCurve, *, title: str = "") -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of one vehicle.
 
-    The upper panel shows the predicted harm, the simulated harm under both counts, and the decelerations that E-V2X-BM
-    chooses. Horizontal lines mark the best known harm. The lower panel shows the way in which each pair first meets.
+    The upper panel shows the predicted harm, the simulated harm under both counts, and the decelerations that the
+    pairwise and the coupled E-V2X-BM choose. Two horizontal lines mark the best known harm over all commands, constant
+    or not, under each count. The lower panel shows how each pair makes its first contact (see ``regimes_of``).
 
     Args:
         curve: result of ``deceleration_curve``.
-        title: title of the figure; if empty, the name of the scenario.
+        title: title of the figure; if empty, the title is the name of the scenario.
 
     """
     scenario, vehicle = curve.task.scenario, curve.task.vehicle

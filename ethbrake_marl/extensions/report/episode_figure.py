@@ -21,12 +21,12 @@ from ethbrake_marl.game.harm import HARM_COUNTS
 def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
     """Draw positions with impacts, gaps, and commands of the controlled vehicles over time.
 
-    The figure has one column for each record, with common scales, so agents can be compared in the same world. Raises
-    ``InvalidInput`` if ``records`` is empty.
+    The figure has one column for each record. All columns have the same scales, so agents can be compared in the same
+    world. Raises ``InvalidInput`` if ``records`` is empty.
 
     Args:
-        records: recorded episodes, by the title of their column.
-        caption: text below the figure; if empty, the parameters of the first world.
+        records: recorded episodes; the key of an episode is the title of its column.
+        caption: text below the figure; if empty, the caption states the parameters of the first world.
 
     """
     if not records:
@@ -120,5 +120,5 @@ def _command(axes: Axes, record: EpisodeRecord) -> None:
 
 
 def _vehicle_style(i: int) -> dict[str, Any]:
-    """Return the colour and dashes of the curves of Vehicle ``i + 1`` and of the gap ahead of this vehicle."""
+    """Return the colour and dashes in which the curves of Vehicle ``i + 1``, and of the gap ahead of it, are drawn."""
     return {"color": vehicle_colour(i), "linestyle": DASHES[i % len(DASHES)], "linewidth": 1.6}

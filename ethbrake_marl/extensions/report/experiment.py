@@ -1,6 +1,6 @@
-"""The report of ``ethbrake run``: an HTML page, three figures, and the results of the policy on the other two tests.
+"""The report of ``ethbrake run``: an HTML page, three figures, and results of the policy on the other two tests.
 
-Other extensions can add sections to the page (``register_run_section``).
+Other extensions can add sections to the page: see ``register_run_section``.
 """
 
 from __future__ import annotations
@@ -61,8 +61,9 @@ MakeSection = Callable[[Experiment, OnProgress], RunSection | None]  # None: no 
 def register_run_section(name: str, make: MakeSection) -> None:
     """Register a function that adds a section to the report of every ``ethbrake run``, below the results.
 
-    ``name`` is the unique name of the section. ``make`` is a function that returns the section, or None for no section.
-    An installed package can instead declare an entry point in the group ``ethbrake_marl.run_sections``.
+    ``name`` is the unique name of the section. ``make`` is a function that returns the section, or None if the run gets
+    no such section. An installed package can instead declare an entry point in the group
+    ``ethbrake_marl.run_sections``.
     """
     RUN_SECTIONS.add(name, make, lambda other: other is make)
 
@@ -71,7 +72,7 @@ RUN_SECTIONS: Registry[MakeSection] = Registry("section of a run's report", "run
 
 
 def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
-    """Evaluate a policy on the other two tests, draw the figures, write ``report.html``, and return the printed part.
+    """Evaluate the policy on the other two tests, draw figures, write ``report.html``, and return what is printed.
 
     Args:
         experiment: finished run, with its folder, policy and evaluation.
@@ -82,7 +83,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
     others, done = other_tests(evaluation.scenario) if len(evaluation.vehicles) == 1 else (), count()
 
     def begin(stage: str) -> None:
-        """Report that ``stage`` begins. An empty text means that all stages have ended."""
+        """Report that ``stage`` begins. An empty ``stage`` means that all stages have ended."""
         tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(others)))
 
     is_papers = is_papers_test(evaluation.task, evaluation.seed)
@@ -122,7 +123,7 @@ def make_report(experiment: Experiment, tell: OnProgress) -> RunReport:
 
 
 def _drive_other_test(experiment: Experiment, test: Scenario) -> SummaryTable:
-    """Evaluate the trained policy, the same policy with a shield, and the baselines on ``test``; return the table."""
+    """Evaluate the trained policy (without and with a shield) and the baselines on ``test``; return a summary."""
     evaluation = experiment.evaluation
     worlds = test.sample(min(evaluation.worlds.n, MOST_WORLDS), experiment.list_seed)
     agents = compared_agents(experiment.trained.trained, test, experiment.harm_count, BESIDE)
@@ -142,17 +143,18 @@ def write_figures(
     learned: str = TRAINED_POLICY,
     harm_count: HarmCount = "first",
 ) -> list[Part]:
-    """Draw the three figures, write them as PNG files into ``folder``, and return them as pieces of HTML.
+    """Draw the three figures, write them as PNG files into ``folder``, and return them as parts of an HTML page.
 
     Args:
         folder: folder of the run.
         evaluation: evaluation of the trained policy or team and the baselines.
         rows: summary of the evaluation, one row for each agent.
-        course: evaluations during the training; each has ``steps``, both harms and ``collision_rate``.
+        course: evaluations during the training, each with ``steps``, ``first_impact_harm``, ``total_harm`` and
+            ``collision_rate``.
         course_caption: caption of the learning curve.
-        agents: evaluated agents, by name.
+        agents: evaluated agents, by name; some drive the typical world again.
         learned: name of the trained policy or team in ``agents``.
-        harm_count: harm count that the trained policy or team minimises.
+        harm_count: harm count by which the typical world of the third figure is chosen.
 
     """
     references = [row for row in rows if row.agent in BESIDE]
@@ -183,11 +185,11 @@ def write_figures(
 
 
 def telling_world(evaluation: Evaluation, harm_count: HarmCount = "first", learned: str = TRAINED_POLICY) -> int:
-    """Return the index of a typical world: the world in which ``learned`` reduces harm by the median amount.
+    """Return the index of a typical world: the one in which ``learned`` reduces the harm by the median amount.
 
-    The reduction is the harm of full braking minus the harm of ``learned``, the trained policy or team. Worlds in which
-    full braking does no harm are ignored. Returns 0 if full braking does no harm in any world. ``harm_count`` is
-    ``first`` or ``total``.
+    The reduction is the harm of full braking minus the harm of ``learned``, the trained policy or team. The median is
+    taken over the worlds in which full braking does harm. Returns 0 if full braking does no harm in any world.
+    ``harm_count`` is ``first`` or ``total``.
     """
     before = evaluation.outcome(BESIDE[0]).world_harm(harm_count)
     rows = np.flatnonzero(before > 0.0)

@@ -32,18 +32,19 @@ _COLOURS = 64
 def film_scenes(world: Worlds, agent: Driver, *, scenario: Scenario, fps: float = FILM_FPS) -> list[Scene]:
     """Simulate one episode, and return its scenes: ``fps`` scenes per second from the alert on, and the final scene.
 
-    Raises ``InvalidInput`` unless there is exactly one world, and ``PhysicsError`` if the physics cannot simulate it.
+    Raises ``InvalidInput`` if there is not exactly one world, and ``PhysicsError`` if the physics cannot simulate the
+    world.
 
     Args:
         world: world at the alert, n = 1.
-        agent: agent of the learner, or a team of agents. It is not changed.
+        agent: agent of the learner, or a team of agents. The agent is not changed.
         scenario: scenario of the world; its scripts control the other vehicles.
         fps: scenes per second.
 
     """
     if world.n != 1:
         raise InvalidInput(
-            f"film_scenes: {count_of(world.n, 'world')}; give exactly one world, for instance worlds.take([0])"
+            f"film_scenes: world has {count_of(world.n, 'world')}; give exactly one, for instance worlds.take([0])"
         )
     engine = episode_engine(world, Team.of(agent, scenario.learners), scenario)
     trace = Trace(engine, whole=True, alert=world)
@@ -68,7 +69,7 @@ def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: 
 
     Args:
         world: world at the alert, n = 1.
-        agents: agents, by the title above their film.
+        agents: agents; the key of an agent is the title above its film.
         ending: ending of the file name: ``.gif``, ``.mp4`` or ``.svg``.
         scenario: scenario of the world.
 
@@ -79,15 +80,15 @@ def film(world: Worlds, agents: Mapping[str, Driver], ending: str, *, scenario: 
 
 
 def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
-    """Return the bytes of a GIF, MP4 or SVG file with several films of one world, one below the other, in real time.
+    """Return the bytes of a GIF, MP4 or SVG file that shows films of one world in real time, one below the other.
 
-    A film that ends earlier shows its last scene until the end. GIF and SVG files repeat endlessly. Raises
-    ``InvalidInput`` if there are no films, more than ``MOST_FILMS`` films or more than ``MOST_PICTURES`` pictures, if
-    ``ending`` is unknown, or if ``fps`` does not divide 100 (a GIF counts hundredths of a second). Raises
-    ``MissingExtra`` for an MP4 file if the library imageio-ffmpeg is not installed.
+    A film that ends before the longest film shows its last scene until the end of the file. GIF and SVG files repeat
+    endlessly. Raises ``InvalidInput`` if there are no films, more than ``MOST_FILMS`` films or more than
+    ``MOST_PICTURES`` pictures, if ``ending`` is unknown, or if 100 is not a multiple of ``fps`` (a GIF stores times in
+    hundredths of a second). Raises ``MissingExtra`` for an MP4 file if the library imageio-ffmpeg is not installed.
 
     Args:
-        films: scenes of each film, by title.
+        films: scenes of each film; the key of a film is its title.
         ending: ending of the file name: ``.gif``, ``.mp4`` or ``.svg``.
         fps: scenes per second.
 
@@ -96,12 +97,12 @@ def film_bytes(films: Films, ending: str, *, fps: int = FILM_FPS) -> bytes:
     if not films or not all(films.values()):
         raise InvalidInput("film_bytes: there are no scenes; give at least one film with at least one scene")
     if not fps > 0 or 100 % fps:
-        raise InvalidInput(f"film_bytes: fps = {fps}: fps must divide 100, for instance 10, 20, 25 or 50")
+        raise InvalidInput(f"film_bytes: fps = {fps}: 100 must be a multiple of fps; give 10, 20, 25 or 50")
     pictures = len(films) * max(map(len, films.values()))
     if pictures > MOST_PICTURES:
         raise InvalidInput(
-            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: the film has {pictures:,} pictures,"
-            f" but at most {MOST_PICTURES:,} fit; give fewer agents, or a scenario with a shorter horizon_s"
+            f"film of {len(films)} agents for {pictures // len(films) / fps:g} s: the film needs {pictures:,} pictures,"
+            f" but at most {MOST_PICTURES:,} are allowed; give fewer agents, or a scenario with a shorter horizon_s"
         )
     return _WRITERS[ending](films, fps)
 
@@ -116,7 +117,7 @@ def check_film(ending: str, films: int = 1) -> None:
     if ending == ".mp4":
         need("imageio_ffmpeg")
     if films > MOST_FILMS:
-        raise InvalidInput(f"film: {films} agents; a film can show at most {MOST_FILMS} agents, so give fewer")
+        raise InvalidInput(f"film: {films} agents are too many; give at most {MOST_FILMS} agents")
 
 
 def _stacked(films: Films) -> Iterator[Frame]:

@@ -1,4 +1,4 @@
-"""Figures of harm: mean harm of each agent, distribution of regret, and harm in avoidable and unavoidable contacts."""
+"""Figures of harm: mean harm, distribution of regret, and harm in worlds with avoidable and unavoidable contact."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def harm_by_agent(
 ) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    A line marks the best known harm, and further marks show the harm on other tests. The figure is narrow enough for
-    the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
+    A vertical line marks the mean best known harm. Further marks show each agent's mean harm on other tests. The figure
+    is narrow enough for the screen of a phone. Raises ``InvalidInput`` if ``rows`` is empty.
 
     Args:
         rows: summary of each agent.
         harm_count: harm count to draw, ``first`` or ``total``.
-        elsewhere: summaries of the agents on other tests, by the title of the test; None: no marks.
+        elsewhere: summaries of the agents on other tests, by the title of the test; None: no other tests.
 
     """
     if not rows:
@@ -70,7 +70,7 @@ def harm_by_agent(
 
 
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
-    """Label the rows of a figure with the names of the agents, the first one on top.
+    """Label the rows of a figure with the names of the agents, the first agent in the top row.
 
     Names are shortened to ``most`` characters.
     """
@@ -79,9 +79,10 @@ def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
 
 
 def regret_distribution(evaluation: Evaluation) -> Figure:
-    """Draw, for each agent, the fraction of worlds in which its regret exceeds x, under both harm counts.
+    """Draw, for each agent and harm count, the fraction of worlds in which the agent's regret exceeds x, against x.
 
-    *Regret* is harm minus best known harm. If no best known harm exists, the figure shows the harm instead of regret.
+    *Regret* is harm minus best known harm. If the best known harm of the worlds was not computed, the figure shows the
+    agents' harm instead of their regret.
     """
     regrets = regrets_of(evaluation)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
@@ -107,18 +108,18 @@ def regret_distribution(evaluation: Evaluation) -> Figure:
 
 
 def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Draw each agent's mean harm as a bar of three parts.
+    """Draw each agent's mean harm per world as a bar of three parts.
 
     The parts are the best known harm, the regret in worlds with unavoidable contact, and the regret in worlds with
-    avoidable contact. *Regret* is harm minus best known harm. Raises ``InvalidInput`` if it is unknown in which worlds
-    contact is avoidable.
+    avoidable contact. *Regret* is harm minus best known harm. Raises ``InvalidInput`` if it is not proven in which
+    worlds contact is avoidable.
     """
     regrets = regrets_of(evaluation)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
     if regrets is None or avoidable is None:
         raise InvalidInput(
-            "harm_in_parts: it is not proven in which worlds contact is avoidable; give an evaluation that the proofs"
-            " cover"
+            "harm_in_parts: it is not proven in which worlds contact is avoidable; give an evaluation"
+            " of worlds that the proofs cover"
         )
     figure, panels = new_panels((10.0, 1.4 + 0.36 * len(evaluation.outcomes)), columns=2, sharey=True)
     for axes, count in zip(panels, HARM_COUNTS, strict=True):

@@ -1,4 +1,7 @@
-"""Films of episodes as one animated SVG file without scripts. Any browser plays it, with light or dark colours."""
+"""Films of episodes as one animated SVG file without scripts.
+
+Any browser plays the file, in light or dark colours as the browser prefers.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +40,10 @@ text { font-family: system-ui, sans-serif; font-size: 14px; fill: var(--ink); }
 
 
 def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
-    """Return the text of an SVG file that shows films of one world in real time, one below the other, on one scale.
+    """Return the text of an SVG file that shows films of one world in real time, below each other, to the same scale.
 
     Args:
-        films: scenes of each film, by title; every film has at least one scene.
+        films: scenes of each film, at least one; the key of a film is its title.
         fps: scenes per second.
 
     """
@@ -65,10 +68,10 @@ def animate_films(films: Mapping[str, Sequence[Scene]], *, fps: int) -> str:
 
 
 class _Strip:
-    """Strip of the SVG picture with the film of one agent on its road.
+    """Horizontal strip of the SVG picture that shows the film of one agent: a road with vehicles, and a title.
 
-    ``left_m`` and ``right_m`` are the positions at the edges of the picture. ``fps`` is the number of scenes per
-    second.
+    ``left_m`` and ``right_m`` are the positions on the road at the left and right edge of the picture. ``fps`` is the
+    number of scenes per second.
     """
 
     def __init__(self, film: Sequence[Scene], title: str, left_m: float, right_m: float, fps: int) -> None:
@@ -146,9 +149,10 @@ class _Strip:
         )
 
     def _events(self) -> list[tuple[int, int, Struck]]:
-        """Return the impacts to show, each with the index of its first scene and of the scene after its last one.
+        """Return the impacts to show, each as (start, stop, impact): the scenes start to stop - 1 show the impact.
 
-        Only one impact is shown at a time. A weaker impact is omitted while a harder impact is shown.
+        Only one impact is shown at a time. A new impact replaces the shown impact unless it is weaker; then it is
+        omitted.
         """
         known: set[tuple[int, float]] = set()
         events: list[tuple[int, int, Struck]] = []
@@ -164,7 +168,7 @@ class _Strip:
         return events
 
     def _switched(self, lit: Sequence[bool]) -> str:
-        """Return an SVG animation with opacity 1 in scenes in which ``lit`` is True, and opacity 0 in other scenes."""
+        """Return an SVG animation that shows an element only in the scenes in which ``lit`` is True."""
         values, times, k = [], [], 0
         for on, run in groupby(lit):
             values.append("1" if on else "0")
@@ -185,7 +189,7 @@ def _clock(y: int, last: int, frames: int, fps: int) -> Iterator[str]:
     Args:
         y: vertical position of the bar in the picture.
         last: index of the last scene of the longest film.
-        frames: number of scenes until the animation starts again.
+        frames: number of scenes after which the animation starts again.
         fps: scenes per second.
 
     """

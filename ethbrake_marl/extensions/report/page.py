@@ -1,8 +1,8 @@
-"""HTML pages that are a single file each, and load no other file.
+"""HTML pages. Each page is a single file, which loads no other file.
 
-A page consists of a title, a short lead and sections. A section contains strings, which become paragraphs, and parts:
-tables, figures or the episode player. Strings are escaped, so they never act as HTML. Control characters, and
-characters that change the writing direction, are shown as Python escapes.
+A page consists of a title, a short lead and sections. A section consists of strings, which become paragraphs, and of
+parts: tables, figures or the episode player. Strings are escaped, so characters such as < are shown and never act as
+HTML. Control characters, and characters that change the writing direction, are shown as Python escapes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _STAY = "\u00a0"  # no-break space
 class Part:
     """Part of an HTML page: its HTML text, and the names of the style sheets and scripts that it needs.
 
-    Class methods make the usual parts, for instance ``Part.paragraph("Text")``.
+    The class methods create common parts, for instance ``Part.paragraph("Text")``.
     """
 
     html: Markup  # HTML text of the part
@@ -47,7 +47,8 @@ class Part:
     def paragraph(cls, text: str, kind: str = "") -> Part:
         """Return a part with ``text`` as a paragraph.
 
-        ``kind`` is its style: ``quiet`` (conditions), ``note`` (important remark), ``alarm``, or empty.
+        ``kind`` is the style of the paragraph: ``quiet`` (small print), ``note`` (important remark), ``alarm``, or
+        empty.
         """
         return cls(Markup('<p class="{}">{}</p>\n').format(kind, shown(text)))
 
@@ -58,7 +59,7 @@ class Part:
 
     @classmethod
     def facts(cls, facts: Mapping[str, object]) -> Part:
-        """Return a part with a list of names and values; ``facts`` maps each name to its value."""
+        """Return a part with a list of names and their values; ``facts`` maps each name to its value."""
         lines = [Markup("<dt>{}</dt><dd>{}</dd>").format(shown(name), _text(value)) for name, value in facts.items()]
         return cls(Markup("<dl>\n{}\n</dl>\n").format(Markup("\n").join(lines)))
 
@@ -70,7 +71,7 @@ class Part:
 
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
-        """Return a part that explains words in a box; ``meanings`` maps each word to its meaning."""
+        """Return a part with a box that explains words; ``meanings`` maps each word to its meaning."""
         return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
 
     @classmethod
@@ -91,9 +92,9 @@ class Part:
 
     @classmethod
     def data(cls, name: str, content: object, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = ()) -> Part:
-        """Return a part with ``content`` as JSON in a script element, which the scripts of the page can read.
+        """Return a part with ``content`` as JSON in an HTML element ``script``, which the scripts of the page can read.
 
-        The characters < > and & are escaped, so the content cannot end the element or begin another one.
+        The characters < > and & are escaped, so the content cannot end the element or begin a new element.
 
         Args:
             name: id of the element.
@@ -110,10 +111,10 @@ class Part:
 
     @classmethod
     def template(cls, file: str, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **values: object) -> Part:
-        """Return a part made from the template ``file`` in this folder, filled with ``values``.
+        """Return a part made from the template ``file`` in the folder of this module, filled with ``values``.
 
         Values of the type ``Markup`` are inserted unchanged; other values are escaped. ``styles`` and ``scripts`` are
-        the names of the files in this folder that the part needs.
+        the names of the style sheets and scripts in the same folder that the part needs.
         """
         return cls(Markup(_environment().get_template(file).render(**values)), styles, scripts)
 
@@ -121,8 +122,8 @@ class Part:
     def table(cls, sheet: Sheet) -> Part:
         """Return a part that shows ``sheet`` as a table. A table that is wider than the page can be scrolled.
 
-        A cell may be a ``Shown`` object with a value of the type ``Markup``, for instance a button. All other texts are
-        escaped.
+        To put HTML such as a button into a cell, give a ``Shown`` object whose value has the type ``Markup``. All other
+        texts are escaped.
         """
         return cls(Markup(sheet.html() + "\n"))
 
@@ -140,16 +141,16 @@ class Part:
         """Return a part that shows a figure with a title and a description.
 
         The caption of the figure becomes text of the page below the figure, because the text of a wide figure is too
-        small on a phone. Raises ``InvalidInput`` if ``figure`` is not the SVG of a figure of this package.
+        small on a phone. Raises ``InvalidInput`` if ``figure`` is an SVG file that this package did not write.
 
         Args:
-            figure: figure, or the bytes of the SVG of a figure of this package.
+            figure: figure of matplotlib, or the bytes of an SVG file with a figure of this package.
             title: title above the figure.
             description: description of what the figure shows.
-            alone: True: keep the colours of the figure, on a white background, as for a map. False: use the colours of
-                the page, light or dark.
-            known: text that is omitted from the caption, because it is elsewhere on the page.
-            where: file of the SVG, for error messages.
+            alone: True: keep the figure's own colours, on a white background (for instance for a map). False: use the
+                colours of the page, light or dark.
+            known: text that is omitted from the caption, because the page shows it elsewhere.
+            where: path of the SVG file, for error messages.
 
         """
         from ethbrake_marl.extensions.report.svg import inline_svg
@@ -182,12 +183,12 @@ class Part:
 
         Args:
             worlds: worlds to show, at least one, with the episode of each agent.
-            driven: indices (0 = front) of the controlled vehicles; or a mapping from agents to indices if the agents
-                control different vehicles.
-            focus: name of an agent that is selected at the start, together with the first and the last agent.
-            shown_first: indices of the agents that are selected at the start; empty: the first agent, ``focus`` and
-                the last agent.
-            folded: whether the curves over time are hidden until the reader clicks on their title.
+            driven: indices (0 = front) of the controlled vehicles. If the agents control different vehicles: a mapping
+                from the name of each agent to these indices.
+            focus: name of an agent that is selected at the start if ``shown_first`` is empty.
+            shown_first: indices of the agents that are selected at the start; empty: ``focus``, and the first and last
+                agents, up to three.
+            folded: whether the curves over time are hidden until the reader clicks on the title above them.
 
         """
         agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
@@ -237,7 +238,7 @@ class Section:
 
     @property
     def parts(self) -> list[Part]:
-        """Body of the section as parts; every string becomes a paragraph."""
+        """Body of the section as a list of parts; every string becomes a paragraph."""
         return [Part.paragraph(each) if isinstance(each, str) else each for each in self.body]
 
 
@@ -247,7 +248,7 @@ class Page:
 
     Args:
         title: title of the page.
-        sections: sections in order; each section has an entry in the table of contents.
+        sections: sections, in the order of the page; each section has an entry in the table of contents.
         lead: one or two sentences about the page, shown below the title.
         opening: parts between the lead and the table of contents.
 
@@ -269,14 +270,14 @@ class Page:
 
     @cached_property
     def _code(self) -> tuple[str, str]:
-        """Text of all style sheets, and text of all scripts of the page. Each file is included once."""
+        """Text of all style sheets of the page, and text of all its scripts. Each file is included only once."""
         styles = dict.fromkeys(["page.css", *(name for part in self._parts for name in part.styles)])
         scripts = dict.fromkeys(name for part in self._parts for name in part.scripts)
         return "\n".join(map(read_file, styles)), "\n".join(map(read_file, scripts))
 
     @property
     def policy(self) -> str:
-        """Content security policy of the page: only its own styles and scripts, and embedded pictures, are allowed."""
+        """Content security policy of the page, which allows only the page's own styles, scripts and pictures."""
         styles, script = (
             f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" if text else "'none'"
             for text in self._code
@@ -288,7 +289,7 @@ class Page:
 
     @staticmethod
     def anchors(titles: Sequence[str]) -> list[str]:
-        """Return a unique link name for each title, made of letters, digits and hyphens ("worst-ten-worlds")."""
+        """Return a unique anchor for each title, made of letters, digits and hyphens ("worst-ten-worlds")."""
         anchors: list[str] = []
         for k, title in enumerate(titles):
             name = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:40]
@@ -320,7 +321,7 @@ def shown(value: object) -> str:
 
 @cache
 def read_file(name: str) -> str:
-    """Return the text of the file ``name`` in this folder."""
+    """Return the text of the file ``name`` in the folder of this module."""
     return files(__package__).joinpath(name).read_text("utf-8")
 
 

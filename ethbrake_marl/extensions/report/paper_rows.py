@@ -16,7 +16,10 @@ from ethbrake_marl.scenario.task import Task
 
 @dataclass(frozen=True, slots=True)
 class PaperRow:
-    """One row of a table of results as printed in the paper. The paper has one harm count and no intervals."""
+    """One row of a table of results as printed in the paper.
+
+    The paper has only one harm count, and gives no confidence intervals.
+    """
 
     table: Literal["random test", "hybrid test"]  # title of the table
     agent: str  # name of the strategy in the paper
@@ -65,10 +68,11 @@ _SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the varian
 
 
 def is_papers_test(task: Task, seed: int | None) -> bool:
-    """Return whether an evaluation can be compared with the paper's rows.
+    """Return whether an evaluation can be compared with the rows of the paper's tables of results.
 
-    This is so if the scenario is the paper's random test as shipped, Vehicle 2 alone is controlled, and the seed is
-    known. ``task`` is the evaluated task. ``seed`` is the seed of the list of worlds; None: unknown.
+    The comparison is possible if the scenario is ``paper-random`` or ``paper-random-early`` as shipped, only Vehicle 2
+    is controlled, and the seed is known. ``task`` contains the scenario and the controlled vehicles of the evaluation.
+    ``seed`` is the seed of the list of worlds; None: the seed is unknown.
     """
     scenario = task.scenario
     return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
@@ -78,7 +82,7 @@ def check_papers_test(task: Task, seed: int | None) -> None:
     """Raise ``InvalidInput`` if an evaluation cannot be compared with the paper's rows (see ``is_papers_test``)."""
     if not is_papers_test(task, seed):
         raise InvalidInput(
-            f"paper: the paper's rows apply to Vehicle 2 in a list of {' or '.join(_SHOWN_WITH)} as shipped, but the"
+            f"paper: the paper's results are for Vehicle 2 in worlds of {' or '.join(_SHOWN_WITH)} as shipped, but the"
             f" evaluation has {'worlds without a seed' if seed is None else 'a list'} of {task.scenario.name!r} with"
             f" the controlled vehicles {task.names};"
             f" {'give evaluate the seed of the list, or ' if seed is None else ''}leave paper out"
@@ -86,17 +90,17 @@ def check_papers_test(task: Task, seed: int | None) -> None:
 
 
 def summarise_beside_paper(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTable:
-    """Return the summary of an evaluation, with the rows of the paper's tables below it.
+    """Return the summary of an evaluation as a table, with the rows of the paper's tables below the agents.
 
-    Raises ``InvalidInput`` if the paper's rows do not apply to the evaluation. ``baseline`` is the agent with which
-    the other agents are compared.
+    Raises ``InvalidInput`` if the evaluation cannot be compared with the paper's rows. ``baseline`` is the name of the
+    agent with which all other agents are compared.
     """
     check_papers_test(evaluation.task, evaluation.seed)
     return with_paper_rows(summarise(evaluation, baseline=baseline))
 
 
 def with_paper_rows(table: SummaryTable) -> SummaryTable:
-    """Return ``table`` with the rows of the paper's tables below it."""
+    """Return ``table`` with the rows of the paper's tables added at the end."""
     return SummaryTable(table, _beside())
 
 

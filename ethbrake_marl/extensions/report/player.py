@@ -33,13 +33,13 @@ class Played:
 
     @staticmethod
     def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent drive the worlds, and store the motion under the agent's name in the ``motions`` of each entry.
+        """Let one agent drive the worlds, and store the motion in each world under ``name`` in ``motions``.
 
         Args:
-            played: one entry for each world; their ``motions`` are changed.
-            worlds: worlds at the alert, in the same order.
-            name: name of the agent on the page.
-            agent: agent that drives; it is not changed.
+            played: one entry for each world; the function adds the motion to the ``motions`` of the entry.
+            worlds: worlds at the alert, in the order of ``played``.
+            name: name of the agent that the page shows.
+            agent: agent that drives the worlds; the agent is not changed.
             scenario: scenario of the worlds; its learners are the controlled vehicles.
 
         """
@@ -48,10 +48,10 @@ class Played:
 
     @staticmethod
     def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
-        """Return the data of one episode for the script of the player, by name.
+        """Return the data of one episode as a dictionary, which the script of the player reads.
 
         Args:
-            motion: motion of the vehicles.
+            motion: motion of the vehicles in the episode.
             driven: indices of the controlled vehicles.
 
         """
@@ -72,12 +72,12 @@ class Played:
 
 
 def _impacts(motion: EpisodeMotion) -> list[list[float]]:
-    """Return a list of seven numbers for each impact of an episode, in order of time.
+    """Return a list of seven numbers for each impact of an episode, earlier impacts first.
 
     The numbers are the time (s), the index of the pair, the closing speed (m/s), 1 for the first impact of the pair and
     0 for a later one, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
-    harm so far (m2/s2). If a pair has several impacts within ``_BIN_S``, only the last one is returned. The harm after
-    the last impact is exactly the recorded harm of the episode.
+    harm so far (m2/s2). If a pair has several impacts within 1 ms (``_BIN_S``), only the last of these impacts is
+    returned. After the last impact, both harms equal the recorded harms of the episode exactly.
     """
     rows = motion.impacts
     order = np.argsort(rows.time_s, kind="stable")

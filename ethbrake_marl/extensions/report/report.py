@@ -40,8 +40,8 @@ SHIELD_WORLDS = 200  # number of worlds in which each replacement by a shield is
 def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) -> Section:
     """Return the section with the ten worlds in which the agent ``focus`` did worst.
 
-    ``watched`` are the numbers of the worlds that the player of the page can show. A button next to each of these
-    worlds starts the player.
+    ``watched`` are the numbers of the worlds that the episode player on the page can show. Next to each of the ten
+    worlds that the player can show, a button starts the player.
     """
     regrets, outcome = regrets_of(evaluation), evaluation.outcome(focus)
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -68,7 +68,7 @@ def worst_section(evaluation: Evaluation, focus: str, watched: Sequence[int]) ->
 
 
 def avoidable_section(evaluation: Evaluation) -> Section:
-    """Return the section with collisions, harm and regret, separately for avoidable and unavoidable contact."""
+    """Return the section that compares harm in worlds with avoidable contact and with unavoidable contact."""
     regrets, limits = regrets_of(evaluation), limits_of(evaluation)
     body: list[str | Part] = []
     avoidable = None if regrets is None else regrets.limits.proof.avoidable
@@ -120,9 +120,9 @@ _SPLIT: tuple[Column | str, ...] = (
 def shield_section(rows: ShieldModes, conditions: str) -> Section:
     """Return the section that compares the modes of the shield.
 
-    The section also counts how many interventions of the mode step were needed, harmless or costly. ``rows`` are the
-    results of each agent and mode. ``conditions`` is a sentence that describes the worlds. The section is empty if
-    there are no rows.
+    The section also states how many interventions of the mode ``step`` were needed, harmless or costly. ``rows`` are
+    the results, one row for each agent and mode of its shield. ``conditions`` is a sentence about the worlds and the
+    harm count. The section is empty if ``rows`` is empty.
     """
     if not rows:
         return Section("Shield", ())
@@ -151,7 +151,8 @@ _OTHERS = {"Knows", "sampled_harm", "vehicle_1_shoved_m", "vehicle_1_shoved_far_
 class Report:
     """Content of the HTML report of an evaluation.
 
-    ``html`` is the text of the page, ``write`` writes the page to a file, and ``driven`` adds episodes to watch.
+    ``html`` is the text of the page, ``write`` writes the page to a file, and ``driven`` returns the report with
+    episodes to watch.
     """
 
     title: str  # title of the page
@@ -174,8 +175,8 @@ class Report:
     def driven(self, agents: Mapping[str, Driver], *, on_agent: Callable[[str], None] | None = None) -> Report:
         """Return the report with episodes to watch and with the section about shields.
 
-        Every agent drives the chosen worlds again. The modes of each shield are compared in the first ``SHIELD_WORLDS``
-        worlds.
+        For the episodes, every agent drives some worlds again (see ``choose_shown``). The section about shields
+        compares the modes of each shield in the first ``SHIELD_WORLDS`` worlds.
 
         Args:
             agents: evaluated agents, by name; they are not changed.
@@ -203,16 +204,17 @@ class Report:
 
     @property
     def about(self) -> str:
-        """Name of the agent that the page is about.
+        """Name of the agent that the page is mainly about.
 
-        It is ``focus`` if given. Otherwise it is the last agent with a trained policy, or the last agent.
+        The name is ``focus`` if ``focus`` is not empty; otherwise the last agent with a trained policy; if there is
+        none, the last agent.
         """
         learned = [row.agent for row in self.rows if row.policy_sha256]
         return self.focus or (learned or [row.agent for row in self.rows] or [""])[-1]
 
     @property
     def html(self) -> str:
-        """HTML text of the whole page. The page loads no other file."""
+        """HTML text of the whole page. The page is a single file, which loads no other file."""
         sections: list[Section | None] = [self._results(), *self.sections, self._episodes()]
         if self.focus:
             sections.append(worst_section(self.evaluation, self.focus, [one.number for one in self.played]))
@@ -254,8 +256,8 @@ class Report:
     def first_sentence(self) -> str:
         """Sentence at the top of the page, which compares the agent's harm with full braking and the best known harm.
 
-        The sentence names the other tests in which the agent does at least as much harm as full braking. If there are
-        no such tests, it states in how many worlds the agent does more harm than full braking.
+        The sentence names the other tests in which the agent does at least as much harm as full braking. If there is no
+        such test, the sentence states in how many worlds the agent does more harm than full braking.
         """
         rows, harm = {row.agent: row for row in self.rows}, NAMES[self.harm_count]
         if self.about not in rows:
@@ -277,11 +279,11 @@ class Report:
         return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in no world more'}."
 
     def _fails(self, harm: str) -> str:
-        """Return a clause that names where the agent fails; an empty text if it fails nowhere.
+        """Return a clause that says where the agent fails, or an empty text if it fails nowhere.
 
-        The agent fails in another test if it does at least as much harm as full braking there. If it fails in no test,
-        the clause states the share of worlds in which it does more harm. ``harm`` is the measure to compare, for
-        instance ``total_harm``.
+        The agent fails in another test if its harm in that test is not clearly less than that of full braking. If the
+        agent fails in no other test, the clause states in how many worlds of the evaluation the agent does more harm
+        than full braking. ``harm`` is the measure to compare, for instance ``total_harm``.
         """
         reasons = []
         for title, _, others in self.tests:
@@ -317,7 +319,10 @@ class Report:
         return Section("Results", [*parts, Part.box("Three words", WORDS), *_measured(rows, because)])
 
     def _episodes(self) -> Section:
-        """Return the section with episodes to watch. Notes name the agents that drove differently the second time."""
+        """Return the section with episodes to watch.
+
+        Notes in the section name the agents that drove differently here than in the evaluation.
+        """
         evaluation, played = self.evaluation, self.played
         if not played:
             return Section("Episodes", ())
@@ -349,15 +354,15 @@ class Report:
 
 
 def _words(estimate: Estimate | None) -> str:
-    """Return a mean as text, without its interval; a dash if there is no estimate."""
+    """Return an estimated mean as text, without its interval; a dash if ``estimate`` is None."""
     return Column("").show(estimate).value
 
 
 def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Compare an agent's harm with full braking in the same worlds, and return "less", "more" or "as much".
+    """Return "less", "more" or "as much": the harm of an agent compared with full braking in the same worlds.
 
-    The result is "as much" if the interval of the difference contains 0, or if the interval of several worlds is
-    unknown. ``harm`` is the measure to compare, for instance ``total_harm``.
+    The result is "as much" if the interval of the difference contains 0, or if there are several worlds but no
+    interval. ``harm`` is the measure to compare, for instance ``total_harm``.
     """
     difference = row[f"{harm}_difference"]
     unknown = difference is None or (difference.interval is None and row.episodes > 1)
@@ -366,7 +371,7 @@ def _change(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
 
 
 def _table_of(rows: Sequence[SummaryRow]) -> SummaryTable:
-    """Return ``rows`` as a summary table. A summary table is returned unchanged, including the paper's rows."""
+    """Return ``rows`` as a summary table; if ``rows`` is already a summary table, return it unchanged."""
     return rows if isinstance(rows, SummaryTable) else SummaryTable(rows)
 
 
@@ -377,14 +382,17 @@ def _short_table(rows: SummaryTable) -> Part:
 
 
 def _remarks(rows: SummaryTable) -> list[str]:
-    """Return the texts of the important remarks about ``rows``."""
+    """Return those notes about ``rows`` that are important remarks."""
     return [text for kind, text in SummaryTable(rows).notes() if kind == "note"]
 
 
 def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
-    """Return parts with the conditions of ``rows``, and a table of all measures that is hidden until clicked.
+    """Return parts with the conditions under which ``rows`` were measured, and with tables of all measures.
 
-    The table also contains the paper's rows. ``because`` is a sentence with the reason for empty columns.
+    The tables are hidden until the reader clicks on their title.
+
+    The first table also contains the paper's rows if ``rows`` has them. ``because`` is a sentence that says why columns
+    are empty.
     """
     ours = SummaryTable(rows)
     whole, notes, empty = rows.sheet(), ours.notes(), _empty(rows)
@@ -404,14 +412,14 @@ def _measured(rows: SummaryTable, because: str = "") -> list[Part]:
 
 
 def _empty(rows: SummaryTable) -> list[str]:
-    """Return the headings of the empty columns of a summary, in which no row has a value."""
+    """Return the headings of those columns of a summary in which no row has a value."""
     sheet = rows.sheet()
     filled = sheet.filled()
     return [name for k, name in enumerate(sheet.headings) if k not in filled]
 
 
 def _table(sheet: Sheet, caption: str, names: set[str]) -> Part:
-    """Return a table with the first column of ``sheet`` (the agent) and the columns in ``names`` that are not empty.
+    """Return a table with the first column of ``sheet`` (the agent) and those columns in ``names`` that have values.
 
     ``caption`` is the title of the table.
     """
@@ -442,9 +450,10 @@ def write_evaluation(
         evaluation: evaluation of the agents.
         rows: summary of the evaluation.
         agents: evaluated agents, by name; they drive some worlds again for the episode player.
-        harm_count: harm count that the agents minimise.
+        harm_count: harm count that the agents make small, ``first`` or ``total``.
         force: whether an existing file is replaced.
-        tell: function that is called with the number of agents that have driven, and the number of all agents.
+        tell: function that is called with the number of agents that have driven the worlds again, and the number of all
+            agents.
 
     """
     done: list[str] = []

@@ -38,9 +38,10 @@ def learning_curve(
     Raises ``InvalidInput`` if ``points`` is empty.
 
     Args:
-        points: evaluations in order; each has ``steps``, ``first_impact_harm``, ``total_harm`` and ``collision_rate``.
-        learned: name of the policy or team in the legend.
-        references: summaries of other agents, drawn as horizontal lines.
+        points: evaluations, earliest first; each has ``steps``, ``first_impact_harm``, ``total_harm`` and
+            ``collision_rate``.
+        learned: name of the policy or team that the legend shows.
+        references: summaries of other agents, whose results are drawn as horizontal lines.
         caption: text below the figure.
 
     """
@@ -66,13 +67,13 @@ def learning_curve(
 def harm_against_total_gap(evaluation: Evaluation, *, agents: Sequence[str] | None = None, bins: int = 12) -> Figure:
     """Draw mean first-impact harm and mean total harm against the sum of the gaps at the alert.
 
-    The figure has one line per agent, with a band for the 95 % interval. Raises ``InvalidInput`` if an agent is unknown
-    or ``bins`` is below 1.
+    The figure has one line for each agent. A band around the line shows the 95 % interval. Raises ``InvalidInput`` if
+    an agent is unknown or ``bins`` is below 1.
 
     Args:
         evaluation: evaluation of the agents.
         agents: names of the agents to draw; None: all agents.
-        bins: number of intervals of equal width into which the range of the sum of gaps is divided.
+        bins: number of intervals of equal width into which the worlds are grouped by their sum of gaps.
 
     """
     if not bins >= 1:

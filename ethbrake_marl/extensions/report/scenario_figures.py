@@ -1,4 +1,4 @@
-"""Figure of the worlds of a scenario: distributions of quantities, scatter plots, and three worlds to scale."""
+"""Figure of the worlds of a scenario: distributions and scatter plots of quantities, and three worlds to scale."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def write_worlds(path: Path, scenario: Scenario, sample: Sample, *, seed: int, f
 
 
 def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
-    """Draw distributions of the quantities that vary, scatter plots of some pairs of them, and three worlds to scale.
+    """Draw distributions and scatter plots of the quantities that vary between the worlds, and three worlds to scale.
 
-    For the scatter plots, quantities of the first learner and of the pair ahead of it are chosen before quantities of
-    other vehicles. Colours separate the scenarios of a mixture, or the types of the first learner.
+    The scatter plots prefer quantities of the first learner and of the gap ahead of it. If the scenario is a mixture,
+    the colours show from which scenario a world is drawn; otherwise they show the type of the first learner.
 
     Args:
         scenario: scenario of the worlds.
@@ -88,10 +88,10 @@ def worlds_figure(scenario: Scenario, sample: Sample, *, seed: int) -> Figure:
 
 
 def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
-    """Return the quantities to draw in scatter plots, as a dictionary from labels to values [n].
+    """Return the quantities to draw in scatter plots, as a dictionary: label of the quantity -> values [n].
 
-    Only quantities that vary between the worlds are used. For each quantity, the vehicle or pair nearest to the vehicle
-    ``focus`` comes first. At most ``_MOST_PAIRED`` labels are returned.
+    Quantities that have the same value in all worlds are omitted. Quantities of the vehicles and pairs nearest to the
+    vehicle ``focus`` are preferred. At most ``_MOST_PAIRED`` quantities are returned.
     """
     pairs: list[tuple[int, str, Floats]] = []
     for rule in QUANTITY.of(worlds).values():
@@ -108,10 +108,10 @@ def _paired(worlds: Worlds, focus: int) -> dict[str, Floats]:
 
 
 def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> None:
-    """Draw the distribution of each quantity, with one outline for all vehicles that have the same distribution.
+    """Draw a panel for each quantity, with one histogram for all vehicles that have the same distribution.
 
-    ``panels`` maps each quantity to the values [n, ...] of each group of vehicles. ``part`` is a sub-figure of
-    matplotlib.
+    ``panels`` maps each quantity to a dictionary: name of a group of vehicles -> values in this group, [n, ...].
+    ``part`` is a sub-figure of matplotlib.
     """
     columns = min(len(panels), _ABREAST)
     every = part.subplots(-(-len(panels) // columns), columns, squeeze=False).ravel()
@@ -136,10 +136,10 @@ def _distributions(panels: Mapping[str, Mapping[str, Floats]], part: Any) -> Non
 
 
 def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
-    """Draw a scatter plot of each pair of quantities, with a colour for each kind of world.
+    """Draw a scatter plot for every two quantities; the colour of a point shows the kind of its world.
 
-    ``paired`` maps labels to values [n]. ``kinds`` [n] are the names of the kinds of the worlds. ``part`` is a
-    sub-figure of matplotlib.
+    ``paired`` maps the label of each quantity to its values [n]. ``kinds`` [n] contains the name of the kind of each
+    world (its scenario or vehicle type). ``part`` is a sub-figure of matplotlib.
     """
     labels, values, names = list(paired), list(paired.values()), np.unique(kinds)
     grid = part.subplots(len(paired) - 1, len(paired) - 1, squeeze=False, sharex="col", sharey="row")
@@ -162,9 +162,9 @@ def _pairs(paired: Mapping[str, Floats], kinds: Any, part: Any) -> None:
 
 
 def _lines(sample: Sample, shown: Mapping[int, str], part: Any) -> None:
-    """Draw some worlds at the alert, to scale.
+    """Draw the vehicles of some worlds at the alert, to scale, one world below the other.
 
-    ``shown`` maps indices of worlds in ``sample`` to descriptions. ``part`` is a sub-figure of matplotlib.
+    ``shown`` maps the index of each drawn world in ``sample`` to a description. ``part`` is a sub-figure of matplotlib.
     """
     worlds, every = sample.worlds, part.subplots(len(shown), 1, squeeze=False, sharex=True).ravel()
     for axes, (row, name) in zip(every, shown.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Figure of several trainings: mean of a quantity over the training steps, with the spread between seeds."""
+"""Figure of trainings with several seeds: mean of a quantity at each training step, and spread between seeds."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from ethbrake_marl.physics.state import Floats
 
 @dataclass(frozen=True, slots=True)
 class SeedCurve:
-    """Values of one quantity during several trainings that differ only in their seeds, at k common steps."""
+    """Values of one quantity at k steps of several trainings that differ only in their seeds."""
 
     steps: Floats  # [k] training steps (or another quantity of the x axis)
     values: Floats  # [seeds, k] values of the quantity
 
     @classmethod
     def of(cls, trainings: Sequence[Mapping[int, float]]) -> Self:
-        """Return the curve of several trainings at the steps that all trainings have in common.
+        """Return the values of several trainings at the steps that all trainings have in common.
 
-        Each training is a dictionary from steps to values. Raises ``InvalidInput`` if there is no common step.
+        Each training is a dictionary: step -> value of the quantity. Raises ``InvalidInput`` if the trainings have no
+        step in common.
         """
         common = sorted(set.intersection(*(set(training) for training in trainings))) if trainings else []
         if not common:
@@ -45,16 +46,19 @@ def seed_curves(
     x_label: str = "Training steps",
     known: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Draw one panel per quantity and one line per recipe: the mean over seeds, with a band of one standard deviation.
+    """Draw a panel for each quantity, with a line for each recipe: the mean over the seeds.
+
+    A band shows plus and minus one standard deviation.
 
     Raises ``InvalidInput`` if there are no panels, or if a panel has no curves.
 
     Args:
-        panels: curves by label of the quantity and by name of the recipe.
-        logarithmic: labels of the panels with a logarithmic axis. The axis stays linear if a value is not positive.
+        panels: label of a quantity -> name of a recipe -> curve.
+        logarithmic: labels of the quantities whose panels have a logarithmic axis. The axis of a panel stays linear if
+            one of its values is not positive.
         caption: text below the figure.
         x_label: label of the x axis.
-        known: best known value by label of the quantity, drawn as a dashed line; None: no line.
+        known: label of a quantity -> best known value, drawn as a dashed line; None: no lines.
 
     """
     if not panels or not all(panels.values()):

@@ -1,4 +1,4 @@
-"""Choice of the worlds that a report shows: worst worlds, typical worlds, and random worlds."""
+"""Choice of the worlds that a report shows as episodes: worst worlds, typical worlds, random worlds and others."""
 
 from __future__ import annotations
 
@@ -36,9 +36,10 @@ WORDS = {
 def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
     """Choose at most ``most`` worlds, and return their entries for the episode player, by index in the evaluation.
 
-    The order is: worlds in which the agent ``focus`` did worst, worlds with an avoidable collision, worlds with the
-    largest reduction of harm compared with full braking, worlds with more harm than full braking, worlds with typical
-    harm, and random worlds. The entries contain no motion yet.
+    The worlds are chosen in this order: worlds in which the agent ``focus`` did worst, worlds with an avoidable
+    collision, worlds with the largest reduction of harm compared with full braking, worlds with more harm than full
+    braking, worlds with typical harm of this agent, and random worlds. The entries contain no motion of vehicles yet;
+    ``Played.drive`` adds it.
     """
     outcome = evaluation.outcome(focus)
     chosen: dict[int, Played] = {}
@@ -68,8 +69,8 @@ def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS)
 def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
     """Return the indices of at most ten worlds in which the agent ``focus`` did worst, worst first.
 
-    The worlds are ordered by regret in total harm, or by total harm if no best harm is known. Worlds in which this
-    value is 0 are omitted.
+    The worst world is the one with the largest regret in total harm, or with the largest total harm if no best known
+    harm exists. Worlds whose regret (or harm) is 0 are omitted.
     """
     outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
     value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")

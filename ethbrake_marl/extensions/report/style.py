@@ -46,12 +46,13 @@ _NO_DATES: dict[str, dict[str, None]] = {  # metadata to omit, because they diff
 
 
 class ShownFigure(Figure):
-    """Figure that a notebook displays as the value of a cell, without pyplot."""
+    """Figure that a notebook displays if it is the value of the last line of a cell; pyplot is not needed."""
 
     def draw(self, renderer: RendererBase) -> None:
         """Draw the figure with matplotlib's ``renderer``.
 
-        Saving a file calls this method twice. The first call only computes the layout, because its picture is not used.
+        When a file is saved, matplotlib calls this method twice and uses only the second picture. The first call
+        therefore only computes the layout.
         """
         engine = self.get_layout_engine()
         if self.axes and isinstance(engine, ConstrainedLayoutEngine) and self.canvas.is_saving():
@@ -73,7 +74,10 @@ def series_style(number: int) -> dict[str, Any]:
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """Return ``text`` without formulas, with only characters of the font, shortened to ``most`` characters."""
+    """Return ``text`` as a label of at most ``most`` characters.
+
+    Dollar signs start no formula, and characters that the font lacks are escaped.
+    """
     signs = font_signs()
     label = "".join(c if ord(c) in signs else c.encode("unicode_escape").decode() for c in plain_text(text))
     return (label if len(label) <= most else f"{label[: most - 16]}…{label[-15:]}").replace("$", r"\$")
@@ -114,7 +118,10 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 
 def name_axes(axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
-    """Set the title of a panel and the labels ``x`` and ``y`` of its axes. Empty texts set nothing."""
+    """Set the title of a panel and the labels ``x`` and ``y`` of its axes.
+
+    An empty text leaves the title or label unchanged.
+    """
     in_style = ((title, partial(axes.set_title, loc="left"), 10), (x, axes.set_xlabel, 9), (y, axes.set_ylabel, 9))
     for text, write, size in in_style:
         if text:
@@ -135,8 +142,8 @@ def finish(
     Args:
         figure: figure to change.
         caption: text below the figure.
-        legend: axes whose curves the legend names, for all panels; None: no legend.
-        columns: number of columns of the legend.
+        legend: panel whose curves appear in the legend of the whole figure; None: no legend.
+        columns: number of columns in the legend.
         fontsize: font size of the legend.
         loc: place of the legend.
 
@@ -154,14 +161,17 @@ def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Ma
 
 
 def add_caption(figure: Figure, text: str) -> None:
-    """Write ``text`` below the figure, in small letters."""
+    """Write ``text`` below the figure, in a small font."""
     width = int(figure.get_figwidth() * _CHARACTERS_PER_INCH)
     label = figure.supxlabel(textwrap.fill(text, width), x=0.01, ha="left", fontsize=CAPTION_PT, color=GREY)
     label.set_gid(CAPTION)
 
 
 def picture_ending(path: str | Path) -> str:
-    """Return the ending of a picture's file name: .png, .svg or .pdf. Raises ``InvalidInput`` for other endings."""
+    """Return the ending of a picture's file name: .png, .svg or .pdf.
+
+    Raises ``InvalidInput`` if the name ends differently.
+    """
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
         raise InvalidInput(f"{path}: the name of a picture file must end in .png, .svg or .pdf")
@@ -171,8 +181,8 @@ def picture_ending(path: str | Path) -> str:
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
     """Return the bytes of a PNG, SVG or PDF file with the figure. The ending of ``path`` selects the format.
 
-    The function writes no file. The same figure always gives the same bytes. Raises ``InvalidInput`` for another
-    ending.
+    The function writes no file. The same figure always gives the same bytes. Raises ``InvalidInput`` if the ending is
+    not .png, .svg or .pdf.
     """
     ending = picture_ending(path)
     buffer = io.BytesIO()
@@ -187,8 +197,8 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
     """Write ``figure`` to a PNG, SVG or PDF file. The ending of ``path`` selects the format.
 
-    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` for another ending or if the file cannot
-    be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
+    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` if the ending is not .png, .svg or .pdf
+    or if the file cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 
@@ -197,7 +207,7 @@ TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)
 
 
 def plain(value: float, _: int) -> str:
-    """Format the number at a tick of an axis without powers of ten.
+    """Return the number at a tick of an axis as text such as 1000, not as a power of ten.
 
     The second argument, the index of the tick, is not used.
     """

@@ -61,18 +61,19 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
     """Return a figure as an SVG element, and its caption as text.
 
     The SVG element contains no caption and no ``style`` attributes, because the security policy of the page forbids
-    them. All ids get a prefix that makes them unique in a page. Raises ``InvalidInput`` if an SVG contains elements or
-    attributes that the figures of this package do not have, because somebody may have changed the file.
+    such attributes. All ids of SVG elements get a prefix, so that two figures of a page have no id in common. Raises
+    ``InvalidInput`` if the bytes contain elements or attributes that figures of this package do not have: somebody may
+    have changed the file.
 
     Args:
-        figure: figure, or the bytes of its SVG.
-        label: description for readers who cannot see the figure; it also makes the ids unique.
+        figure: figure of matplotlib, or the bytes of an SVG file with a figure.
+        label: description for readers who cannot see the figure; the prefix of the ids depends on this text, too.
         recolour: True: use the colours of the page, light or dark; False: keep the colours of the figure.
 
     """
     svg = figure if isinstance(figure, bytes) else picture_bytes(figure, "figure.svg")
     if svg is figure and not _is_ours(svg):
-        raise InvalidInput("the file is not the unchanged SVG of a figure; draw the figure again (--force)")
+        raise InvalidInput("the file is not an SVG figure as this package writes it; draw the figure again (--force)")
     root = ElementTree.fromstring(svg, ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True)))
     group, caption = root.find(f".//{{{_SVG}}}g[@id='{CAPTION}']"), ""
     if group is not None:  # the caption is in comments; later texts use the outlines of its letters, so these stay
@@ -115,13 +116,13 @@ def inline_svg(figure: Figure | bytes, label: str, *, recolour: bool = True) -> 
 
 
 def _size_pt(root: ElementTree.Element) -> tuple[float, float]:
-    """Return the width and height of an SVG figure in points; 0, 0 if its viewBox has an unknown form."""
+    """Return the width and height of an SVG figure in points; (0, 0) if its ``viewBox`` cannot be read."""
     match = re.fullmatch(r"0 0 (\d+(?:\.\d+)?) (\d+(?:\.\d+)?)", root.attrib.get("viewBox", ""))
     return (float(match[1]), float(match[2])) if match else (0.0, 0.0)
 
 
 def _is_ours(svg: bytes) -> bool:
-    """Return whether the bytes of an SVG contain only elements and attributes that figures of this package have."""
+    """Return whether an SVG file contains only those elements and attributes that figures of this package have."""
     try:
         level = [ElementTree.fromstring(svg)]
     except (ElementTree.ParseError, LookupError, ValueError):  # not XML, or an unknown encoding
@@ -141,9 +142,9 @@ def _is_ours(svg: bytes) -> bool:
 
 
 def _restyle(element: ElementTree.Element, recolour: bool) -> None:
-    """Replace each declaration in the ``style`` attribute by an attribute of the same name, in place.
+    """Replace each declaration in the ``style`` attribute of ``element`` by an attribute of the same name.
 
-    If ``recolour`` is true, the colours are replaced by the colours of the page.
+    If ``recolour`` is true, the colours become those of the page.
     """
     for declaration in element.attrib.pop("style", "").split(";"):
         name, colon, value = declaration.partition(":")

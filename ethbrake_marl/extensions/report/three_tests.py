@@ -22,7 +22,10 @@ TESTS = {
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Return whether the scenario equals the shipped scenario of the same name. Titles and descriptions may differ."""
+    """Return whether the scenario equals the shipped scenario of the same name.
+
+    The two may differ in title, description and source.
+    """
     one, other = (
         each.model_dump(exclude={"title", "description", "source"}) for each in (scenario, load_scenario(scenario.name))
     )
@@ -40,9 +43,9 @@ _KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the 
 
 
 def brief(table: SummaryTable, beside: Mapping[str, SummaryTable]) -> Sheet:
-    """Return a short table with the collision rate and both harms of each agent, also on other tests.
+    """Return a short table with the collision rate and both harms of each agent, and both harms on the other tests.
 
-    Notes are below the table. The paper's rows and all other measures are omitted.
+    The notes about the results are below the table. The paper's rows and all other measures are omitted.
 
     Args:
         table: summary of the agents on the scenario of the run.

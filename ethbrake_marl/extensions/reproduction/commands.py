@@ -21,33 +21,33 @@ def reproduce_command(
     names: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="ITEM", help="Figures and tables to make; --list names them.", show_default="everything"
+            metavar="ITEM", help="Figures and tables to reproduce; --list prints names.", show_default="everything"
         ),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use shipped policies, without training (default).")] = False,
     full: Annotated[
-        bool, typer.Option("--full", help="Also train policies, for learning curves and a policy stopped early.")
+        bool, typer.Option("--full", help="Also train policies, to draw learning curves and to stop one early.")
     ] = False,
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[
-        int, typer.Option(help="Most worlds for a figure or table; the paper has 10,000.", min=2, max=PAPER_EPISODES)
+        int, typer.Option(help="Largest number of worlds for an item; the paper has 10,000.", min=2, max=PAPER_EPISODES)
     ] = PAPER_EPISODES,
     docs: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.json", help="Also write the results to this file, and the figures beside it."),
+        typer.Option(metavar="FILE.json", help="JSON file for a copy of all results; figures go beside it."),
     ] = None,
     cost: Annotated[
-        bool, typer.Option("--cost", help="Print which work is left and how long it takes, and exit.")
+        bool, typer.Option("--cost", help="Print how much work is left and how long it takes, and exit.")
     ] = False,
     listed: Annotated[bool, typer.Option("--list", help="List all figures and tables, and exit.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Reproduce the paper's figures and tables, and compare them with the paper.
+    """Reproduce the paper's results, and compare ours with them.
 
-    An item is a figure or a table of the paper. The command prints how long the work takes, then makes each item. It
-    writes one page (index.html), and for each item its figures, its data and a verdict: the results agree with the
-    paper, differ, or cannot agree. After an interruption, repeat the command to continue.
+    An item is a figure or a table of the paper. The command prints how long the work takes, then reproduces each item.
+    It writes one page (index.html) with all items and, for each item, figures and data. A verdict says whether our
+    results agree with the paper, differ, or cannot agree. After an interruption, repeat the command to continue.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         from ethbrake_marl.extensions.reproduction.folder import Reproduction
@@ -55,7 +55,7 @@ def reproduce_command(
         from ethbrake_marl.extensions.studies.machine import this_machine
 
         if quick and full:
-            raise InvalidInput("--quick and --full exclude each other; give one of them")
+            raise InvalidInput("--quick and --full cannot be combined; give only one of them")
         chosen = choose_items(names or ())
         if listed:
             rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]

@@ -1,6 +1,6 @@
 """Reproduce the paper's learning curves at high and low delay.
 
-These are the figures ``fig:ppo_sac_high_latency`` and ``fig:ppo_sac_low_latency``.
+The labels of these figures in the paper's source are ``fig:ppo_sac_high_latency`` and ``fig:ppo_sac_low_latency``.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _NUMBER, _DECISIONS = Column("Final return", digits=3), Column("Decisions", digi
 def _shipped_ends(settings: Reproduction) -> Made:
     """Evaluate shipped policies at low and high delay; return verdicts, a table and data.
 
-    The evaluation uses both assumptions on when Vehicle 2 may act (``READINGS``).
+    The policies are evaluated with both assumptions on when Vehicle 2 may act (``READINGS``).
     """
     episodes = min(2_000, settings.episodes)
     verdicts, rows, data = [], [], []
@@ -100,46 +100,47 @@ class Course:
 
     @property
     def last_returns(self) -> Floats:
-        """Mean return of each seed over the last tenth of its updates, [seeds]."""
+        """Mean return over the last tenth of the updates of each training, [seeds]."""
         return np.asarray(self.returns.values[:, -max(len(self.returns.steps) // 10, 1) :].mean(axis=1))
 
     @property
     def rise(self) -> float:
-        """Mean over the seeds of (return in the last tenth of the updates - return in the first update)."""
+        """Rise of the return from the first update to the last tenth of the updates, as the mean over the trainings."""
         return float((self.last_returns - self.returns.values[:, 0]).mean())
 
     @property
     def decisions_to_converge(self) -> Floats:
-        """Number of decisions until the harm has fallen by 90 % (``_DONE``) of its whole fall, [seeds]."""
+        """Number of decisions until the harm has fallen by 90 % (``_DONE``) of its largest fall, [seeds]."""
         first, least = self.harm.values[:, :1], self.harm.values.min(axis=1, keepdims=True)
         there = self.harm.values <= first - _DONE * (first - least)
         return np.asarray(self.harm.steps[np.argmax(there, axis=1)])
 
     def returns_at(self, shares: Floats) -> Floats:
-        """Return each seed's return at k points of the training, [seeds, k].
+        """Return the mean return at k points of each training, [seeds, k].
 
-        ``shares`` [k] are the points: 0 is the start and 1 the end of the training.
+        ``shares`` [k] are the points as shares of the training: 0 is its start and 1 its end.
         """
         steps = shares * self.returns.steps[-1]
         return np.array([np.interp(steps, self.returns.steps, own) for own in self.returns.values])
 
     def unrest(self, points: int) -> Floats:
-        """Return how much each seed's return fluctuates in the second half of the training, [seeds].
+        """Return how much the return of each training fluctuates in its second half, [seeds].
 
-        The result is the standard deviation of the change of the return between neighbouring points, divided by
-        ``rise``. There are ``points`` equally spaced points, which makes trainings of different lengths comparable.
+        The return is read at ``points`` equally spaced points of the second half, so trainings of different lengths can
+        be compared. The result is the standard deviation of the changes from one point to the next, divided by
+        ``rise``.
         """
         return np.asarray(np.diff(self.returns_at(np.linspace(0.5, 1.0, points)), axis=1).std(axis=1) / abs(self.rise))
 
     @property
     def still_rising(self) -> float:
-        """Mean rise of the return in the last quarter of the training, as a share of ``rise``."""
+        """Rise of the return in the last quarter of the training, as a share of ``rise`` (mean over the trainings)."""
         before = self.returns_at(np.array([0.75]))[:, 0]
         return float((self.returns.values[:, -1] - before).mean()) / abs(self.rise)
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return over the seeds, at k steps in the second half of the training, [k]."""
+        """Standard deviation of the return among the trainings, at k steps in the second half of training, [k]."""
         return np.asarray(self.returns.values[:, len(self.returns.steps) // 2 :].std(axis=0, ddof=1))
 
 
@@ -147,9 +148,10 @@ Courses = Mapping[str, Course]  # trainings by recipe
 
 
 def reproduce_curves(delay: str, settings: Reproduction) -> Made:
-    """Reproduce the learning curves at one delay (``high`` or ``low``) from the trainings of ``--full``.
+    """Reproduce the paper's learning curves at one delay (``high`` or ``low``) with the trainings of ``--full``.
 
-    Returns verdicts, tables, figures and data. Without these trainings, the tables show results of shipped policies.
+    Returns verdicts, tables, figures and data. Without these trainings, there are no curves, and the tables show
+    results of shipped policies.
     """
     courses = {
         each: {
@@ -223,7 +225,7 @@ def reproduce_curves(delay: str, settings: Reproduction) -> Made:
 def _judge(delay: str, courses: Mapping[str, Courses]) -> list[Verdict]:
     """Return verdicts on the paper's statements about the learning curves at one delay (``high`` or ``low``).
 
-    ``courses`` maps delay and recipe to trainings.
+    ``courses`` maps each delay to its trainings: name of the recipe -> trainings.
     """
     own, high, low = courses[delay], courses[HIGH], courses[LOW]
     if not own:

@@ -1,4 +1,4 @@
-"""Figures of a reproduction."""
+"""Functions that draw the figures of a reproduction of the paper."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def estimates_figure(
         panels: nested mapping: title of the panel -> label of the series -> x (a number or a text) -> estimate.
         y_label: label of the y axis.
         caption: text below the figure.
-        x_label: label of the x axis. With a label, each x is a number, and lines with bands are drawn. Without one,
+        x_label: label of the x axis. With a label, each x is a number, and lines with bands are drawn. Without a label,
             each x is a text, and groups of bars are drawn.
 
     """
@@ -56,13 +56,13 @@ def estimates_figure(
 
 
 def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure:
-    """Draw the positions of all vehicles on the road as the paper does: one panel per episode, one row per vehicle.
+    """Draw the positions of all vehicles on the road as the paper does. Each episode has a panel, each vehicle a row.
 
     An arrow marks the position every ten time steps. Dashed lines connect the positions of the vehicles at the same
     time.
 
     Args:
-        records: episodes, by the title of their panel.
+        records: episodes; the key of an episode is the title of its panel.
         caption: text below the figure.
 
     """
@@ -83,7 +83,7 @@ def road_figure(records: Mapping[str, EpisodeRecord], *, caption: str) -> Figure
 
 
 def _in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with panels side by side in pairs, and the panels. All panels have the same scales.
+    """Return a figure with two panels in each row, and the list of its panels. All panels have the same scales.
 
     Args:
         panels: number of panels.
@@ -121,10 +121,12 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], *, captio
 
 
 def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], *, x_label: str, caption: str) -> Figure:
-    """Draw the effects of several changes, with their 95 % intervals: one row per change, one mark per label.
+    """Draw the effects of several changes with their 95 % intervals.
+
+    There is one row for each change, with one mark for each label.
 
     Args:
-        changes: nested mapping: name of the change -> label -> effect.
+        changes: nested mapping: name of the change (row) -> label (for instance a strategy) -> effect.
         x_label: label of the x axis.
         caption: text below the figure.
 

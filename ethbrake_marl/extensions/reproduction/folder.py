@@ -1,7 +1,4 @@
-"""Settings of a reproduction, and the types of its items and results.
-
-An item is a figure or a table of the paper.
-"""
+"""Settings of a reproduction, and types for items and results. An item is a figure or a table of the paper."""
 
 from __future__ import annotations
 
@@ -53,17 +50,17 @@ class Reproduction:
     docs: Path | None = None  # JSON file to which all results are written; None: no such file
 
     def __post_init__(self) -> None:
-        """Raise ``InvalidInput`` if the name of ``docs`` does not end in ``.json``, or the file cannot be written."""
+        """Raise ``InvalidInput`` if the name of ``docs`` does not end in ``.json`` or the file cannot be written."""
         if self.docs is not None:
             if self.docs.suffix != ".json":
                 raise InvalidInput(f"{self.docs}: the name of the file must end in .json")
             check_target(self.docs, force=True)
 
     def seeds_of(self, wanted: Collection[str]) -> list[tuple[Group, str, list[Path]]]:
-        """Return the trainings of some groups, as (group, name of the recipe, folder of each seed).
+        """Return the trainings of some groups, each as (group, name of the recipe, list with the folder of each seed).
 
         ``wanted`` are the names of the groups. The result has one entry for each recipe of each group. In mode
-        ``quick`` it is empty.
+        ``quick`` the result is empty.
         """
         return [
             (
@@ -79,7 +76,7 @@ class Reproduction:
     def trained(self, wanted: Collection[str]) -> dict[str, list[Path]]:
         """Return the recipes whose trainings are finished for every seed: ``group/recipe`` -> folder of each seed.
 
-        ``wanted`` are the names of the groups to look at.
+        ``wanted`` are the names of the groups whose trainings are checked.
         """
         return {
             f"{group.name}/{name}": paths
@@ -90,7 +87,7 @@ class Reproduction:
     def seconds_left(self, wanted: Collection[str]) -> float:
         """Return the time (s) that one core needs for the remaining trainings of the groups named in ``wanted``.
 
-        A training that has begun counts with its whole time.
+        For a training that has begun, the time of the whole training is added.
         """
         return sum(
             group.trained[name][0].decisions / group.trained[name][0].per_s
@@ -100,7 +97,10 @@ class Reproduction:
         )
 
     def train(self, wanted: Collection[str]) -> bool:
-        """Run the remaining trainings of the groups named in ``wanted``. Return False if Ctrl-C stopped them."""
+        """Run those trainings of the groups named in ``wanted`` that are not finished.
+
+        Return False if Ctrl-C stopped a training.
+        """
         from ethbrake_marl.extensions.reproduction.learning_curves import LearningCurves
 
         for group in groups().values():
@@ -112,7 +112,7 @@ class Reproduction:
         return True
 
     def cost(self, items: Sequence[Item]) -> str:
-        """Return a message on the work that is left for ``items``, and how long it takes."""
+        """Return a message that says which work is left for ``items`` and how long it takes."""
         wanted = {group for item in items for group in item.trained} if self.mode == "full" else set()
         cost = (
             f"to do: {count_of(len(items), 'item')}, at most about {sum(item.most_s for item in items)} s of one core"
@@ -131,7 +131,7 @@ class Parameter:
 
 
 def stated(name: str, value: str, where: str) -> Parameter:
-    """Return a parameter whose value the paper states at the place ``where``; empty: the value is our default."""
+    """Return a parameter whose value the paper states at the place ``where``. Empty: the value is our default."""
     return Parameter(name, value, f"stated in the paper ({where})") if where else Parameter(name, value)
 
 
@@ -189,7 +189,10 @@ class Result:
     notes: Sequence[str]  # sentences that say what was run and what was not
 
     def in_words(self) -> dict[str, Any]:
-        """Return the result as mappings, lists and texts, for a JSON file. Each cell of a table is one text."""
+        """Return the result as mappings, lists and texts, for a JSON file.
+
+        In this form, each cell of a table is one text.
+        """
         tables = [
             {**asdict(table), "rows": [[cell.in_words for cell in row] for row in table.rows]} for table in self.tables
         ]
@@ -211,9 +214,10 @@ class Item:
 
 
 def csv_text(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return the content of a CSV file with the headings ``head`` and these rows.
+    """Return the content of a CSV file with the headings ``head`` and the rows ``rows``.
 
-    An ``Estimate`` in a row fills three columns (value, low, high), each with its own heading.
+    An ``Estimate`` in a row fills three columns: value, and lower and upper end of the interval. ``head`` contains a
+    heading for each of them.
     """
     parts = ([(e.value, *(e.interval or ("", ""))) if isinstance(e, Estimate) else (e,) for e in row] for row in rows)
     return csv_of([dict(zip(head, chain(*row), strict=True)) for row in parts], head)
@@ -240,7 +244,9 @@ FIRST_IMPACTS = stated("harm", "each pair's first impact", "sec:result, Experime
 
 
 def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
-    """Return the quantities of a scenario as parameters. The origin of each is the place where the paper states it.
+    """Return the quantities of a scenario as parameters.
+
+    Each parameter names the place where the paper states the value.
 
     Args:
         scenario: the scenario.
@@ -259,7 +265,7 @@ def scenario_parameters(scenario: Scenario, **places: str) -> list[Parameter]:
 
 
 def list_parameter(episodes: int, where: str = "") -> Parameter:
-    """Return the number of worlds and the seed of their evaluation list as one parameter.
+    """Return one parameter that states the number of worlds and the seed of the evaluation list from which they come.
 
     The seed is our choice, because the paper only says "a fixed random seed".
 
@@ -313,5 +319,5 @@ def checked_result(content: Mapping[str, Any], where: Path | str, name: str) -> 
         }
         wrong = next((what for what, is_right in checks.items() if not is_right), "")
     if wrong:
-        raise InvalidInput(f"{where}: {wrong}: is missing or wrong; make the result again (--force)")
+        raise InvalidInput(f"{where}: the entry {wrong} is missing or wrong; make the result again (--force)")
     return result

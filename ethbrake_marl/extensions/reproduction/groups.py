@@ -1,6 +1,6 @@
-"""Reproduce the harm in groups of worlds, by distance or by delay.
+"""Reproduce figures of the paper that show harm against distance or delay.
 
-By distance: the paper's ``Fig:Harm-ivds`` and ``Fig:hybrid illu``. By delay: ``Fig:harm-delay``.
+The figures with distance are ``Fig:Harm-ivds`` and ``Fig:hybrid illu``. The figure with delay is ``Fig:harm-delay``.
 """
 
 from __future__ import annotations
@@ -55,10 +55,11 @@ _ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # limits of the groups, for the 
 
 
 def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
-    """Group worlds by the sum of both gaps. Return the mean sum in each group (m), and the harm in each group.
+    """Group the worlds by the sum of the two gaps.
 
-    The harm has the form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for
-    each world of the group. Empty groups are left out.
+    Return the mean sum in each group (m), and the harm of each strategy in each world of each group. The harm has the
+    form ``{"10-12 m": {"PPO": harm, ...}, ...}``, in which ``harm`` is an array with one value for each world of the
+    group. Groups without worlds are omitted.
     """
     total, each_harm = evaluation.worlds.gaps_m.sum(axis=1), harms(evaluation)
     inner, at, groups = np.digitize(total, _ENDS_M[1:-1]), [], {}
@@ -72,7 +73,8 @@ def by_distance(evaluation: Evaluation) -> tuple[list[float], Groups]:
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
     """Compare, in every group of worlds, the harm of strategy ``smaller`` with the harm of each strategy ``larger``.
 
-    The comparisons are paired by world. ``groups`` maps the name of a group to the harm [n] of each strategy.
+    The comparisons are paired by world. ``groups`` contains, for each group, the harm [n] of each strategy in the n
+    worlds of the group.
     """
     return [
         Less.of_harms(group if len(larger) == 1 else f"{group}, {other}", harm, smaller, other)
@@ -82,9 +84,12 @@ def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
 
 
 def _harm_table(title: str, groups: Groups, note: str) -> Sheet:
-    """Return a table of the mean harm with its interval: one row per strategy, one column per group of worlds.
+    """Return a table of mean harms with intervals.
 
-    ``groups`` maps the name of a group to the harm [n] of each strategy. ``note`` is added to the text below the table.
+    It has a row for each strategy and a column for each group of worlds.
+
+    ``groups`` contains, for each group, the harm [n] of each strategy in the n worlds of the group. ``note`` is added
+    to the text below the table.
     """
     strategies = next(iter(groups.values()))
     rows = [(name, *(mean(harm[name]) for harm in groups.values())) for name in strategies]
@@ -99,14 +104,14 @@ def over_distance(
     parameters: Sequence[Parameter],
     episodes: int,
 ) -> Made:
-    """Return the result for a figure of the paper that shows harm against the sum of both gaps.
+    """Return the result for a figure of the paper that shows harm against the sum of the two gaps.
 
     Args:
-        stem: name of the result's files without ending.
-        curves: result of ``by_distance``, by the name of the assumption on when Vehicle 2 may act.
+        stem: file name of the figure and of the data, without ending.
+        curves: name of the assumption on when Vehicle 2 may act -> result of ``by_distance``.
         verdicts: verdicts on the paper's statements.
         lines: names of the strategies to draw.
-        parameters: parameters to list besides the quantities of the scenario.
+        parameters: further parameters to list, in addition to the quantities of the scenario.
         episodes: number of worlds.
 
     """
@@ -145,7 +150,7 @@ def over_distance(
 
 
 def reproduce_distance(settings: Reproduction) -> Made:
-    """Reproduce the figure of harm against the sum of both gaps; return figure, tables and verdicts."""
+    """Reproduce the paper's figure of harm against the sum of the two gaps; return figure, tables and verdicts."""
     episodes, braking = min(_DISTANCE_WORLDS, settings.episodes), NAMES[FULL_BRAKE]
     curves, verdicts = {}, []
     for reading in READINGS:
@@ -184,9 +189,10 @@ _ONE, _LIST = "d = 7, 7 m; v = 20, 18, 20 m/s", "d = 5-10 m; v = 18-22 m/s"
 
 
 def reproduce_delays(settings: Reproduction) -> Made:
-    """Reproduce the figure of harm at three delays; return figures, tables and verdicts.
+    """Reproduce the paper's figure of harm at three delays; return figures, tables and verdicts.
 
-    One figure shows the single world of the paper's figure. A second figure shows means over random worlds.
+    The first figure shows the harm in the one world of the paper's figure. The second figure shows the mean harm in
+    random worlds.
     """
     episodes = min(_DELAY_WORLDS, settings.episodes)
     curves: dict[tuple[str, str], Groups] = {}  # (description of the worlds, assumption) -> delay -> harm

@@ -1,6 +1,6 @@
-"""Reproduce the paper's results on its hybrid, and its random test.
+"""Reproduce the paper's results on its hybrid, and on random worlds.
 
-The hybrid is in ``Fig:hybrid illu`` and ``Table:hybrid``, the random test in ``Table:Random``.
+The hybrid is in ``Fig:hybrid illu`` and ``Table:hybrid`` of the paper, the random worlds in ``Table:Random``.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ _ALONE, _REALISED, _AS_PRINTED = "policy alone", "hybrid, realised H*", "hybrid,
 
 
 def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evaluation:
-    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of both.
+    """Evaluate E-V2X-BM, a policy that has not converged, and the paper's hybrid of the two.
 
-    The *hybrid* is the paper's Algorithm 1: at the alert it chooses E-V2X-BM or the policy.
+    The *hybrid* is the paper's Algorithm 1: at the alert it chooses whether E-V2X-BM or the policy drives.
 
     Args:
-        name: name of a shipped scenario.
-        settings: settings of the reproduction, which limit the number of worlds.
+        name: name of the shipped scenario.
+        settings: settings of the reproduction, such as the largest number of worlds.
         reading: assumption on when Vehicle 2 may act.
 
     """
@@ -66,8 +66,9 @@ def _drive_hybrid(name: str, settings: Reproduction, reading: Reading) -> Evalua
 def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: str) -> Evaluation:
     """Evaluate the strategies of ``_drive_hybrid``, or return the evaluation from the cache.
 
-    ``about`` describes the policy that has not converged. It is part of the cache key, because a training that is
-    finished meanwhile replaces a shipped policy.
+    ``about`` describes the policy that has not converged. The description is part of the cache key: if the training of
+    this policy ends after the first call, the trained policy replaces a shipped one, and the strategies are evaluated
+    again.
     """
     scenario, (policy, _) = reading.scenario(name), unconverged_policy(settings)
     agents: dict[str, Agent] = {
@@ -82,10 +83,10 @@ def _driven_hybrid(name: str, settings: Reproduction, reading: Reading, about: s
 def reproduce_illustration(settings: Reproduction) -> Made:
     """Reproduce the paper's illustration of its hybrid; return figure, tables and verdicts.
 
-    The figure shows the harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against the
-    sum of both gaps. The *hybrid* is the paper's Algorithm 1: at the alert it chooses E-V2X-BM or the policy. The paper
-    says that it "consistently selects the strategy that results in lower harm". The verdicts check this statement in
-    each world, and in groups of worlds.
+    The figure shows the harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of the two, against the
+    sum of the two gaps. The *hybrid* is the paper's Algorithm 1: at the alert it chooses whether E-V2X-BM or the policy
+    drives. The paper says that the hybrid "consistently selects the strategy that results in lower harm". The verdicts
+    check this statement in each world, and in groups of worlds.
     """
     curves, verdicts = {}, []
     for reading in READINGS:
@@ -113,7 +114,8 @@ def reproduce_illustration(settings: Reproduction) -> Made:
 def reproduce_hybrid_table(settings: Reproduction) -> Made:
     """Reproduce the paper's table of 5,000 episodes (``Table:hybrid``); return tables and verdicts.
 
-    The paper does not say which of two sets of initial speeds it used. The results cover both sets.
+    The paper has two sets of initial speeds, and does not say which of them this table uses. Therefore our results
+    cover both sets.
     """
     ours = {
         "E-V2X-BM": (NAMES[PAIRWISE], NAMES[COUPLED]),

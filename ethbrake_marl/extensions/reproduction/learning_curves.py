@@ -47,7 +47,10 @@ AXES: dict[Against, tuple[str, str, type]] = {  # column, label of the axis, typ
 
 
 class LearningCurves(NamedTuple):
-    """Trainings of several recipes with several seeds on one scenario. Each is stored in ``folder/RECIPE-seedK``."""
+    """Trainings of several recipes with several seeds on one scenario.
+
+    The folder of a training is ``folder/RECIPE-seedK``.
+    """
 
     scenario: Scenario  # scenario of all trainings
     plan: Sequence[tuple[TrainingRecipe, int]]  # each recipe with its number of seeds; the seeds are 0, 1, ...
@@ -56,22 +59,21 @@ class LearningCurves(NamedTuple):
 
     @staticmethod
     def parse(text: str) -> list[tuple[TrainingRecipe, int]]:
-        """Read a text such as ``ppo:5,sac:3``; return the recipes with their numbers of seeds.
+        """Read a text such as ``ppo:5,sac:3``, and return each recipe with its number of seeds.
 
-        A recipe is the name of a shipped recipe, or the path of a recipe file. Raises ``InvalidInput`` if the text has
-        another form, or if two recipes have the same name.
+        A recipe is the name of a shipped recipe, or the path of a recipe file. Raises ``InvalidInput`` if the text does
+        not have this form, or if two recipes have the same name.
         """
         curves = []
         for part in split_names(text, lambda part: os.path.isfile(part.rpartition(":")[0])):
             match = re.fullmatch(r"(.+):([1-9][0-9]{0,3})", part)
             if match is None:
                 raise InvalidInput(
-                    f"recipes {text!r}: {part!r}: must be RECIPE:SEEDS, a recipe and its number of seeds, for instance"
-                    " ppo:5"
+                    f"recipes {text!r}: {part!r} must have the form RECIPE:SEEDS (number of seeds), for instance ppo:5"
                 )
             curves.append((load_recipe(match[1]), int(match[2])))
         if len({recipe.name for recipe, _ in curves}) < len(curves):
-            raise InvalidInput(f"recipes {text!r}: two recipes have the same name; name each recipe once")
+            raise InvalidInput(f"recipes {text!r}: two recipes have the same name; give each recipe only once")
         return curves
 
     def train(
@@ -79,15 +81,15 @@ class LearningCurves(NamedTuple):
     ) -> bool:
         """Train every recipe with every seed. Finished trainings are not repeated; unfinished trainings continue.
 
-        Returns False if Ctrl-C stopped the work. Raises ``InvalidInput`` before any training if the folder contains a
-        different training. Also raises the exceptions of ``train_all``.
+        Returns False if Ctrl-C stopped the work. Before any training begins, raises ``InvalidInput`` if the folder
+        contains a different training. Later the method raises the exceptions of ``train_all``.
 
         Args:
-            steps: number of steps of each training; None: as the recipe says.
-            settings: changes ``KEY=VALUE`` that scenario and recipe already contain; they are recorded in
-                ``config.json`` of each training.
+            steps: number of steps of each training; None: the number in the recipe.
+            settings: changes ``KEY=VALUE`` that were already applied to scenario and recipes; they are written into the
+                file ``config.json`` of each training.
             jobs: number of trainings that run at the same time.
-            tell: function that receives the progress; None: the progress is not reported.
+            tell: function that is called with the progress; None: the progress is not reported.
 
         """
         trainings = [
@@ -106,11 +108,11 @@ class LearningCurves(NamedTuple):
             return train_all(trainings, jobs, tell)
 
     def write(self) -> dict[str, Any]:
-        """Draw the finished trainings, write figure, table and summary to the folder, and return the summary.
+        """Draw the curves of the trainings, write figure, table and summary to the folder, and return the summary.
 
-        The summary contains, for each recipe, the harm of the best policy and of the last policy of the trainings. Each
-        is the interquartile mean over seeds with a stratified bootstrap interval. The summary also contains hashes of
-        the best policies, and of the worlds on which they were compared.
+        The summary contains, for each recipe, the harm of the best policy and of the last policy of its trainings: the
+        interquartile mean over the seeds, with a bootstrap interval. The summary also contains hashes of the best
+        policies and of the worlds on which the policies were evaluated.
 
         Raises ``InvalidInput`` if no step exists at which all seeds of a recipe were evaluated.
         """
@@ -161,8 +163,9 @@ class LearningCurves(NamedTuple):
     def curves(self) -> dict[str, dict[str, SeedCurve]]:
         """Return the learning curves: metric -> name of the recipe -> curve with all seeds of the recipe.
 
-        The metrics are the return, and each count of harm that the reward of a recipe uses. A metric without values is
-        left out. If ``against`` is ``cpu``, the x values are processor times (s), averaged over the seeds.
+        The metrics are the return, and those counts of harm that the rewards of the recipes use. A metric that has no
+        values is omitted. If ``against`` is ``cpu``, the x values of a curve are processor times (s), averaged over the
+        seeds.
         """
         counts = {recipe.reward.harm_count for recipe, _ in self.plan}
         metrics = [RunDirectory.HARM[count] for count in HARM_COUNTS if count in counts]

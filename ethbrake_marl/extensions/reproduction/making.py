@@ -1,4 +1,4 @@
-"""Make figures and tables of a reproduction, and store them in its folder."""
+"""Reproduce figures and tables of the paper, and store the results in a folder."""
 
 from __future__ import annotations
 
@@ -31,38 +31,40 @@ from ethbrake_marl.files.store import write_file, write_output
 def choose_items(names: Sequence[str]) -> list[Item]:
     """Return the items (figures and tables of the paper) with these names, in the order of the paper.
 
-    Without names, returns all items. Raises ``UnknownName`` with a suggestion for an unknown name, and ``InvalidInput``
-    for a repeated name.
+    If ``names`` is empty, the result contains all items. Raises ``UnknownName``, with a suggestion, if a name is
+    unknown, and ``InvalidInput`` if a name is repeated.
     """
     known = {item.name: item for item in ITEMS}
     for k, name in enumerate(names):
         if name not in known:
             raise unknown_name("item", name, known)
         if name in names[:k]:
-            raise InvalidInput(f"item {name!r} is given twice; name each item once")
+            raise InvalidInput(f"item {name!r} is given twice; give each item only once")
     return [item for item in ITEMS if not names or item.name in names]
 
 
 def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
-    """Return the folder of a reproduction. An earlier reproduction with the same settings in this folder continues.
+    """Return the object that checks and locks the folder of a reproduction.
+
+    A reproduction that was begun in this folder with the same settings continues.
 
     Raises ``InvalidInput`` if the folder is a symbolic link.
 
     Args:
         asked: settings of the reproduction.
-        force: delete the results in the folder; trainings are not deleted.
+        force: whether existing results in the folder are deleted; trainings are never deleted.
 
     """
     path, question = asked.folder, {"episodes": asked.episodes, "version": __version__}
     if path.is_symlink():
-        raise InvalidInput(f"{path}: is a symbolic link; give a folder (--output)")
+        raise InvalidInput(f"{path}: this is a symbolic link; give the path of a folder (--output)")
     if force and (path / SETTINGS).is_file() and read_object(path / SETTINGS).get("format") == FORMAT["format"]:
         for item in ITEMS:  # figures and data are overwritten later
             (path / item.name / RESULT).unlink(missing_ok=True)
         write_file(path / SETTINGS, json_text({**FORMAT, **question}))
     advice = "give another folder (--output), or replace its results (--force)"
     return StudyFolder(
-        path, "reproduction", question, record=SETTINGS, more=FORMAT, advice=advice, beside=("trainings",),
+        path, "a reproduction", question, record=SETTINGS, more=FORMAT, advice=advice, beside=("trainings",),
         writes=("index.html",),
     )  # fmt: skip
 
@@ -70,11 +72,11 @@ def open_folder(asked: Reproduction, *, force: bool = False) -> StudyFolder:
 def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = False) -> tuple[list[Result], bool]:
     """Reproduce items (figures and tables of the paper).
 
-    Items without trainings come first. An item is not made again if its result exists and used the same trainings. The
-    page is rewritten after each item.
+    Items that need no trainings are reproduced first. An item is not reproduced again if its result exists and used the
+    same trainings. The HTML page is written again after each item.
 
-    Ctrl-C during a training stops all trainings; the items then use the trainings that are finished. A second Ctrl-C
-    stops the work at once.
+    Ctrl-C during a training stops all trainings; afterwards the items are reproduced with the finished trainings. A
+    second Ctrl-C stops everything at once.
 
     Returns all results in the folder, and whether all trainings are finished. Raises the exceptions of ``open_folder``
     and ``StudyFolder.work``.
@@ -82,7 +84,7 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
     Args:
         asked: settings of the reproduction.
         items: items to reproduce.
-        force: make existing results again.
+        force: whether items whose results exist are reproduced again.
 
     """
     full, finished = asked.mode == "full", True
@@ -102,9 +104,9 @@ def make_items(asked: Reproduction, items: Sequence[Item], *, force: bool = Fals
 
 
 def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
-    """Reproduce an item; write its figures and data, then its result file. The result file marks it as complete.
+    """Reproduce an item; write its figures, its data and then its result file, which marks the item as complete.
 
-    ``trained`` names the finished trainings of the item, as ``group/recipe``.
+    ``trained`` are the names of the finished trainings that the item uses, each as ``group/recipe``.
     """
     place, started = asked.folder / item.name, time.process_time()
     product = item.make(asked)
@@ -131,7 +133,7 @@ def _make_item(asked: Reproduction, item: Item, trained: Sequence[str]) -> None:
         notes=product.notes,
     )
     if place.is_symlink() or (place.exists() and not place.is_dir()):
-        raise InvalidInput(f"{place}: is a symbolic link or a file, but must be a folder; move it away")
+        raise InvalidInput(f"{place}: must be a folder, but is a file or a symbolic link; move it away")
     place.mkdir(exist_ok=True)
     for drawn, figure in product.figures.items():
         for ending in (".svg", ".png"):

@@ -1,4 +1,4 @@
-"""Sensitivity of the random test to quantities that the paper leaves open.
+"""How much the results of the random test depend on quantities that the paper leaves open.
 
 The result states for each quantity: what the paper says, our default, alternatives, and how much the main results
 change with each alternative.
@@ -44,7 +44,7 @@ from ethbrake_marl.training.run_folder import RunDirectory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alternative:
-    """Another possible value of a quantity that the paper leaves open, and how to apply it to the random test."""
+    """Another possible value of a quantity that the paper leaves open, and how this value changes the random test."""
 
     value: str  # the value in words
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario with their new values
@@ -130,9 +130,9 @@ class Headline:
     collided: Mapping[str, Bools]  # strategy -> [n] whether each world has a collision
 
     def change(self, base: Headline, strategy: str) -> Estimate:
-        """Return a strategy's mean harm here minus its mean harm in ``base``, m2/s2.
+        """Return a strategy's mean harm in these results minus its mean harm in the results ``base``, m2/s2.
 
-        The comparison is paired by world if both results are for the same worlds.
+        If both results are for the same worlds, the difference is computed world by world (paired).
         """
         own, other = self.harm[strategy], base.harm[strategy]
         if np.array_equal(self.gaps_m, base.gaps_m):
@@ -143,8 +143,8 @@ class Headline:
 def reproduce_gaps(settings: Reproduction) -> Made:
     """Measure how much the results of the random test change when one open quantity changes.
 
-    Open quantities are those that the paper does not state, or states ambiguously (``GAPS``). Returns tables, one of
-    which lists all open quantities, a figure and verdicts.
+    Open quantities are those that the paper does not state, or states ambiguously (``GAPS``). Returns a figure,
+    verdicts and tables; one table lists all open quantities.
     """
     episodes, scenario = min(2_000, settings.episodes), load_scenario(RANDOM)
     base = _measure(scenario, Alternative("default"), episodes)
@@ -245,11 +245,11 @@ def reproduce_gaps(settings: Reproduction) -> Made:
 def _measure(scenario: Scenario, alternative: Alternative, episodes: int) -> Headline:
     """Evaluate the strategies on the random test with one alternative; return harm and collisions in each world.
 
-    If the alternative counts predicted harm, the first-impact harm is used for strategies that predict no harm.
+    If ``alternative.harm`` is ``predicted``, strategies that predict no harm get their first-impact harm.
 
     Args:
         scenario: scenario of the random test, to which the changes of the alternative are applied.
-        alternative: value of an open quantity.
+        alternative: alternative value of an open quantity.
         episodes: number of worlds.
 
     """

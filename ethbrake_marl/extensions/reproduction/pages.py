@@ -28,10 +28,11 @@ _NUMERAL = re.compile(r"[-+−]?\d[\d,.]*( ?%)?|–|")
 
 
 def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
-    """Return texts on the results and how they were made.
+    """Return texts about the results and about how they were made.
 
-    Returns the first sentence of the page; the command that makes the results; date, machines and processor time; and
-    a list of remarks. The list has one remark if fewer worlds were used than in the paper; else it is empty.
+    There are four: the first sentence of the page; the command that makes the results; date, machines and processor
+    time; and a list of remarks. The list contains one remark if fewer worlds were used than in the paper; otherwise it
+    is empty.
     """
     every = len(results) == len(ITEMS)
     most = max((result.episodes for result in results), default=MOST_EPISODES)
@@ -55,7 +56,7 @@ def _account(results: Sequence[Result]) -> tuple[str, str, str, list[str]]:
 def render_page(folder: Path, results: Sequence[Result]) -> str:
     """Return the page with all results as HTML text. ``folder`` contains the figures of the results.
 
-    Raises ``InvalidInput`` if a figure is missing, or contains an element that our figures never contain.
+    Raises ``InvalidInput`` if a figure is missing, or if its file is not an SVG figure of this package.
     """
     lead, command, count, few = _account(results)
     _, *names = Page.anchors(["Overview", *(result.title for result in results)])
@@ -118,13 +119,13 @@ FIGURES, PREFIX = "figures", "reproduction-"  # folder and file prefix of the fi
 
 
 def write_docs(file: Path, folder: Path, results: Sequence[Result]) -> None:
-    """Write the results to a JSON file, and copies of the figures into a folder ``figures`` beside it.
+    """Write the results to a JSON file, and copies of the figures into a folder ``figures`` next to this file.
 
     Existing files are replaced.
 
     Args:
         file: JSON file to write.
-        folder: folder of the reproduction, which contains the figures.
+        folder: folder of the reproduction, from which the figures are copied.
         results: results to write.
 
     """

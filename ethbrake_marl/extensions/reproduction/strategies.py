@@ -1,6 +1,7 @@
 """The paper's strategies, and two assumptions on the time at which Vehicle 2 may act.
 
-The assumptions are the latencies that the paper states, and a latency of 0.2 s for Vehicle 2.
+With the first assumption, Vehicle 2 has the latency that the paper states. With the second assumption, its latency is
+0.2 s.
 """
 
 from __future__ import annotations
@@ -45,13 +46,16 @@ NAMES = {  # names of the strategies in tables and figures
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """An assumption on the time at which Vehicle 2 may act. The paper can be understood in two ways."""
+    """An assumption on the time at which Vehicle 2 may act.
+
+    There are two such assumptions (``READINGS``), because the paper is not clear about this time.
+    """
 
     name: str  # name of the assumption
     acts_s: float | None = None  # time at which Vehicle 2 may act (s); None: the latency of the scenario
 
     def scenario(self, name: str, **changes: object) -> Scenario:
-        """Return the shipped scenario ``name`` with this assumption, and with ``changes`` of its keys."""
+        """Return the shipped scenario ``name`` with the latency of this assumption and ``changes`` of further keys."""
         scenario = load_scenario(name).replace(**changes) if changes else load_scenario(name)
         if self.acts_s is None:
             return scenario
@@ -63,12 +67,18 @@ READINGS = (Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2))
 
 
 def lineup(scenario: Scenario, *specs: str) -> dict[str, Agent]:
-    """Return agents by name. ``specs`` are texts such as ``"full_brake"``, which ``NAMES`` maps to longer names."""
+    """Return agents by name.
+
+    ``specs`` are the agents' specs, such as ``"full_brake"``; their names in the result are those in ``NAMES``.
+    """
     return {NAMES.get(spec, spec): agent for spec, agent in make_agents(specs, scenario).items()}
 
 
 def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, settings: Reproduction) -> Evaluation:
-    """Evaluate every agent in the first ``episodes`` worlds of a scenario; report the progress to ``settings``."""
+    """Evaluate every agent in the first ``episodes`` worlds of a scenario.
+
+    The progress is reported with ``settings.tell``.
+    """
     return evaluate(
         scenario.sample(episodes, LIST_SEED),
         agents,
@@ -82,8 +92,8 @@ def drive_list(scenario: Scenario, agents: Mapping[str, Agent], episodes: int, s
 def harms(evaluation: Evaluation) -> dict[str, Floats]:
     """Return the first-impact harm of each strategy: name of the strategy -> [n] harm in each world (m2/s2).
 
-    If they are known, two further entries are the harm that E-V2X-BM predicts (``PREDICTED``), and the proven lower
-    bound of the harm (``PROVEN``).
+    Further entries, if known, are the harm that E-V2X-BM predicts (key ``PREDICTED``) and the proven lower bound of the
+    harm (key ``PROVEN``).
     """
     each_harm = {name: outcome.first_impact_harm for name, outcome in evaluation.outcomes.items()}
     pairwise = evaluation.outcomes.get(NAMES[PAIRWISE])
@@ -101,8 +111,8 @@ _STAND_IN = "ppo-obstacle"  # shipped policy that is used if no policy stopped e
 def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
     """Return a policy that has not converged, and its description.
 
-    The paper uses a "PPO model obtained from training before convergence occurred". Here it is the policy that
-    ``--full`` stopped early. If this policy does not exist, a shipped policy replaces it.
+    The paper uses a "PPO model obtained from training before convergence occurred". This function returns the policy of
+    the training that ``--full`` stops early. If this training has not run, a shipped policy replaces the policy.
     """
     for (path,) in settings.trained([STOPPED]).values():
         about = f"PPO stopped early: the last policy of {EARLY.decisions:,} decisions on paper-random"
@@ -112,10 +122,10 @@ def unconverged_policy(settings: Reproduction) -> tuple[Policy, str]:
 
 
 def hybrid(policy: Policy, scenario: Scenario, bound: Literal["coupled", "pairwise"]) -> Agent:
-    """Return the paper's hybrid (Algorithm 1): at the alert it chooses ``policy`` if its harm is at most H*.
+    """Return the paper's hybrid (Algorithm 1).
 
-    Otherwise it chooses E-V2X-BM. H* is the harm of E-V2X-BM: simulated (``bound="coupled"``), or predicted by a closed
-    form (``bound="pairwise"``).
+    At the alert the hybrid chooses ``policy`` if the policy's harm is at most H*, otherwise E-V2X-BM. H* is the harm of
+    E-V2X-BM. It is simulated if ``bound`` is ``coupled``, and predicted by a closed form if ``bound`` is ``pairwise``.
     """
     return HybridAgent(LearnedAgent(policy, "policy"), scenario, bound=bound)
 

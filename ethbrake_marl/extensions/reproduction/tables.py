@@ -1,4 +1,4 @@
-"""Compare our results with the paper's tables: what agrees, what differs, and what no strategy can reach."""
+"""Compare our results with the paper's tables: which numbers agree, which differ, and which no strategy can reach."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "
 
 
 def collision_rate(collided: Bools) -> Estimate:
-    """Return the share of worlds with an impact, with its 95 % interval. ``collided`` [n] marks these worlds."""
+    """Return the share of worlds with an impact, with its 95 % interval. ``collided`` [n] is True for these worlds."""
     return rate(int(collided.sum()), len(collided))
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Our results with one assumption on when Vehicle 2 may act, for comparison with a table of the paper."""
+    """Our results under one assumption on when Vehicle 2 may act, which are compared with a table of the paper."""
 
     title: str  # description of the assumption
     evaluation: Evaluation  # outcomes of our strategies
@@ -45,8 +45,8 @@ class Beside:
     def numbers(self) -> dict[str, dict[str, Estimate]]:
         """Our results: strategy -> quantity (such as "collision rate") -> estimate.
 
-        If proofs exist, the further key "least possible (proven)" (``NOBODY``) has the proven lower bounds for all
-        strategies.
+        If lower bounds are proven, a further key, "least possible (proven)" (``NOBODY``), contains the bounds that hold
+        for all strategies.
         """
         numbers, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
         for name, outcome in self.evaluation.outcomes.items():
@@ -65,13 +65,14 @@ class Beside:
         return numbers
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield our results that a number in the paper may mean, each as (name, estimate).
+        """Yield those of our results that may correspond to a number in the paper, each as (name, estimate).
 
-        The paper's number is compared with the first result. If they differ, the verdict names the nearest result.
+        The number is compared with the first result. If the two differ, the verdict also names the result nearest to
+        the number.
 
         Args:
-            row: name of the strategy in the paper.
-            quantity: "collision rate", "average harm" or "harm decrease".
+            row: name that the paper gives the strategy.
+            quantity: quantity that the number states: "collision rate", "average harm" or "harm decrease".
 
         """
         for name in self.ours[row]:
@@ -85,7 +86,7 @@ class Beside:
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """Return a verdict on each number in a table of the paper, for each of ``besides``.
+    """Compare each number in a table of the paper with each of our results ``besides``, and return the verdicts.
 
     Args:
         printed: rows of the paper's table.
@@ -116,15 +117,15 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Return a verdict: can a strategy that chooses one of two others per world avoid as many collisions as printed?
+    """Return a verdict on the printed number of collisions of a strategy that chooses one of two others in each world.
 
-    It avoids a collision only in worlds in which one of the two others avoids it. It therefore avoids at most as many
-    collisions as the two others together.
+    Such a strategy avoids a collision only in worlds in which one of the other two avoids it. Therefore it avoids at
+    most as many collisions as the other two together.
 
     Args:
         one: row of the paper's table for the first strategy.
         other: row for the second strategy.
-        chosen: row for the strategy that chooses one of the two.
+        chosen: row for the strategy that chooses one of these two in each world.
 
     """
     avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
@@ -138,13 +139,13 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Return a verdict: does the printed decrease of harm follow from the printed harms?
+    """Return a verdict on whether the decrease of harm that the paper prints follows from the harms that it prints.
 
-    The printed and the computed decrease must agree within 0.01 percentage points.
+    The printed and the computed decrease may differ by at most 0.01 percentage points.
 
     Args:
-        row: row of the paper's table with the decrease.
-        baseline: row to whose harm the decrease refers.
+        row: row of the paper's table in which the decrease is printed.
+        baseline: row of the strategy relative to whose harm the decrease is stated.
 
     """
     follows = 1.0 - row.average_harm / baseline.average_harm
@@ -157,7 +158,7 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
 
 
 def rows_table(beside: Beside) -> Sheet:
-    """Return a table of our results with one assumption (``beside``), with the proven lower bounds."""
+    """Return a table of our results under one assumption on when Vehicle 2 may act, with the proven lower bounds."""
     columns: dict[str, Column | str] = {
         _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
         _DECREASE: replace(PERCENT, heading="Harm decrease"),
@@ -180,10 +181,10 @@ def beside_printed(
     """Return the comparison of a table of the paper with our results: verdicts, tables and data.
 
     Args:
-        stem: name of the data file without ending.
+        stem: name of the CSV file with the data, without ending.
         printed: rows of the paper's table.
         besides: our results, one entry for each assumption on when Vehicle 2 may act.
-        arithmetic: verdicts that use the printed numbers only.
+        arithmetic: verdicts that follow from the printed numbers alone.
         parameters: quantities that affect the result.
         notes: sentences that say what was run and what was not.
 

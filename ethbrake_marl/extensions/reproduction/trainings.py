@@ -1,6 +1,6 @@
-"""Trainings of ``ethbrake reproduce --full``: learning curves, a policy stopped early, and open settings of training.
+"""Trainings of ``ethbrake reproduce --full``: for learning curves, for a policy stopped early, and for open settings.
 
-A group of trainings is one folder of learning curves (``learning_curves.LearningCurves``).
+The trainings of a group are stored in one folder, which ``learning_curves.LearningCurves`` manages.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _STATED_STATE = (  # the paper's state: positions and speeds of all vehicles, an
 
 @dataclass(frozen=True, slots=True)
 class TrainedRecipe:
-    """A training recipe, the length of the training, and how often the policy is evaluated."""
+    """Name of a recipe, length of its training, and number of updates between two evaluations of the policy."""
 
     recipe: str  # name of a shipped recipe
     decisions: int  # length of the training, in decisions
@@ -33,7 +33,7 @@ class TrainedRecipe:
     per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
 
     def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Return the recipe with the name ``name``, with these settings, and with ``changes`` of further keys."""
+        """Return the recipe with the new name ``name``, with these settings, and with ``changes`` of further keys."""
         recipe = load_recipe(self.recipe)
         evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}
         if "log_every_updates" in type(recipe).model_fields:  # otherwise the table has a row for every update

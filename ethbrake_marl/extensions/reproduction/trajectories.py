@@ -1,6 +1,6 @@
 """Reproduce the paper's figures of its Scenarios 1 and 2.
 
-These are the trajectories (``Fig:pic5sim``) and the acceleration profiles (``Fig:pic5act``).
+These figures show trajectories (``Fig:pic5sim``) and acceleration profiles (``Fig:pic5act``).
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _record_all(settings: Reproduction) -> Records:
 def play() -> Part:
     """Return an interactive player of the episodes in Scenarios 1 and 2, as a part of the page.
 
-    It first shows PPO and SAC side by side. The episodes use both assumptions on when Vehicle 2 may act.
+    At the start the player shows PPO and SAC. There are episodes with both assumptions on when Vehicle 2 may act.
     """
     records = []
     for reading, number in _CELLS:
@@ -176,13 +176,14 @@ def _parameters() -> list[Parameter]:
 def _both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
     """Return one recorded quantity under PPO and under SAC, at the same times.
 
-    The times end when the longer episode ends. The last value of the shorter episode is repeated until then.
+    The times end when the longer of the two episodes ends. After the end of the shorter episode, its last value is
+    repeated.
 
     Args:
         records: recorded episodes.
         reading: assumption on when Vehicle 2 may act.
         number: number of the scenario, 1 or 2.
-        what: name of an array of the record, for instance ``gaps_m``.
+        what: name of the quantity's array in the records, for instance ``gaps_m``.
         column: index of a column of this array.
 
     """
@@ -193,7 +194,9 @@ def _both(records: Records, reading: Reading, number: int, what: str, column: in
 
 
 def _apart(records: Records, reading: Reading, what: str) -> list[float]:
-    """Return the root mean square difference of a quantity of Vehicle 2 between PPO and SAC, for Scenarios 1 and 2.
+    """Return how far a quantity of Vehicle 2 differs between PPO and SAC, in Scenario 1 and in Scenario 2.
+
+    The result is the root mean square of the difference over time.
 
     Args:
         records: recorded episodes.
@@ -206,12 +209,13 @@ def _apart(records: Records, reading: Reading, what: str) -> list[float]:
 
 
 def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Reading, show: Column) -> list[Verdict]:
-    """Return a verdict on each claim about a single world. The numbers have no intervals.
+    """Return a verdict on each claim of the paper about a single world. Numbers for a single world have no intervals.
 
     Args:
-        claims: claim -> text with both numbers, the number that the claim says is smaller, and the larger number.
+        claims: claim -> (text with the two numbers, number that is smaller according to the claim, number that is
+            larger).
         reading: assumption on when Vehicle 2 may act, for the text of the verdict.
-        show: format of the difference of the two numbers.
+        show: format in which the difference of the two numbers is written.
 
     """
     return [
@@ -223,8 +227,8 @@ def _judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Re
 def _asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
     """Return three numbers on the commands of Vehicle 2.
 
-    They are its first command (m/s2), the sum of the absolute changes of its command (m/s2), and the share (0 to 1) of
-    the time in which it brakes while it moves.
+    The numbers are the first command (m/s2), the sum of the absolute changes of the command (m/s2), and the share (0 to
+    1) of the time in motion during which Vehicle 2 brakes.
     """
     acting = record.time_s >= float(record.initial.vehicles.latency_s[0, 1])
     command, moving = record.command_mps2[acting, 1], record.speeds_mps[acting, 1] > 0.0

@@ -1,14 +1,15 @@
 """Verdicts on the paper's numbers and statements, computed from our results.
 
-*Chance* is the difference that two random lists of worlds may have by chance. A number that the paper prints
+*Chance* is the difference that the results of two random lists of worlds may have by chance.
 
-- *agrees* with ours if the two differ by no more than chance, or by no more than ``TOLERANCE`` of the printed number;
-- is *undecided* if they differ by no more than chance, but chance is more than ``WIDE`` of the number;
-- *cannot agree* if a proven bound for all strategies excludes it by more than chance;
-- *differs* in all other cases.
+- A number that the paper prints *agrees* with ours if the two differ by no more than chance, or by no more than
+  ``TOLERANCE`` of the printed number.
+- It is *undecided* if the two differ by no more than chance, but chance is more than ``WIDE`` of the larger number.
+- It *cannot agree* if it is below a proven lower bound for all strategies by more than chance.
+- It *differs* in all other cases.
 
-A statement of the paper *agrees* if the interval of every comparison supports it. It is *undecided* if the intervals of
-all other comparisons contain 0.
+A statement of the paper *agrees* if the interval of every comparison supports it. It is *undecided* if some intervals
+do not support it, but all these intervals contain 0.
 """
 
 from __future__ import annotations
@@ -64,16 +65,16 @@ def compare_number(
     least: tuple[str, Estimate] | None = None,
     others: Mapping[str, Estimate] | None = None,
 ) -> Verdict:
-    """Return a verdict on whether a number that the paper prints agrees with ours.
+    """Return a verdict on whether a number that the paper prints agrees with our result.
 
     Args:
-        what: name of the number.
-        printed: the paper's number.
+        what: name of the number, for the verdict.
+        printed: number that the paper prints.
         ours: the same quantity in our results, with its 95 % interval.
-        show: format of both numbers.
+        show: format in which both numbers are written.
         least: description and value of a proven lower bound for all strategies in our worlds; None: no bound.
-        others: description -> the same quantity with another assumption. If our number differs from the printed number,
-            the verdict names the nearest of these quantities.
+        others: description -> the same quantity under another assumption. If our result differs from the printed
+            number, the verdict names the entry that is nearest to the printed number.
 
     """
     text = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
@@ -97,10 +98,10 @@ def compare_number(
 
 
 def _off(printed: float, ours: Estimate) -> str:
-    """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; empty if the two agree.
+    """Return how far ``ours`` is from the printed number, as text such as "+3.1 %"; an empty text if the two agree.
 
     The two numbers agree if they differ by at most 2 % of the printed number (``TOLERANCE``), or by no more than chance
-    (``_chance``). Chance is ignored if it is more than 15 % of the larger number (``WIDE``).
+    (``_chance``). If chance is more than 15 % (``WIDE``) of the larger number, only the first condition applies.
     """
     chance = _chance(ours)
     off = chance if chance <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
@@ -110,7 +111,7 @@ def _off(printed: float, ours: Estimate) -> str:
 
 
 def _chance(estimate: Estimate) -> float:
-    """Return by how much this estimate may differ by chance from an estimate for other worlds (as many).
+    """Return by how much this estimate may differ, by chance, from an estimate for the same number of other worlds.
 
     The result is sqrt(2) times half the width of the 95 % interval.
     """
@@ -120,7 +121,7 @@ def _chance(estimate: Estimate) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Less:
-    """Comparison of two quantities, as evidence on a statement that the first is smaller than the second.
+    """Comparison of two quantities, to judge a statement of the paper that the first is smaller than the second.
 
     A statement can need several comparisons, for example one for each group of worlds.
     """
@@ -134,18 +135,18 @@ class Less:
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Compare the means of two independent samples: is the mean of ``smaller`` [n] below that of ``larger`` [m]?
+        """Compare the mean of ``smaller`` [n] with the mean of ``larger`` [m], two independent samples.
 
-        ``where`` is a text that says what is compared.
+        ``where`` is a text that says which worlds or strategies are compared.
         """
         return cls(where, unpaired_difference(mean(smaller), len(smaller), mean(larger), len(larger)))
 
     @classmethod
     def of_harms(cls, where: str, harm: Mapping[str, Floats], smaller: str, larger: str) -> Less:
-        """Compare the harm of two strategies in the same worlds, and with the proven lower bound if it is known.
+        """Compare the harms of two strategies in the same worlds, also with the proven lower bound if it is known.
 
         Args:
-            where: text that says what is compared.
+            where: text that says which worlds or strategies are compared.
             harm: name of the strategy -> [n] harm in each world.
             smaller: name of the strategy whose harm should be smaller.
             larger: name of the strategy whose harm should be larger.
@@ -157,13 +158,15 @@ class Less:
 
 
 def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
-    """Return a verdict on a statement of the paper. It agrees if the interval of every comparison is below 0.
+    """Return a verdict on a statement of the paper.
+
+    The statement agrees if the interval of every difference is below 0.
 
     Args:
         what: the statement.
         parts: comparisons that the statement needs.
-        or_equal: True: intervals that end at 0 agree, too.
-        show: format of the differences.
+        or_equal: whether intervals that end at 0 agree, too.
+        show: format in which the differences are written.
 
     """
     compared, ties = [part for part in parts if not part.neither], [part.where for part in parts if part.neither]
@@ -196,9 +199,9 @@ def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False,
 
 
 def summarise_verdicts(verdicts: Sequence[Verdict]) -> Verdict:
-    """Combine all verdicts on a figure or table into one: the worst outcome, and the number of each outcome.
+    """Combine all verdicts on a figure or table into one verdict with the worst outcome.
 
-    The text also quotes the first verdict with the worst outcome.
+    Its text states how often each outcome occurs, and quotes the first verdict with the worst outcome.
     """
     if not verdicts:
         return Verdict("all", "not run", "nothing was compared")

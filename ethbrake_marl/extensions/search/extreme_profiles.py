@@ -2,7 +2,7 @@
 
 The proof of the lower bound shows that profiles with the least harm have one of two forms. Either the vehicle drives
 fully for a while, brakes fully until it meets the vehicle ahead, and drives fully again. Or it brakes fully, drives
-fully until the vehicle behind meets it, and brakes fully again (docs/extensions/search.md). A random search seldom
+fully until the vehicle behind meets it, and brakes fully again. A random search seldom
 finds these profiles.
 """
 

@@ -1,1 +1,1 @@
-"""Many trainings or worlds: ``ethbrake study sweep``, ``tune`` and ``falsify``."""
+"""Studies of many trainings or many worlds: the commands ``ethbrake study sweep``, ``tune`` and ``falsify``."""

@@ -17,11 +17,12 @@ _SILENT = ("ray.tune.tune", "ray.tune.analysis.experiment_analysis")  # loggers 
 def connected(address: str, cores: int | None) -> Iterator[None]:
     """Context manager that connects to Ray while its block runs, and disconnects afterwards, also after an error.
 
-    Inside the block, the signal SIGTERM acts like Ctrl-C. Afterwards the earlier signal handlers are restored.
+    Inside the block, the signal SIGTERM acts like Ctrl-C. After the block, the signals have their earlier handlers
+    again.
 
     Args:
         address: address of a running cluster, or ``local`` to start Ray on this machine.
-        cores: number of cores that Ray on this machine uses; None: all.
+        cores: number of cores that Ray on this machine uses; None: all cores.
 
     """
     with own_signals():

@@ -30,13 +30,13 @@ RetriesOption = Annotated[
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Print the trainings without starting them.")]
 
 ClusterOption = Annotated[
-    str, typer.Option(metavar="local|ADDRESS", help="Start Ray on this machine, or use a running cluster.")
+    str, typer.Option(metavar="local|ADDRESS", help="local: start Ray on this machine; ADDRESS: use a running cluster.")
 ]
 
 study_group = typer.Typer(
     rich_markup_mode=None,
     add_completion=False,
-    help="Train and compare many policies; search for the worst worlds of an agent.",
+    help="Compare many policies; search for an agent's worst worlds.",
     epilog=example("study sweep sweep.yaml --output runs/sweep", "study ablate --quick --output runs/ablation-quick"),
 )
 
@@ -90,7 +90,8 @@ def sweep_command(
 )
 def tune_command(
     file: Annotated[
-        Path, typer.Argument(metavar="TUNING.yaml", help="File with a training and the ranges of its settings.")
+        Path,
+        typer.Argument(metavar="TUNING.yaml", help="File with a training and the ranges of the settings to search."),
     ],
     output: FolderOption,
     trials: Annotated[
@@ -99,7 +100,7 @@ def tune_command(
     jobs: Annotated[
         int,
         typer.Option(
-            help="Number of trials that run at once, one process each. It affects which values are tried.",
+            help="Number of trials that run at once, one process each. This number affects which values are tried.",
             min=1,
             max=MOST_WORKERS,
         ),
@@ -107,18 +108,18 @@ def tune_command(
     ray: ClusterOption = "local",
     retries: RetriesOption = 2,
     export: Annotated[
-        Path | None, typer.Option(metavar="NAME.yaml", help="Write the settings of the best trial as a recipe.")
+        Path | None, typer.Option(metavar="NAME.yaml", help="File for a recipe with the settings of the best trial.")
     ] = None,
     dry_run: DryRunOption = False,
     schema: schema_option("ethbrake_marl.extensions.studies.tuning", "TuningPlan", "tuning") = False,  # type: ignore[valid-type]  # made here
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search for the settings of a recipe whose trained policy does the least harm.
+    """Search for the best settings of a training recipe.
 
-    The harm of a trial is measured on the list of worlds in the file. After an interruption, the same command
-    continues: finished trials are not trained again, and unfinished trials continue. The exit status is 1 if no trial
-    has finished.
+    A trial is one training. Its harm is measured on the list of worlds that the file describes. After an interruption,
+    the same command continues: finished trials are not trained again, and unfinished trials continue. The exit status
+    is 1 if no trial has finished.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         need("optuna")
@@ -178,7 +179,7 @@ def tune_command(
 
 
 def _end_study(out: Out, summary: str, *, interrupted: bool, failed: bool) -> None:
-    """Print the ``summary`` of a sweep or tuning, and exit with status 130 if interrupted, 1 if failed, else 0."""
+    """Print ``summary``, and exit with status 130 if the study was interrupted, 1 if it failed, else 0."""
     if interrupted:
         out.interrupted(f"interrupted; {summary}; {REMAINS}")
     out.note(summary)
@@ -191,26 +192,29 @@ def falsify_command(
     agent: Annotated[
         str | None,
         typer.Option(
-            help="Agent whose worst worlds are searched; any agent of `ethbrake evaluate`.", show_default="universal"
+            help="Agent whose worst worlds the command finds; any agent of `ethbrake evaluate`.",
+            show_default="universal",
         ),
     ] = None,
     measure: Annotated[
         str | None,
         typer.Option(
             metavar="harm|regret|difference|bound",
-            help="Score of a world that the search maximises.",
+            help="Measure of a world that the search makes as large as possible.",
             show_default="regret",
         ),
     ] = None,
     against: Annotated[
         str | None,
         typer.Option(
-            metavar="AGENT", help="Agent to compare with, for regret and difference.", show_default="best_harm"
+            metavar="AGENT",
+            help="Second agent, with which --agent is compared if --measure is regret or difference.",
+            show_default="best_harm",
         ),
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(metavar="NAME|PATH", help="Scenario whose ranges are searched.", show_default="paper-random"),
+        typer.Option(metavar="NAME|PATH", help="Scenario whose worlds are searched.", show_default="paper-random"),
     ] = None,
     budget: Annotated[int | None, typer.Option(help="Number of worlds to try.", min=1, show_default="4000")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the search.", min=0, show_default="0")] = None,
@@ -219,20 +223,22 @@ def falsify_command(
     ] = None,
     settings: SettingsOption = None,
     output: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Write the worlds to a file for --again.")
+        Path | None,
+        typer.Option(metavar="FILE.yaml", help="File for the worlds that were found, which --again can read."),
     ] = None,
     again: Annotated[
-        Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of a file again instead of searching.")
+        Path | None, typer.Option(metavar="FILE.yaml", help="Drive the worlds of this file again instead of searching.")
     ] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Search the ranges of a scenario for the worlds in which an agent does worst.
+    """Search a scenario for the worlds in which an agent does worst.
 
-    --measure sets the score of a world. harm: the agent's harm. regret: the agent's harm minus the harm of --against,
-    by default the best known profile. difference: the absolute difference between these two harms. bound: the agent's
-    harm minus the bound of its shield; a score above 0 means that the bound is broken. --again FILE drives the worlds
-    of a file again, with --agent or with the agent of the file. The exit status is then 1 if a world has a worse score.
+    --measure sets the score of a world; a larger score is worse. With harm, the score is the agent's harm. With regret,
+    it is the agent's harm minus the harm of --against (by default the best known commands). With difference, it is the
+    absolute difference between these two harms. With bound, it is the agent's harm minus the bound of its shield, so a
+    score above 0 means that the bound is broken. With --again FILE, the agent of the file (or --agent) drives the
+    worlds of the file again. With --again, the exit status is 1 if a world has a worse score than in the file.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
@@ -248,14 +254,14 @@ def falsify_command(
             }  # fmt: skip
             for option in (name for name, value in asked.items() if value is not None):
                 raise InvalidInput(
-                    f"{option} cannot be combined with --again, because that file sets what is measured; leave"
+                    f"{option} cannot be combined with --again, whose file sets what is measured; leave"
                     f" {option} out (only --agent may be given)"
                 )
             _drive_again(out, again, agent)
             return
         agent, measure, scenario = agent or "universal", measure or "regret", scenario or "paper-random"
         budget, seed, keep = 4000 if budget is None else budget, seed or 0, keep or 20
-        out.check(output, ".yaml", ".yml", what="a file of worlds")
+        out.check(output, ".yaml", ".yml", what="worlds")
         task = read_task(scenario, settings)
         chosen = task.scenario
         measured_by = Measure.of(measure, agent, against, chosen, task.harm_count)
@@ -329,8 +335,8 @@ def _spelled(**options: Any) -> str:
 def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     """Measure the worlds of a file of ``study falsify`` again, and print a comparison with the scores in the file.
 
-    ``agent`` is the agent that drives; None: the agent that the file names. Exits with status 1 if the score of a world
-    is worse than in the file, or if the agent cannot drive the world.
+    ``agent`` is the agent that drives the worlds; None: the agent that the file names. Exits with status 1 if a world
+    has a worse score than in the file, or if the agent cannot drive a world.
     """
     import numpy as np
 
@@ -343,7 +349,7 @@ def _drive_again(out: Out, file: Path, agent: str | None) -> None:
     for spec in (*([named.agent] if agent is None else []), *([named.against] if named.against else [])):
         if (code := parse_spec(spec).file) is not None:
             raise InvalidInput(
-                f"{file}: names an agent in the code file {code[0]}. Code that a file names is not run; give the agent"
+                f"{file}: the file names an agent whose code is in {code[0]}. Such code is not run; give the agent"
                 " with --agent, or edit the key against in the file"
             )
     chosen = evaluation.load_runnable(named.scenario, training.read_settings(named.settings).scenario, drives="some")

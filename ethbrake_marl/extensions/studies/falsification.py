@@ -1,4 +1,4 @@
-"""Adaptive search of the unit cube for several points with a high score that are far apart."""
+"""Adaptive search of the unit cube for several points that have high scores and are far apart."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _LAST = np.nextafter(1.0, 0.0)
 
 
 class Scored(NamedTuple):
-    """All n points of the unit cube that a search tried, in order, with their scores."""
+    """The n points of the unit cube that a search tried, in the order of the search, with their scores."""
 
     points: Floats  # [n, d] coordinates in [0, 1)
     scores: Floats  # [n] score of each point, the larger the better; minus infinity: the point is invalid
@@ -43,18 +43,19 @@ def search(
 ) -> Scored:
     """Search the unit cube for points with a high score, and return all points that were tried.
 
-    Half of the points of a round are spread evenly (scrambled Sobol points). The other half are one step away from
-    parents, which are the best points so far that are far apart. A step is a normal random step in some coordinates, or
-    half the difference of two other parents (differential evolution). As long as no score is above the median, all
-    points are spread evenly. The same seed gives the same points.
+    Half of the points of a round are spread evenly (scrambled Sobol points). Each point of the other half is one step
+    away from a *parent*. The parents are the points with the highest scores so far that are far apart from each other.
+    A step is a normal random step in some coordinates, or half the difference between two random parents (differential
+    evolution). In the first round, and later while no score is above the median score, all points are spread evenly.
+    The same seed gives the same points.
 
     Args:
         score: function from points [n, d] to scores [n].
         dimensions: number of coordinates, d.
         budget: number of points to try.
-        seed: seed of the points.
-        adaptive: whether to search around the best points; False: all points are uniform random points.
-        on_round: function that is called after each round with the number of points so far and ``budget``.
+        seed: seed of the random numbers.
+        adaptive: True: search around the best points; False: all points are uniform random points.
+        on_round: function that is called after each round with the number of points tried so far and ``budget``.
 
     """
     check_whole_number("search: budget", budget, 1)
@@ -89,10 +90,11 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(scored: Scored, count: int) -> Ints:
-    """Return the row numbers of at most ``count`` points of ``scored`` that are good and far apart, best first.
+    """Choose at most ``count`` points of ``scored`` that have high scores and are far apart.
 
-    Any two of these points differ by at least 0.1 in some coordinate. Points with a score that is not finite are
-    omitted.
+    Return their row numbers, best point first.
+
+    Any two of these points differ by at least 0.1 in some coordinate. Points whose score is not finite are omitted.
     """
     order = np.argsort(-scored.scores, kind="stable")
     order = order[np.isfinite(scored.scores[order])]
@@ -105,7 +107,7 @@ def far_apart(scored: Scored, count: int) -> Ints:
 
 
 def _above_median(scored: Scored) -> Scored:
-    """Return ``scored`` with all scores that are not above the median replaced by minus infinity."""
+    """Return ``scored`` with minus infinity in place of all scores that are not above the median score."""
     good = np.isfinite(scored.scores)
     if not good.any():
         return scored
@@ -113,7 +115,7 @@ def _above_median(scored: Scored) -> Scored:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Return ``count`` new points [count, d] near the points ``parents`` [m, d]; each parent gets equally many."""
+    """Return ``count`` new points [count, d] near the points ``parents`` [m, d], about equally many near each."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]
@@ -130,16 +132,16 @@ def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Falsified:
-    """Result of a search for worlds in which an agent does badly: the worst worlds, worst first, and all scores."""
+    """Result of a search for worlds in which an agent does badly: the worst worlds, and the scores of all worlds."""
 
     sample: Sample  # the worst worlds at the alert
     worlds: list[NamedWorld]  # the same worlds with names, initial states and measurements
-    # Score of every tried world, in order (m2/s2). Minus infinity: the scenario rejects it, or the physics failed.
+    # Score of every tried world, m2/s2; minus infinity: the scenario rejects the world, or the physics failed.
     scores: Floats
     first_above: int | None  # number of worlds tried until the first score above 0; None: no score is above 0
 
     @property
     def share_above(self) -> float:
-        """Number of worlds with a score above 0, divided by the number of worlds with a finite score."""
+        """Fraction of worlds with a score above 0, among the worlds with a finite score."""
         good = self.scores[np.isfinite(self.scores)]
         return float((good > 0.0).mean()) if len(good) else 0.0

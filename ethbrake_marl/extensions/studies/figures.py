@@ -1,4 +1,4 @@
-"""Train one job of a sweep or tuning to its end in its folder, and return its numbers for a table."""
+"""Train one job of a sweep or tuning to its end in the job's folder, and return the job's entries for a table."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def is_done(job: TrainingJob) -> bool:
 
 
 def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
-    """Continue the training of ``job`` to its end. Return False if it was stopped early.
+    """Continue the training of ``job`` to its end. Return False if ``stop_at`` stopped the training early.
 
-    ``stop_at`` is a function that receives each evaluation, and returns a reason to stop or None. Raises the exceptions
-    of a training, ``InvalidInput`` if the folder contains another training, and ``BlockingIOError`` if another worker
-    has just begun the same training.
+    ``stop_at`` is a function that is called with each evaluation; it returns a reason to stop, or None to continue.
+    Raises the exceptions of a training, ``InvalidInput`` if the folder contains another training, and
+    ``BlockingIOError`` if another worker has just begun the same training.
     """
     run = RunDirectory(job.folder)
     if run.status.is_file():
@@ -66,7 +66,7 @@ def finish(job: TrainingJob, stop_at: StopAt | None = None) -> bool:
 
 
 def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
-    """Return the evaluations so far from the folder of ``job``: number of steps and measures, by name.
+    """Return the evaluations so far of the training ``job``, each as number of steps and measures, by name.
 
     Raises ``InvalidInput`` if the file ``progress.csv`` in the folder is damaged.
     """
@@ -80,14 +80,14 @@ def evaluations_of(job: TrainingJob) -> list[dict[str, float]]:
         if any(not {*_MEASURED} <= each.keys() or not all(map(math.isfinite, each.values())) for each in evaluations):
             raise ValueError("a measure is missing or not finite")
     except (ValueError, LookupError, csv.Error) as error:
-        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete its folder to train again") from None
+        raise InvalidInput(f"{run.progress}: is damaged ({error}); delete the run's folder to train again") from None
     return evaluations
 
 
 def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, Any]:
-    """Return the numbers of the training ``job`` for a table, by name, computed from its evaluations so far.
+    """Return the entries of the training ``job`` for a table, by column, computed from its evaluations so far.
 
-    The names are ``harm`` (the quantity by which the best policy is chosen) and the names in ``FIGURES`` without
+    The columns are ``harm`` (the least harm, by which the best policy is chosen) and all ``FIGURES`` except
     ``policy_sha256``. Example: ``{"harm": 7.1, "steps": 400000, "total_harm": 9.8, ...}``.
     """
     harm = RunDirectory.chosen_by(evaluations, job.training.recipe.reward.harm_count)
@@ -102,13 +102,13 @@ def figures(job: TrainingJob, evaluations: Sequence[Evaluation]) -> dict[str, An
 
 
 def final_figures(job: TrainingJob) -> dict[str, Any]:
-    """Return the numbers of the finished training ``job`` for a table, by name: ``harm`` and all names in ``FIGURES``.
+    """Return the entries of the finished training ``job`` for a table, by column: ``harm`` and all ``FIGURES``.
 
     Raises ``InvalidInput`` if a file in the folder is damaged.
     """
     run, evaluations = RunDirectory(job.folder), evaluations_of(job)
     if not evaluations:
-        raise InvalidInput(f"{run.progress}: contains no evaluation; delete its folder to train again")
+        raise InvalidInput(f"{run.progress}: the file contains no evaluation; delete the run's folder to train again")
     trained = read_trained(run.policy)
     if isinstance(trained, Policy):
         sha256 = trained.manifest.manifest_sha256

@@ -1,4 +1,7 @@
-"""The folder of a study. Only one process at a time may work in it, and always with the same settings."""
+"""The folder of a study.
+
+Only one process at a time may work in the folder, and all processes must use the same settings.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +19,18 @@ _LOCK = ".lock"
 
 
 class StudyFolder:
-    """Folder for the results of a study. The same command can continue its work after an interruption.
+    """Folder for the results of a study. After an interruption, the same command continues the work in this folder.
 
     Args:
         path: path of the folder; it is created when the work begins.
-        kind: content of the folder, for messages, such as ``a sweep``.
-        question: all settings and versions that the results depend on, as plain data. A folder with different settings
-            is refused. None: every result stores its own settings.
+        kind: what the folder contains, for messages, such as ``a sweep``.
+        question: all settings and software versions that the results depend on, as plain data. A folder in which other
+            settings are stored is refused. None: the folder stores no common settings, because every result stores its
+            own.
         record: name of the file in the folder that stores ``question``.
-        more: additional entries of the file ``record``, which are not compared.
-        advice: what the user can do about a folder with different settings, for messages.
-        beside: names of files that a folder without the file ``record`` may contain; None: any files.
+        more: additional entries of the file ``record``, which are not compared with the new settings.
+        advice: end of the messages about a wrong folder: what the user can do.
+        beside: names of the only files that a folder without the file ``record`` may contain; None: any files.
         writes: names of files that the work replaces; they must be writable.
 
     """
@@ -51,14 +55,14 @@ class StudyFolder:
         """Check that work may begin in this folder, and return whether the file ``record`` must still be written.
 
         The method writes nothing. Raises ``InvalidInput`` if the path is not a folder, if the folder or a file in
-        ``writes`` is not writable, or if the folder has different settings. Raises ``AlreadyExists`` if the folder has
-        a different kind of content.
+        ``writes`` is not writable, or if other settings are stored in the folder. Raises ``AlreadyExists`` if the
+        folder contains something else than ``kind``.
         """
         check_folder(self.path, self._writes, force=True)
         if self._question is None:
             if self._record.is_file():
                 raise AlreadyExists(
-                    f"{self.path}: is not the folder of {self._kind}: it contains {self._record.name} of another"
+                    f"{self.path}: the folder is not for {self._kind}: it contains {self._record.name} of another"
                     f" command; {self._advice}"
                 )
             return False
@@ -66,7 +70,7 @@ class StudyFolder:
             held = {each.name for each in self.path.iterdir()} if self.path.is_dir() else set()
             if self._beside is not None and held - {*self._beside, _LOCK}:
                 raise AlreadyExists(
-                    f"{self.path}: the folder exists, and is not the folder of {self._kind}; give another folder"
+                    f"{self.path}: the folder exists, but does not contain {self._kind}; give another folder"
                 )
             return True
         try:
@@ -102,8 +106,8 @@ class StudyFolder:
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> list[str]:
     """Return the differences between the settings ``before`` and ``now`` as texts: ``["seeds 2, now 5", "recipes"]``.
 
-    If the value of a setting is a list or an object, the text is the name alone. ``inside`` is the text before each
-    name.
+    If the value of a setting is a list or a mapping, the text contains only the name of the setting. ``inside`` is the
+    text before each name.
     """
     differences: list[str] = []
     for name in dict.fromkeys([*now, *before]):

@@ -13,7 +13,7 @@ import ethbrake_marl as eb
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Processor, load and versions of this machine, which are printed with every measured time."""
+    """Processor, load and software versions of this machine, which are printed with every measured time."""
 
     processor: str  # model of the processor
     cores_usable: int  # number of cores that this process may use
@@ -33,7 +33,7 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    """Return processor, cores, present load and versions of this machine."""
+    """Return the processor, number of cores, present load and software versions of this machine."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text("utf-8").splitlines() if information.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -1,7 +1,7 @@
-"""Files of named worlds: the worlds that a search has found, which agents can drive again.
+"""Files of named worlds, which a search has found and which agents can drive again.
 
-A file stores the worlds, the scenario with a hash of its content, the agent that drove the worlds, and the
-measurements.
+A file stores the worlds, the scenario with a hash of its content, the agent that drove the worlds, and the harm and
+score of each world.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class NamedWorld(FileModel):
-    """One world of the file: its name, its initial state, and its measurements."""
+    """One world of the file: the world's name, its initial state, and the harm and score that were measured in it."""
 
     # Name of the world, unique in the file.
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$")]
@@ -40,7 +40,7 @@ class NamedWorld(FileModel):
 
 
 class NamedWorlds(FileModel):
-    """Content of a YAML file of the worst worlds of an agent, as a search found them."""
+    """Content of a YAML file with the worst worlds of an agent that a search has found."""
 
     format: Literal["ethbrake-worlds"]  # mark of this kind of file
     # Version of the format; not a Literal, which would accept true and 1.0.
@@ -61,7 +61,7 @@ class NamedWorlds(FileModel):
     def of(cls, scenario: Scenario, /, **fields: Any) -> NamedWorlds:
         """Return the content of a file of worlds that were drawn from ``scenario``.
 
-        ``fields`` are the other fields of this class, except format, version and hash.
+        ``fields`` are all fields of this class except ``format``, ``version`` and ``scenario_sha256``.
         """
         return cls(format="ethbrake-worlds", version=1, scenario_sha256=scenario_sha256(scenario), **fields)
 
@@ -69,7 +69,7 @@ class NamedWorlds(FileModel):
     def read(cls, path: str | Path) -> NamedWorlds:
         """Read and check a file of named worlds.
 
-        Raises ``InvalidInput`` with the file, the line and the key if the content is invalid.
+        Raises ``InvalidInput``, which names the file, the line and the key, if the content is invalid.
         """
         document = read_yaml(path, SIZE_LIMIT)
         worlds = read_model(document, cls, Wording(cls, "search again (ethbrake study falsify)"), "of named worlds")
@@ -90,12 +90,12 @@ class NamedWorlds(FileModel):
         return "\n".join(lines) + "\n"
 
     def worlds_of(self, scenario: Scenario, where: str) -> Worlds:
-        """Return the worlds of the file at the alert.
+        """Return the worlds of the file, in their states at the alert.
 
         Raises ``InvalidInput`` if the content of ``scenario`` has changed since the worlds were found.
 
         Args:
-            scenario: scenario that the file names.
+            scenario: scenario whose name is in the file.
             where: name of the file, for messages.
 
         """

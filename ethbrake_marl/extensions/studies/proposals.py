@@ -1,7 +1,7 @@
 """Proposals of Optuna for a tuning: the values to try in each trial, stored in a file and used again after a restart.
 
-Each trial has a new sampler, whose seed depends on the number of the trial. A proposal therefore depends on the trials
-that have ended, but not on interruptions of the command.
+Each trial has a new sampler, whose seed depends on the number of the trial. Therefore a proposal depends on the results
+of earlier trials, but not on interruptions of the command.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ Proposal = Mapping[str, Any]  # key -> value in Optuna's form
 class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
     """Search algorithm of Ray Tune that asks Optuna for proposals, and stores each proposal in a file.
 
-    A *proposal* contains the values to try in one trial, by key, in Optuna's form. The configuration of a trial
-    consists of its number, ``trial``, and its proposal, ``values``.
+    A *proposal* contains the values to try in one trial, by key, in the form in which Optuna stores values. The
+    configuration of a trial consists of its number, ``trial``, and its proposal, ``values``.
 
     Args:
         file: JSON file of the proposals; it is created with the first proposal.
-        known: proposals that the file already contains; they are used again before Optuna makes new ones.
+        known: proposals that the file already contains; the first trials get these proposals again.
         space: key -> Optuna's distribution of the values of this key.
         sampler: function from the number of a trial to its Optuna sampler.
-        first: proposal of the first trial, used if ``known`` is empty; None: Optuna makes this proposal, too.
+        first: proposal of the first trial if ``known`` is empty; None: Optuna makes the first proposal.
 
     """
 
@@ -74,7 +74,7 @@ class Proposals(OptunaSearch):  # type: ignore[misc]  # Ray ships no types
 
 
 class _SamplerOfTrial(BaseSampler):
-    """Optuna sampler that uses a new sampler for each trial: ``of(number)`` for the trial with this number."""
+    """Optuna sampler that uses the sampler ``of(k)`` for trial number k."""
 
     def __init__(self, of: Callable[[int], BaseSampler]) -> None:
         self._of = of

@@ -31,11 +31,11 @@ class StudyFile(FileModel):
     def read_as(cls, path: str | Path, needed: str) -> Self:
         """Read and check a YAML file with the content of this class.
 
-        Raises ``InvalidInput`` with the file, line, key and value of an error, and a correct alternative.
+        Raises ``InvalidInput``, which names the file, line, key and value of the error, and a correct alternative.
 
         Args:
             path: path of the file.
-            needed: required content of the file, for messages, such as ``with a grid or a list of jobs``.
+            needed: what the file must contain, for messages, such as ``with a grid or a list of jobs``.
 
         """
         document = read_yaml(path)
@@ -48,8 +48,8 @@ class StudyFile(FileModel):
 def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Scenario, TrainingRecipe]:
     """Load a scenario and a recipe by name or path, and apply the settings ``KEY=VALUE`` to them.
 
-    A setting is applied to whichever of the two has the key. Raises ``InvalidInput`` if a name or key is unknown, or if
-    a value is not allowed.
+    A setting changes the scenario or the recipe, whichever has the key. Raises ``InvalidInput`` if a name or key is
+    unknown, or if a value is not allowed.
     """
     loaded = load_recipe(recipe)
     changes = read_settings(settings, [loaded])
@@ -57,9 +57,9 @@ def load_parts(scenario: str, recipe: str, settings: Sequence[str]) -> tuple[Sce
 
 
 def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
-    """Return which argument makes ``load_parts`` fail: ``recipe``, ``scenario`` or the key of a setting.
+    """Return the argument with which ``load_parts`` fails: ``recipe``, ``scenario`` or the key of a setting.
 
-    Returns an empty text if each argument alone is valid.
+    Returns an empty text if every argument is valid by itself, so that only their combination fails.
     """
     tried: dict[str, Callable[[], object]] = {
         "recipe": partial(load_recipe, recipe),
@@ -75,5 +75,5 @@ def refused_part(scenario: str, recipe: str, settings: Sequence[str]) -> str:
 
 
 def texts_of(values: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a text ``KEY=VALUE``, as for the option ``--set``, for each key and value."""
+    """Return one text ``KEY=VALUE``, as for the option ``--set``, for each entry of ``values``."""
     return tuple(f"{key}={flow_text(value)}" for key, value in values.items())

@@ -1,7 +1,7 @@
-"""A sweep: check the trainings listed in a YAML file, run them on Ray Tune, and write one table of the results.
+"""A sweep: read a list of trainings from a YAML file, run the trainings on Ray Tune, and write one table of results.
 
-The table is computed only from the folders of the trainings. It is the same, byte for byte, whatever the order, the
-computers and the number of attempts of the jobs.
+The table is computed only from the folders of the trainings. Whatever the order, the computers and the number of
+attempts of the jobs, the table is the same, byte for byte.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _GRID: YamlPath = ("grid",)
 class _OneOrMore:
     """Annotation of a list in a file, in whose place a single entry is allowed.
 
-    The annotation changes the JSON schema. A validator turns a single entry into a list.
+    The annotation itself changes only the JSON schema. A validator of the model turns a single entry into a list.
     """
 
     @classmethod
@@ -57,7 +57,7 @@ _Values = Annotated[tuple[Any, ...], Field(strict=False, min_length=1)]
 def _check_keys(value: dict[str, Any]) -> dict[str, Any]:
     for key in value:
         if key in ("seed", "recipe.seed"):
-            raise ValueError("the seed is not given under set; give the key seed next to recipe")
+            raise ValueError("the seed must not be given under set; give it as the key seed, next to the key recipe")
         if "=" in key:
             raise ValueError(f"{flow_text(key, 60)}: a key must not contain the character =; write KEY: VALUE")
     return value
@@ -76,7 +76,7 @@ class Request(NamedTuple):
     seed: int  # seed of the training
 
     def __str__(self) -> str:
-        """Return the place in the file, scenario, recipe, seed and settings of the job as text, for messages."""
+        """Return the job as text, for messages: its place in the file, scenario, recipe, seed and settings."""
         settings = f", {', '.join(self.settings)}" if self.settings else ""
         return f"{_place(self.path)} ({self.scenario}, {self.recipe}, seed {self.seed}{settings})"
 
@@ -116,7 +116,7 @@ class Grid(FileModel):
 
     @property
     def seeds(self) -> Sequence[int]:
-        """All seeds of the trainings."""
+        """All seeds of the trainings, also if the file gives a range."""
         if isinstance(self.seed, SeedRange):
             return range(self.seed.first, self.seed.first + self.seed.count)
         return self.seed
@@ -149,7 +149,7 @@ class SweepFile(StudyFile):
     def requests(self) -> Iterator[Request]:
         """Yield all jobs: first the jobs of the grid, then the jobs of the list ``jobs``.
 
-        The jobs of the grid are ordered by seed, so every combination has a first result early.
+        The jobs of the grid are ordered by seed: all combinations with the first seed come before the second seed.
         """
         if (grid := self.grid) is not None:
             changes = [
@@ -163,9 +163,9 @@ class SweepFile(StudyFile):
             yield Request(("jobs", k), job.scenario, job.recipe, self._texts(job.settings, ("jobs", k)), job.seed)
 
     def where(self, asked: Request, part: str = "") -> str:
-        """Return the file and the line of a requested job, for messages: ``sweep.yaml, line 7``.
+        """Return the place of a requested job in the file, for messages: ``sweep.yaml, line 7``.
 
-        If ``part`` is ``recipe``, ``scenario`` or the key of a setting, the line is the line of this entry of the job.
+        If ``part`` is ``recipe``, ``scenario`` or the key of a setting, the line is the one with this entry of the job.
         """
         path = (*asked.path, "set", part) if part else asked.path
         if part in self.settings:
@@ -205,7 +205,7 @@ class Row:
 
     @property
     def about(self) -> dict[str, Any]:
-        """Table columns that describe the job, by name: hash, scenario, recipe, algorithm, scheme, seed, steps."""
+        """Table entries that describe the job, by column: hash, scenario, recipe, algorithm, scheme, seed, steps."""
         return {
             "hash": self.identity,
             "scenario": self.asked.scenario,
@@ -235,13 +235,13 @@ class SweepPlan:
     def read(cls, path: str | Path) -> Self:
         """Read the file of a sweep, and load the scenario and the recipe of every job.
 
-        Raises ``InvalidInput``, with file, line and job, if a scenario, a recipe or a setting is unknown, if they do
-        not fit together, or if two jobs are the same training.
+        Raises ``InvalidInput``, which names the file, the line and the job, if a scenario, a recipe or a setting is
+        unknown, if they do not fit together, or if two jobs are the same training.
         """
         file = SweepFile.read_as(path, "with a grid or a list of jobs")
         if not 1 <= file.size() <= MOST_JOBS:
             raise InvalidInput(
-                f"{path}: requests {count_of(file.size(), 'job')}; the number of jobs must be from 1 to {MOST_JOBS:,}"
+                f"{path}: the file requests {count_of(file.size(), 'job')}; a sweep has from 1 to {MOST_JOBS:,} jobs"
             )
         rows: list[Row] = []
         firsts: dict[object, tuple[Training, dict[str, dict[str, Any]]]] = {}
@@ -260,7 +260,7 @@ class SweepPlan:
             identity = Training.identity_of(content)
             if identity in seen:
                 raise InvalidInput(
-                    f"{file.where(asked)}: {asked}: is the same training as {seen[identity]}; leave one of them out"
+                    f"{file.where(asked)}: {asked}: is the same training as {seen[identity]}; delete one of the jobs"
                 )
             seen[identity] = asked
             name = f"{first.scenario.name}-{first.recipe.name}-seed{asked.seed}-{identity[:16]}"
@@ -271,7 +271,7 @@ class SweepPlan:
     def folder(path: Path) -> StudyFolder:
         """Return the object that checks and locks the folder ``path`` of a sweep.
 
-        It compares no settings of the whole sweep, because the folder of each job stores the settings of its training.
+        The object compares no settings, because the folder of each job stores the settings of the job's training.
         """
         return StudyFolder(path, "a sweep", writes=(TABLE, FAILURES))
 
@@ -282,13 +282,13 @@ class SweepPlan:
         return TrainingJob(training, path / RUNS / row.name, row.asked.settings)
 
     def train(self, row: Row, path: Path) -> None:
-        """Train the job ``row`` in the sweep's folder ``path`` to its end. An unfinished training continues."""
+        """Train the job ``row`` in the sweep's folder ``path`` to its end, or continue it if it has begun."""
         finish(self.job(row, path))
 
     def results(self, path: Path) -> dict[str, dict[str, Any]]:
         """Return the results of each finished job in the sweep's folder ``path``, by the name of the job.
 
-        The results of a job are the numbers in ``figures.FIGURES`` and ``harm``, by name. Example:
+        The results of a job are its table entries by column: ``harm`` and all of ``figures.FIGURES``. Example:
         ``{"ppo-seed0": {"harm": 7.1, "steps": 400000, ...}}``.
         """
         jobs = ((row.name, self.job(row, path)) for row in self.rows)
@@ -313,7 +313,9 @@ class SweepPlan:
     def run(
         self, path: Path, *, jobs: int | None = None, ray: str = LOCAL, retries: int = 2, tell: OnProgress | None = None
     ) -> SweepResult:
-        """Run the unfinished jobs of the sweep, and write the tables. After Ctrl-C, the tables are written, too.
+        """Run the unfinished jobs of the sweep, and write the tables.
+
+        The tables are also written if Ctrl-C stops the run.
 
         Raises ``InvalidInput`` if another process works in the folder, or if no cluster runs at the address ``ray``.
 
@@ -322,7 +324,8 @@ class SweepPlan:
             jobs: number of jobs that run at once; None: one for each core.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
             retries: number of further attempts at a job whose process is lost.
-            tell: function that is called with the number of ended jobs and the reasons of failures; None: no reports.
+            tell: function that is called with the number of jobs that have ended, and with the reason of each failure;
+                None: no reports.
 
         """
         with self.folder(path).work():
@@ -363,7 +366,7 @@ class SweepPlan:
     ) -> dict[str, str]:
         """Train jobs on Ray, and return the reasons of failures, by the name of the job.
 
-        ``left`` are the indices of the jobs in ``rows``. The other arguments are explained in ``run``.
+        ``left`` are the indices of the jobs in ``rows``. The docstring of ``run`` explains the other arguments.
         """
         with connected(ray, jobs):
             from ray import tune

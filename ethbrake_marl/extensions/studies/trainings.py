@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 def train_all(trainings: Sequence[TrainingJob], jobs: int = 1, tell: OnProgress | None = None) -> bool:
-    """Continue every training to its end. Return False if Ctrl-C stopped a training.
+    """Continue every training to its end. Return False if a training was stopped before its end.
 
-    The policies do not depend on ``jobs`` or on interruptions. Before any training begins, the function raises the
-    exceptions of ``steps_left``. Later it raises the exception of the first training that fails.
+    The trained policies depend neither on ``jobs`` nor on interruptions. The function raises the exceptions of
+    ``steps_left`` before any training begins, and later the exception of the first training that fails.
 
     Args:
         trainings: trainings with their folders.
@@ -59,7 +59,7 @@ class TrainingJob:
 
     @property
     def per_update(self) -> int:
-        """Number of decisions between two updates, summed over all learners."""
+        """Number of decisions of all learners between two updates."""
         return self.training.recipe.n_envs * len(self.training.scenario.learners) * self.training.recipe.rounds
 
     def steps_left(self) -> int:
@@ -71,13 +71,13 @@ class TrainingJob:
         if not run.status.exists():
             if self.folder.exists():
                 raise InvalidInput(
-                    f"{self.folder}: is not the folder of a training; move the folder, or give another --output"
+                    f"{self.folder}: the folder is not that of a training; move the folder, or give another --output"
                 )
             return total
         try:
             status = read_object(run.status)
         except InvalidInput as error:
-            raise InvalidInput(f"{error}; delete its folder to train again") from None
+            raise InvalidInput(f"{error}; delete the run's folder to train again") from None
         check_same_training(run, self.training)
         if status.get("status") == "finished":
             return 0
@@ -85,13 +85,13 @@ class TrainingJob:
         return max(total - (steps if isinstance(steps, int) else 0), 1)
 
     def finish(self, tell: OnProgress | None = None, *, stop_at: StopAt | None = None) -> bool | None:
-        """Continue the training to its end. Return True if it has finished, or None if it was stopped early.
+        """Continue the training to its end. Return True if the training has finished, or None if it was stopped early.
 
         Raises the exceptions of ``train`` and ``resume``.
 
         Args:
             tell: function that is called with the progress; None: no reports.
-            stop_at: function that receives each evaluation, and returns a reason to stop or None.
+            stop_at: function that is called with each evaluation; it returns a reason to stop, or None to continue.
 
         """
         from ethbrake_marl.training.session import resume, train  # torch takes seconds to load
@@ -113,9 +113,9 @@ class TrainingJob:
         return True if ended.status == "finished" else None
 
     def time(self, sample: Sample | None = None) -> Timed:
-        """Measure the time of a few updates of this training, and the time of its policy on 50 worlds.
+        """Measure how long a few updates of this training take, and how long its policies need to drive 50 worlds.
 
-        The policy drives the worlds in ``sample``; None: the first worlds of the list on which the recipe evaluates.
+        The policies drive the worlds in ``sample``; None: the first 50 worlds of the recipe's list for evaluations.
         """
         from ethbrake_marl.training.session import train
 
@@ -139,23 +139,24 @@ class TrainingJob:
             return Timed(self, decision_s, replace(self, folder=path).world_seconds(worlds))
 
     def world_seconds(self, sample: Sample) -> float:
-        """Return the time that the trained policies need to drive one world of ``sample``, s."""
+        """Return the time in s that the trained policies in ``folder`` need for one world of ``sample``."""
         team = {"team": load_team(self.folder, self.training.scenario)}
         drive = partial(evaluate, agents=team, scenario=self.training.scenario, aftermath=False)
         return Timed.each_s(sample.worlds, drive)
 
 
 class Timed(NamedTuple):
-    """Measured speed of a training on one core, in CPU time. Other programs on the machine hardly affect CPU time."""
+    """Measured speed of a training on one core, in CPU time, which other programs on the machine hardly affect."""
 
     job: TrainingJob  # the measured training
     decision_s: float  # training time divided by the number of decisions, s
     world_s: float  # time to evaluate the policies in one world, s
 
     def seconds(self, steps: int) -> float:
-        """Return the estimated time of ``steps`` decisions of this training with its evaluations, s.
+        """Return the estimated time in s of ``steps`` decisions of this training, with the evaluations.
 
-        A training evaluates its policies on the list of the recipe at the start, every few updates, and at the end.
+        The evaluations of a training, on the recipe's list of worlds, take place at the start, every few updates, and
+        at the end.
         """
         recipe = self.job.training.recipe
         times = recipe.total_steps // self.job.per_update // recipe.evaluation.every_updates + 2
@@ -163,9 +164,9 @@ class Timed(NamedTuple):
 
     @staticmethod
     def each_s(worlds: Worlds, work: Callable[[Worlds], object], most: int = 50) -> float:
-        """Measure the time of ``work(worlds)`` on at most ``most`` of the worlds, and return the time per world, s.
+        """Measure the CPU time of ``work`` on at most ``most`` of the worlds, and return the time per world in s.
 
-        The function first runs with one world, so the measured time does not include compilation.
+        ``work`` first runs once with one world, so the measured time does not include compilation.
         """
         work(worlds.take([0]))
         some, started = worlds.take(range(min(worlds.n, most))), time.process_time()

@@ -1,8 +1,8 @@
-"""Run many trials on Ray Tune, each on one core. A trial whose process is lost is tried again.
+"""Run many trials on Ray Tune, each on one core. A trial whose process ends unexpectedly is started again.
 
-Ray stores its state as pickles in a temporary folder, which is removed at the end of the command. ``Tuner.restore`` is
-not used, because it loads pickles that a stranger may have written. Instead, a trial continues from the files in its
-own folder.
+Ray stores its own state as pickles in a temporary folder, which is removed at the end of the command. Ray's
+``Tuner.restore`` is not used, because it loads pickles, which may be unsafe. Instead, an interrupted trial continues
+from the files in its own folder.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ def run_trials(
     retries: int,
     callback: TrialCallback,
 ) -> list[dict[str, Any]]:
-    """Run trials on Ray Tune, and return the last report of each trial that began, in order.
+    """Run trials on Ray Tune, and return the last report of each trial that began, in order of beginning.
 
-    A report is the dictionary that ``work`` passes to ``tune.report``, with Ray's own entries. The entry ``reason`` is
-    the reason why a trial failed. The entry ``done`` is true if Ray has ended the trial. Ctrl-C ends all trials early.
+    A report is the dictionary that ``work`` passes to ``tune.report``, and to which Ray adds entries. If the trial
+    failed, the entry ``reason`` says why. The entry ``done`` is True if the trial has ended. Ctrl-C stops all trials.
     The caller must connect to Ray first (see ``cluster.connected``).
 
     Args:
         work: function that runs a trial in a worker process, called as ``work(config, **given)``.
-        given: keyword arguments of ``work`` that are the same for all trials.
+        given: further keyword arguments of ``work``, the same for all trials.
         folder: folder of all results; every computer of a cluster must see it.
         config: settings of Ray Tune: search algorithm, scheduler and number of trials.
-        space: space of configurations: key -> values that Ray Tune tries.
+        space: for each key of ``config``, the values that Ray Tune tries.
         jobs: number of trials that run at once; None: one for each core.
         retries: number of further attempts at a trial whose process is lost, or that raises an error from outside this
             package.
@@ -80,14 +80,16 @@ def run_trials(
 
 
 def _attempt(config: dict[str, Any], work: Callable[..., None], given: Mapping[str, Any], folder: Path) -> None:
-    """Run one attempt at a trial with the configuration ``config``. ``run_trials`` explains the other arguments.
+    """Run one attempt at a trial with the configuration ``config``.
 
-    An error of this package becomes a report, because Ray would try again after an exception.
+    The docstring of ``run_trials`` explains the other arguments.
+
+    An error of this package is reported as a result, because Ray would repeat the trial after an exception.
     """
     try:
         if not folder.is_dir():
             raise InvalidInput(
-                f"{folder}: the computer {os.uname().nodename} does not see this folder; every computer of the cluster"
+                f"{folder}: the computer {os.uname().nodename} does not have this folder; every computer of the cluster"
                 " must see it under the same path"
             )
         work(config, **given)
@@ -114,7 +116,7 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         return {}
 
     def say(self, note: str = "") -> None:
-        """Report the number of ended trials. ``note`` is a message to print once."""
+        """Report how many trials have ended. ``note`` is a message to print once."""
         self._tell(Progress(self._name, self._done, self._total, note=note))
 
     def on_trial_complete(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
@@ -128,5 +130,5 @@ class TrialCallback(tune.Callback):  # type: ignore[misc]  # Ray ships no types
         self.say("a trial failed after all attempts; the table contains the reason")
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Report that a trial is tried again. Ray calls this method."""
+        """Report that a trial starts again. Ray calls this method."""
         self.say("the process of a trial was lost or failed; the trial is tried again")

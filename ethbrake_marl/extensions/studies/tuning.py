@@ -1,7 +1,7 @@
-"""A tuning: search for the settings of a recipe with the least harm, using Optuna on Ray Tune, and write one table.
+"""A tuning: search with Optuna, on Ray Tune, for settings of a recipe that lead to little harm, and write a table.
 
-The table contains no times and no paths. If only one job runs at a time, the table is the same, byte for byte, however
-often the search was interrupted.
+The table contains no times and no paths. If only one trial runs at a time, the table is the same, byte for byte,
+however often the search was interrupted.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ _Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 def _check_number(value: Any) -> int | float:
-    """Return ``value`` if it is a finite number, else raise ``ValueError``. An ``int`` stays an ``int``."""
+    """Return ``value`` if it is a finite number, else raise ``ValueError``.
+
+    An ``int`` is returned as an ``int``, not as a ``float``.
+    """
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         raise ValueError("the end of a range must be a finite number")
     return value
@@ -68,7 +71,7 @@ _Number = Annotated[int | float, PlainValidator(_check_number), WithJsonSchema({
 
 
 class Range(FileModel):
-    """Range of numbers that a search may try for one setting, from ``low`` to ``high``, both included.
+    """Range of the numbers that a search may try for one setting, from ``low`` to ``high`` inclusive.
 
     If both ends are written without a decimal point, the search tries only whole numbers.
     """
@@ -99,11 +102,11 @@ class Range(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """Both ends of the range. Before the search starts, they are checked against the recipe."""
+        """Both ends of the range. The recipe must accept both ends, which is checked before the search starts."""
         return self.low, self.high
 
     def own(self, value: Any) -> int | float | None:
-        """Return ``value``, the recipe's own value of this setting, as a number; None if the range excludes it."""
+        """Return ``value``, which the recipe has for this setting, as a number; None if it is outside the range."""
         if not isinstance(value, int | float) or isinstance(value, bool) or not self.low <= value <= self.high:
             return None
         if not self.whole:
@@ -119,14 +122,14 @@ class Range(FileModel):
         return FloatDistribution(float(self.low), float(self.high), log=self.log)
 
     def stored(self, value: Any) -> Any:
-        """Return ``value`` as Optuna stores it. For a range, this is the value itself."""
+        """Return ``value`` in the form in which Optuna stores it, which is ``value`` itself for a range."""
         return value
 
     value = stored
 
 
 class Choices(FileModel):
-    """List of values, of any kind, that a search may try for one setting."""
+    """List of the values that a search may try for one setting. The values may be numbers, texts, lists or mappings."""
 
     choices: tuple[Any, ...] = Field(
         strict=False, min_length=2, description="values of any kind that the recipe accepts for this key"
@@ -146,11 +149,11 @@ class Choices(FileModel):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """All choices. Before the search starts, they are checked against the recipe."""
+        """All choices. The recipe must accept every choice, which is checked before the search starts."""
         return self.choices
 
     def own(self, value: Any) -> Any:
-        """Return the choice that equals ``value``, the recipe's own value of this setting; None if no choice does."""
+        """Return the choice that equals ``value``, which the recipe has for this setting; None if there is none."""
         return next((each for each in self.choices if flow_text(each) == flow_text(value)), None)
 
     def distribution(self) -> BaseDistribution:
@@ -178,12 +181,12 @@ Dimension = Annotated[Annotated[Range, Tag("#range")] | Annotated[Choices, Tag("
 def _check_recipe_keys(value: dict[str, Any]) -> dict[str, Any]:
     for key in value:
         if not key or "=" in key:
-            raise ValueError(f"{flow_text(key, 60)}: must be a key of the recipe, such as learning_rate.start")
+            raise ValueError(f"{flow_text(key, 60)}: not a key of the recipe; give a key such as learning_rate.start")
     return value
 
 
 class Measuring(FileModel):
-    """Evaluation of the trials: the list of worlds that policies drive, and the number of evaluations per training."""
+    """How trials are evaluated: the worlds that the policies drive, and the number of evaluations per training."""
 
     # Number of worlds in the list.
     worlds: int = Field(default=1000, ge=1, le=1_000_000, description="number of worlds in the list")
@@ -196,8 +199,8 @@ class Measuring(FileModel):
 class Pruning(FileModel):
     """Rule that stops weak trials early (Ray's median stopping rule).
 
-    A trial is one training. It is stopped at an evaluation if its least harm so far is above the median of the other
-    trials' mean harm up to the same evaluation.
+    A trial is one training. At an evaluation, the mean harm so far of each other trial is computed, up to the same
+    evaluation. The trial is stopped if its own least harm so far is above the median of these means.
     """
 
     # Number of other trials that must have reached an evaluation before a trial may be stopped there.
@@ -222,7 +225,7 @@ class Pruning(FileModel):
 
 
 class Sampling(FileModel):
-    """Method that chooses the values of the next trial: Optuna's TPE, which uses earlier results, or random values."""
+    """Method that chooses the values of the next trial: random choice, or Optuna's TPE, which uses earlier results."""
 
     name: Literal["tpe", "random"] = Field(default="tpe", description="tpe: Optuna's TPE; random: random values")
     # Seed of the proposed values.
@@ -259,9 +262,9 @@ class TuningFile(StudyFile):
     sampler: Sampling = Field(default=Sampling(), description="method that chooses the values of the next trial")
 
     def values(self, proposal: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the values of a proposal in YAML's form, by key.
+        """Return the values of a proposal as the recipe's YAML file would contain them, by key.
 
-        ``proposal`` maps each searched key to its value in Optuna's form.
+        ``proposal`` maps each searched key to its value as Optuna stores it.
         """
         return {key: self.search[key].value(value) for key, value in proposal.items()}
 
@@ -302,7 +305,7 @@ TABLE, TRIALS, PROPOSALS = "trials.csv", "trials", "proposals.json"  # names ins
 
 @dataclass(frozen=True)
 class TuningPlan:
-    """A tuning, checked and loaded: everything that the trials have in common."""
+    """A tuning whose file is checked and loaded: everything that the trials have in common."""
 
     file: TuningFile  # content of the tuning's file
     recipe: TrainingRecipe  # recipe with the file's settings and seed, before any searched value
@@ -366,8 +369,8 @@ class TuningPlan:
     def training(self, values: Values) -> Training:
         """Return the training of a trial with these values of the searched keys.
 
-        Every training has about ``measure.times`` evaluations, so that unfinished trials can be compared. Raises
-        ``InvalidInput`` if the recipe does not allow the values together.
+        Every training has about ``measure.times`` evaluations, so that trials can be compared before they finish.
+        Raises ``InvalidInput`` if the recipe does not allow the combination of values.
         """
         recipe = read_settings(texts_of(values), [self.recipe]).change(self.recipe)
         asked = self.file.measure
@@ -376,11 +379,11 @@ class TuningPlan:
         return Training.of(recipe.replace(evaluation=listed), self.scenario)
 
     def updates(self, recipe: TrainingRecipe) -> int:
-        """Return the number of updates in a whole training with ``recipe``."""
+        """Return the number of updates in a complete training with ``recipe``."""
         return -(-recipe.total_steps // (recipe.n_envs * len(self.scenario.learners) * recipe.rounds))
 
     def own_values(self) -> dict[str, Any] | None:
-        """Return the recipe's own value of each searched key; None if a range or list of choices excludes its value."""
+        """Return the recipe's value of each searched key; None if a range or list of choices excludes one of them."""
         content = self.recipe.model_dump(mode="json")
         own = {key: dimension.own(_value_at(content, key)) for key, dimension in self.file.search.items()}
         return None if None in own.values() else own
@@ -388,7 +391,7 @@ class TuningPlan:
     def example(self) -> str:
         """Return a command line ``ethbrake train ...`` that runs the training of one trial.
 
-        The trial has the recipe's own values if the ranges contain them, else random values.
+        The trial has the values that the recipe itself contains, or random values if the ranges exclude them.
         """
         values = self.own_values() or next(self.file.points(1))
         measured = {"evaluation": self.training(values).recipe.evaluation.model_dump(mode="json")}
@@ -414,16 +417,20 @@ class TuningPlan:
         try:
             self.training(values)
         except InvalidInput as error:
-            raise InvalidInput(f"search, at {', '.join(texts_of(values))}: {error}") from None
+            raise InvalidInput(f"search: the recipe rejects {', '.join(texts_of(values))}: {error}") from None
 
     def folder(self, path: Path) -> StudyFolder:
-        """Return the object that checks and locks the folder ``path``. It refuses the folder of a different tuning."""
+        """Return the object that checks and locks the folder ``path``.
+
+        The object refuses the folder of a tuning with other settings.
+        """
         return StudyFolder(path, "a tuning", self.question, record="tuning.json", writes=(TABLE,))
 
     def proposals(self, path: Path) -> list[Values]:
-        """Return the proposals in the tuning's folder ``path``: the values of each trial so far, in Optuna's form.
+        """Return the proposals in the tuning's folder ``path``: the values of each trial so far, as Optuna stores them.
 
-        Raises ``InvalidInput`` if a proposal has keys or values that ``search`` in the file of the tuning excludes.
+        Raises ``InvalidInput`` if a proposal has other keys or values than the entry ``search`` of the tuning's file
+        allows.
         """
         file, space = path / PROPOSALS, self.file.search
         if not file.exists():
@@ -436,13 +443,13 @@ class TuningPlan:
                     raise ValueError
         except (TypeError, ValueError, AttributeError, LookupError):
             raise InvalidInput(
-                f"{file}: is damaged, because a trial has keys or values that the tuning does not search; delete the"
+                f"{file}: the file is damaged: a trial has keys or values that the tuning does not search; delete the"
                 " folder to start again"
             ) from None
         return [*known]
 
     def job(self, values: Values, path: Path) -> TrainingJob:
-        """Return the training of a trial with these values, with its folder in the tuning's folder ``path``.
+        """Return the training with ``values``, and the folder for this training inside the tuning's folder ``path``.
 
         Trials with equal values share one training and one folder.
         """
@@ -461,18 +468,19 @@ class TuningPlan:
     ) -> TuningResult:
         """Run trials until the folder contains ``trials`` trials, and write their table.
 
-        Every run repeats the search with the stored proposals. The results of finished trainings are read from their
-        folders, and unfinished trainings continue. After Ctrl-C, the table is written, too. Raises ``InvalidInput`` if
-        another process works in the folder, if a file is damaged, or if no cluster runs at the address ``ray``.
+        Every run repeats the search from the first trial, with the proposals that earlier runs have stored. The results
+        of finished trainings are read from their folders, and unfinished trainings continue. The table is also written
+        if Ctrl-C stops the run. Raises ``InvalidInput`` if another process works in the folder, if a file is damaged,
+        or if no cluster runs at the address ``ray``.
 
         Args:
             path: folder of all results; created if necessary.
             trials: number of trials in the folder at the end.
-            jobs: number of trials that run at once; it affects the proposals.
+            jobs: number of trials that run at once; this number affects the proposals.
             ray: address of a Ray cluster; ``local``: Ray is started on this machine.
             retries: number of further attempts at a trial whose process is lost.
-            tell: function that is called with the number of ended trials and the reasons of failures; None: no
-                reports.
+            tell: function that is called with the number of trials that have ended, and with the reason of each
+                failure; None: no reports.
 
         """
         with self.folder(path).work():
@@ -575,7 +583,7 @@ State = Literal["running", "finished", "pruned", "failed"]
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One trial of a tuning (a training with some values of the searched keys), and how it ended."""
+    """One trial of a tuning: a training with certain values of the searched keys, and how it ended."""
 
     number: int  # number of the trial, from 0
     state: State  # state of the trial; ``pruned``: stopped early because of too much harm
@@ -586,7 +594,10 @@ class Trial:
 
     @classmethod
     def of(cls, number: int, values: Values, end: Mapping[str, Any]) -> Trial:
-        """Return the trial ``number`` with these values. ``end`` is the last report of the trial (``run_trials``)."""
+        """Return the trial with this number and these values.
+
+        ``end`` is the last report of the trial (``run_trials``).
+        """
         reason = str(end.get(REASON, ""))
         state: State = "running"
         if reason:
@@ -612,12 +623,15 @@ class TuningResult:
 
     @property
     def interrupted(self) -> bool:
-        """Whether some of the requested trials did not end, because Ctrl-C stopped the run."""
+        """Whether Ctrl-C stopped the run before all requested trials had ended."""
         return len(self.trials) < self.asked or "running" in self.counts
 
     @property
     def best(self) -> Trial | None:
-        """Finished trial with the least harm; the first one if several are equal. None if no trial has finished."""
+        """Finished trial with the least harm, or the first of several with equal harm.
+
+        None if no trial has finished.
+        """
         finished = [each for each in self.trials if each.harm is not None]
         return min(finished, key=lambda each: (each.harm, each.number), default=None)
 
@@ -625,10 +639,11 @@ class TuningResult:
 def do_trial(config: dict[str, Any], plan: TuningPlan, path: Path) -> None:
     """Train one trial to its end in a worker process of Ray, and report every evaluation.
 
-    Ray stops a pruned trial when the trial reports an evaluation.
+    When the trial reports an evaluation, Ray may stop (prune) the trial.
 
     Args:
-        config: configuration of the trial, ``{"trial": number, "values": proposal}``, with values in Optuna's form.
+        config: configuration of the trial, ``{"trial": number, "values": proposal}``, with values as Optuna stores
+            them.
         plan: plan of the tuning.
         path: folder of the tuning.
 
@@ -670,13 +685,13 @@ def _check_searched(key: str, recipe: TrainingRecipe, file: TuningFile) -> None:
             raise InvalidInput(f"search.{key}: the file also sets {other}; delete one of the two keys")
     if read_settings([f"{key}=0"], [recipe]).scenario:
         raise InvalidInput(
-            f"search.{key}: is a key of the scenario; give a key of the recipe, because the harms of trials can be"
+            f"search.{key}: this is a key of the scenario; give a key of the recipe, because the harms of trials can be"
             " compared only in the same scenario"
         )
 
 
 def _value_at(content: Any, key: str) -> Any:
-    """Return the value of a dotted key (``network.policy.0``) in the nested data ``content``; None if it is missing."""
+    """Return the value of a dotted key (``network.policy.0``) in nested data; None if the key is missing."""
     for part in key.removeprefix("recipe.").split("."):
         if isinstance(content, list) and part.isdecimal() and int(part) < len(content):
             content = content[int(part)]

@@ -1,4 +1,4 @@
-"""Measures of how badly an agent does in each world, to search for its worst worlds."""
+"""Measures of how badly an agent does in a world. A search for the worst worlds uses them as scores."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HINDSIGHT = "best_harm"  # default reference agent of the measure regret
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Measurements of an agent in n worlds, in m2/s2."""
+    """Score, harm and reference of an agent in n worlds, in m2/s2."""
 
     score: Floats  # [n] value of the measure, the larger the worse for the agent; minus infinity if the physics failed
     harm: Floats  # [n] harm of the agent; NaN if the physics failed
@@ -40,7 +40,9 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """Measure of how badly an agent does in a world. Calling the measure with a sample measures every world.
+    """Measure of how badly an agent does in a world.
+
+    Call the measure with a sample to compute the score of every world.
 
     There are four measures. ``harm`` is the agent's harm. ``regret`` is the agent's harm minus the harm of a reference
     agent, by default ``best_harm``. ``difference`` is the absolute difference between the harms of the agent and the
@@ -54,10 +56,10 @@ class Measure:
     harm_count: HarmCount  # harm count: the first impact of each pair (``first``) or all impacts (``total``)
 
     def __call__(self, sample: Sample) -> Measured:
-        """Return the measurements in the worlds of ``sample``.
+        """Return the score and the harm of the agent in each world of ``sample``, and the reference harm.
 
-        The score of a world is minus infinity if the physics fails. Raises ``InvalidInput`` for the measure ``bound``
-        if the agent has no shield.
+        If the physics fails, all scores are minus infinity. Raises ``InvalidInput`` for the measure ``bound`` if the
+        agent has no shield.
         """
         n = sample.worlds.n
         score, harm, reference = np.full(n, -np.inf), np.full(n, np.nan), np.full(n, np.nan)
@@ -74,7 +76,7 @@ class Measure:
         beside = other[0].ledger.world_harm(self.harm_count) if other else agent.predicted_harm
         if beside is None:
             raise InvalidInput(
-                f"agent {next(iter(self.agents))!r}: has no shield, but --measure bound compares the harm with the"
+                f"agent {next(iter(self.agents))!r} has no shield, but --measure bound compares the harm with the"
                 " bound of a shield; give an agent with a shield, for instance ppo+step"
             )
         reference[rows] = beside
@@ -87,14 +89,14 @@ class Measure:
     ) -> Falsified:
         """Search the ranges of the scenario for the worlds in which the agent does worst.
 
-        Except for the measure ``bound``, the result contains only worlds with a score above 0, and may be empty. Raises
-        the exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
+        Unless the measure is ``bound``, the result contains only worlds with a score above 0, so it may be empty.
+        Raises the exceptions of ``scenario.ranges``. Raises ``InvalidInput`` if no tried world has a finite score.
 
         Args:
             budget: number of worlds to try.
             seed: seed of the search.
-            most: largest number of worlds in the result; any two of them differ clearly.
-            adaptive: whether to search around the worst worlds so far; False: all worlds are uniform random worlds.
+            most: largest number of worlds in the result; any two of these worlds differ clearly.
+            adaptive: True: search around the worst worlds so far; False: all worlds are uniform random worlds.
             on_round: function that is called with the number of worlds tried so far and ``budget``.
 
         """
@@ -113,7 +115,7 @@ class Measure:
             worst = worst[tried.scores[worst] > 0.0]
         if not np.isfinite(tried.scores).any():
             raise InvalidInput(
-                f"scenario {self.scenario.name!r}: all {budget:,} worlds tried are invalid: in each of them an impact"
+                f"scenario {self.scenario.name!r}: all {budget:,} tried worlds are invalid: in each world an impact"
                 " comes before any agent may act, or the physics fails; set early_impacts: keep in the scenario, or"
                 " give a larger --budget"
             )
@@ -142,7 +144,7 @@ class Measure:
         Args:
             name: name of the measure: ``harm``, ``regret``, ``difference`` or ``bound``.
             agent: spec of the agent.
-            against: spec of the reference agent; None: ``best_harm`` for ``regret``, and none for ``harm`` and
+            against: spec of the reference agent; None: ``best_harm`` for ``regret``, no reference for ``harm`` and
                 ``bound``.
             scenario: scenario whose learners the agents drive.
             harm_count: harm count: the first impact of each pair (``first``) or all impacts (``total``).
@@ -153,7 +155,7 @@ class Measure:
             raise unknown_name("measure", name, MEASURES)
         if name in ("harm", "bound") and against is not None:
             raise InvalidInput(
-                f"--against {against}: --measure {name} compares with no other agent; leave --against out, or use"
+                f"--against {against}: --measure {name} uses no second agent; leave --against out, or use"
                 " --measure regret or difference"
             )
         if name == "difference" and against is None:
@@ -161,5 +163,5 @@ class Measure:
         specs = [agent] if name in ("harm", "bound") else [agent, against or HINDSIGHT]
         lineup = make_lineup(specs, scenario, harm_count=harm_count)
         if len(lineup) != len(specs):
-            raise InvalidInput(f"agent {' or '.join(specs)}: the name means several agents; give one agent")
+            raise InvalidInput(f"agent {' or '.join(specs)}: the name stands for several agents; name one agent")
         return cls(chosen, lineup, scenario, harm_count)

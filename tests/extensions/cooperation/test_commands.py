@@ -47,4 +47,4 @@ def test_ablation__is_refused(line: str, message: str, refuse: Refuse) -> None:
 
 def test_output__is_a_folder_of_its_own(refuse: Refuse) -> None:
     Path("file").write_text("precious")
-    refuse("study ablate --output file/new", "is no folder; give a folder of its own (--output)")
+    refuse("study ablate --output file/new", "is not a folder; give a new folder (--output)")

@@ -32,12 +32,14 @@ NOBODY = PAPER.with_learners([])
 DATASETS: dict[str, Callable[[], object]] = {
     "write_dataset: episodes = 0: must be a whole number, at least 1": lambda: dataset(episodes=0),
     "write_dataset: there are no agents; give at least one": lambda: dataset(agents={}),
-    "a.parquet: a dataset in the format minari is a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
-    "a-v0: a dataset in the format parquet is a file ending in .parquet": lambda: dataset("a-v0", format="parquet"),
+    "a.parquet: a dataset in the format minari must be a folder called NAME-vNUMBER": lambda: dataset(format="minari"),
+    "a-v0: a dataset in the format parquet must be a file ending in .parquet": lambda: dataset(
+        "a-v0", format="parquet"
+    ),
     "brakes: the folder of a Minari dataset must be named NAME-vNUMBER": lambda: dataset("brakes"),
     "nowhere/a.parquet: the folder nowhere does not exist; create it first": lambda: dataset("nowhere/a.parquet"),
     "nowhere/a-v0: the folder nowhere does not exist; create it first": lambda: dataset("nowhere/a-v0"),
-    "has no learner to record: scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
+    "has no learner to record; use scenario.with_learners(['vehicle_2'])": lambda: dataset(scenario=NOBODY),
     "scenario 'cooperation-3-pair' has 2 learners (vehicle_2, vehicle_3)": lambda: dataset("a-v0", scenario=PAIR),
 }
 
@@ -58,7 +60,7 @@ def test_dataset__replaces_nothing_unasked(name: str, make: Callable[[Path], Non
 
 def test_dataset__replaces_no_folder_that_is_none(empty_folder: Path) -> None:
     Path("a-v0").mkdir()
-    with refused("a-v0: is not a Minari dataset, so force does not replace it; give another name"):
+    with refused("a-v0: force replaces only Minari datasets, and this is none; give another name"):
         dataset("a-v0", force=True)
     with refused("unknown format 'csv'; known: minari, parquet", UnknownName):
         dataset(format="csv")

@@ -36,7 +36,7 @@ def test_nondominated__equal_points_do_not_beat_each_other() -> None:
 
 
 def test_volume__of_many_vehicles_is_refused() -> None:
-    with pytest.raises(InvalidInput, match="6 coordinates; give points with at most 5"):
+    with pytest.raises(InvalidInput, match="the points have 6 coordinates, but at most 5"):
         hypervolume(np.zeros((1, 6)), np.ones(6))
 
 

@@ -27,10 +27,10 @@ def experts(**changes: Any) -> Any:
 
 def test_observation_and_network__hold_those_of_the_policy_to_start_from() -> None:
     turned = load_recipe("vine").replace(observation=["own", "front_1", "contact"])
-    with refused("observation: lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
+    with refused("observation lacks rear_1.known, rear_1.gap, rear_1.closing_speed, rear_1.acceleration"):
         widened(eb.load_shipped("ppo"), Training.of(turned, PAPER))
     smaller = load_recipe("vine").replace(network={"policy": [64, 64]})
-    with refused("network: policy_hidden is (64, 64), but (128, 128) in the policy to start from; change the recipe"):
+    with refused("network.policy_hidden is (64, 64), but (128, 128) in the policy of the key start; change the recipe"):
         widened(eb.load_shipped("ppo"), Training.of(smaller, PAPER))
 
 
@@ -62,10 +62,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     "recipe 'vine': reward.shaping = 0.1: must be 0: this algorithm plays tried actions to the end": lambda: (
         TINY_VINE.replace(reward={"harm": 1.0, "shaping": 0.1})
     ),
-    "recipe 'vine': offset.largest = 0.1: must be at least smallest, which is 0.3": lambda: TINY_VINE.replace(
-        offset={"smallest": 0.3, "largest": 0.1}
+    "recipe 'vine': offset.largest = 0.1: must be at least as large as smallest, which is 0.3": lambda: (
+        TINY_VINE.replace(offset={"smallest": 0.3, "largest": 0.1})
     ),
-    "recipe 'vine': gradient_limit = often: must be auto or a finite number above 0": lambda: TINY_VINE.replace(
+    "recipe 'vine': gradient_limit = often: must be 'auto' or a finite number above 0": lambda: TINY_VINE.replace(
         gradient_limit="often"
     ),
     "start = sac@x: must be the name of a shipped policy, for instance ppo, or": lambda: TINY_VINE.replace(
@@ -92,7 +92,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "'policy@shipped/ppo' is now written ppo": lambda: train(
         load_recipe("rollout-classification").replace(policies=["policy@shipped/ppo"], drawn=1), "paper-random", "new"
     ),
-    "recipe 'vine': experts: a mixture of experts can drive one learner only": lambda: train(
+    "recipe 'vine': experts: a mixture of experts can drive only one learner": lambda: train(
         TINY_EXPERTS, PAIR, Path("run")
     ),
 }

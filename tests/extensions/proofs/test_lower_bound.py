@@ -113,7 +113,7 @@ SHIPPED_GAPS = {  # list -> share of the best known first-impact harm that the b
     "paper-distance": 0.02,
     "paper-random": 0.01,
     "paper-random-early": 0.015,
-    "paper-random-brake-only": 0.035,  # see docs/extensions/search.md: all three at once
+    "paper-random-brake-only": 0.035,  # the bound lets all three meet at the same instant
     "paper-delay-low": 0.02,
     "paper-delay-middle": 0.012,
     "paper-delay-high": 0.02,

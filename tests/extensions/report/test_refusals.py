@@ -31,15 +31,15 @@ def scene() -> Any:
 @pytest.mark.parametrize(
     ("films", "message"),
     [
-        (lambda scene: film_bytes({"a": scene}, ".gif", fps=30), "film_bytes: fps = 30: fps must divide 100"),
+        (lambda scene: film_bytes({"a": scene}, ".gif", fps=30), "film_bytes: fps = 30: 100 must be a multiple of fps"),
         (lambda scene: film_bytes({}, ".gif"), "film_bytes: there are no scenes; give at least one film"),
         (
             lambda scene: film_bytes({str(k): scene for k in range(13)}, ".gif"),
-            "film: 13 agents; a film can show at most 12 agents",
+            "film: 13 agents are too many; give at most 12 agents",
         ),
         (
             lambda scene: film_bytes({str(k): scene * 5000 for k in range(2)}, ".gif"),
-            "film of 2 agents for 200 s: the film has 10,000 pictures, but at most 2,500 fit",
+            "film of 2 agents for 200 s: the film needs 10,000 pictures, but at most 2,500 are allowed",
         ),
     ],
     ids=["rate", "none", "too many", "too long"],
@@ -50,7 +50,7 @@ def test_film__is_refused(films: Callable[[Any], bytes], message: str, scene: An
 
 
 FIGURES: dict[str, Callable[[], object]] = {
-    "deceleration_curve: 2 worlds; give exactly one world": lambda: deceleration_curve(
+    "deceleration_curve: world has 2 worlds; give exactly one": lambda: deceleration_curve(
         PAPER.sample(2, 7).worlds, Task(PAPER, (1,))
     ),
     "deceleration_curve: points = 1: the number of points must be at least 2": lambda: deceleration_curve(

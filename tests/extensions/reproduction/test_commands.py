@@ -29,7 +29,7 @@ def test_items__of_the_paper_need_no_torch() -> None:
 REFUSED = [
     ("reproduce harm-delay", "unknown item 'harm-delay'; did you mean 'harm-delays'?"),
     ("reproduce gaps gaps", "item 'gaps' is given twice"),
-    ("reproduce --quick --full", "--quick and --full exclude each other; give one of them"),
+    ("reproduce --quick --full", "--quick and --full cannot be combined; give only one of them"),
     (
         "reproduce gaps --episodes 1",
         "Invalid value for '--episodes': must be greater than or equal to 2 (see: ethbrake reproduce --help)",

@@ -74,7 +74,7 @@ def test_curves__another_training_or_an_edited_scenario_is_told_before_any_is_be
             curves(recipes, "horizon_s: 8", horizon)
     assert (folder / "learning_curves.json").stat().st_mtime_ns == drawn and not (folder / "ppo-seed0").exists()
     # Words change no training: its result is kept.
-    curves(f"{tiny_recipe}:1", 'title: "One line for lists and figures"', 'title: "Another line"')
+    curves(f"{tiny_recipe}:1", 'title: "One-line title for lists and figures"', 'title: "Another line"')
 
 
 def test_recipes__may_lie_in_folders_of_any_name(empty_folder: Path) -> None:

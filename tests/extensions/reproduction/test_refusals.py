@@ -54,9 +54,9 @@ VERDICT = {"what": "all", "outcome": "agrees", "because": "of 25 comparisons 25 
 )
 def test_result__that_was_changed_is_made_again(where: str, changes: dict[str, Any], empty_folder: Path) -> None:
     reproduced({}, changes)
-    with refused(f"out/gaps/result.json: {where}: is missing or wrong; make the result again (--force)"):
+    with refused(f"out/gaps/result.json: the entry {where} is missing or wrong; make the result again (--force)"):
         read_results(Path("out"))
-    with refused(f"out/gaps/result.json: {where}: is missing or wrong; make the result again (--force)"):
+    with refused(f"out/gaps/result.json: the entry {where} is missing or wrong; make the result again (--force)"):
         make_items(
             Reproduction("quick", Path("out"), 24, machine="a machine"),
             [planted("harm-delays", lambda settings: made())],
@@ -87,15 +87,15 @@ def test_figure__that_is_more_than_lines_is_not_shown(
         draw_nothing(patch)
         results = reproduced(drawn(), {})
     Path("out/gaps/a-figure.svg").write_text(f'<svg xmlns="http://www.w3.org/2000/svg">{svg}</svg>')
-    with refused("out/gaps/a-figure.svg: is not a figure as it was drawn; make it again (--force)"):
+    with refused("out/gaps/a-figure.svg: the file is not an SVG figure as this package writes it; draw the figure"):
         render_page(Path("out"), results)
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("ppo", "recipes 'ppo': 'ppo': must be RECIPE:SEEDS, a recipe and its number of seeds, for instance"),
-        ("ppo:0", "recipes 'ppo:0': 'ppo:0': must be RECIPE:SEEDS"),
+        ("ppo", "recipes 'ppo': 'ppo' must have the form RECIPE:SEEDS (number of seeds), for instance"),
+        ("ppo:0", "recipes 'ppo:0': 'ppo:0' must have the form RECIPE:SEEDS"),
         ("ppo:2,ppo:3", "recipes 'ppo:2,ppo:3': two recipes have the same name"),
     ],
 )
@@ -107,10 +107,10 @@ def test_recipes_of_learning_curves__are_refused(text: str, message: str) -> Non
 def test_reproduction__is_written_to_a_folder_of_its_own(empty_folder: Path) -> None:
     Path("mine").mkdir()
     Path("link").symlink_to("mine")
-    with refused("link: is a symbolic link; give a folder (--output)"):
+    with refused("link: this is a symbolic link; give the path of a folder (--output)"):
         open_folder(Reproduction("quick", Path("link"), 24))
     Path("mine/thesis.txt").write_text("years of work")
-    with refused("mine: is there already, and holds no reproduction; give another folder", AlreadyExists):
+    with refused("mine: the folder exists, but does not contain a reproduction; give another folder", AlreadyExists):
         open_folder(Reproduction("quick", Path("mine"), 24), force=True).check()
     assert Path("mine/thesis.txt").read_text() == "years of work"
     with refused("page.html: the name of the file must end in .json"):

@@ -49,11 +49,11 @@ FALSIFIED = [
     ("study falsify --agent coast --budget 0", "Invalid value for '--budget': must be greater than or equal to 1 (see"),
     (
         "study falsify --agent coast --budget 10 --output worst.txt",
-        "worst.txt: a file of worlds must end in .yaml or .yml",
+        "worst.txt: the name of a file with worlds must end in .yaml or .yml",
     ),
     (
         "study falsify --agent coast --budget 10 --measure bound",
-        "agent 'coast': has no shield, but --measure bound compares the harm with the",
+        "agent 'coast' has no shield, but --measure bound compares the harm with the",
     ),
     (
         "study falsify --agent coast --budget 10 --measure difference",
@@ -62,7 +62,7 @@ FALSIFIED = [
     ("study falsify --agent coast --against coast --budget 10", "agent 'coast' is listed twice; list each agent once"),
     (
         "study falsify --agent full_brake --measure harm --against coast --budget 10",
-        "--against coast: --measure harm compares with no other agent; leave --against out",
+        "--against coast: --measure harm uses no second agent; leave --against out",
     ),
     ("study falsify --agent coast --budget 10 --measure hram", "unknown measure 'hram'; did you mean 'harm'?"),
     (
@@ -75,15 +75,15 @@ FALSIFIED = [
     ),
     (
         "study falsify --agent coast --budget 10 --scenario cooperation-2-blocked",
-        "scenario 'cooperation-2-blocked': v2x: draws delays and losses, which no table of worlds holds",
+        "scenario 'cooperation-2-blocked': its v2x channel has delays and losses, which a table",
     ),
     (
         "study falsify --agent coast --budget 10 --scenario paper-scenario-1",
-        "scenario 'paper-scenario-1': draws nothing: all its worlds are the same",
+        "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same",
     ),
     (
         "study falsify --agent ladder --measure harm --budget 8",
-        "agent ladder: the name means several agents; give one agent",
+        "agent ladder: the name stands for several agents; name one agent",
     ),
     ("study sweep nowhere.yaml --output new", "nowhere.yaml: the file does not exist"),
 ]

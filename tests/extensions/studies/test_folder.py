@@ -40,9 +40,9 @@ def test_folder__of_something_else_is_refused_and_what_may_stand_there_may(tmp_p
     (tmp_path / "mine").touch()
     assert folder_of(tmp_path).check()
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(AlreadyExists, match="the folder exists, and is not the folder of sums; give another folder"):
+    with pytest.raises(AlreadyExists, match="the folder exists, but does not contain sums; give another folder"):
         begun(tmp_path)
-    with pytest.raises(InvalidInput, match=r"thesis.tex: .*thesis.tex is no folder; give a folder of its own"):
+    with pytest.raises(InvalidInput, match=r"thesis.tex: .*thesis.tex is not a folder; give a new folder"):
         begun(tmp_path / "thesis.tex")
 
 
@@ -54,7 +54,7 @@ def test_folder__of_another_question_is_refused_with_what_differs(tmp_path: Path
     assert not folder_of(tmp_path / "new", "you").check()  # the record of the first one stays
     assert '"owner": "me"' in (tmp_path / "new" / "question.json").read_text()
     with pytest.raises(
-        AlreadyExists, match=r"is not the folder of curves: it contains question.json of another command"
+        AlreadyExists, match=r"the folder is not for curves: it contains question.json of another command"
     ):
         StudyFolder(tmp_path / "new", "curves").check()
 
@@ -67,7 +67,7 @@ def test_folder__a_file_that_cannot_be_replaced_at_the_end_is_refused_at_once(tm
     folder.check()
     (tmp_path / "sums.csv").unlink()
     (tmp_path / "sums.csv").mkdir()
-    with pytest.raises(InvalidInput, match=r"sums.csv: is a folder; give the name of a file"):
+    with pytest.raises(InvalidInput, match=r"sums.csv: is a folder; give the path of a file"):
         folder.check()
 
 
@@ -228,7 +228,7 @@ LAST = "trainings/cooperation-3-congested-tiny-shared-seed1"
             ('"total_steps": 256', '"total_steps": 512'),
             "this folder contains another training, which differs in recipe total_steps; choose another folder",
         ),
-        (f"{LAST}/run.json", None, "is not the folder of a training"),
+        (f"{LAST}/run.json", None, "the folder is not that of a training"),
         (f"{LAST}/team.json", ('"scheme"', '"shceme"'), "team.json"),
         (f"{LAST}/policy/manifest.json", ("{", "{}"), "manifest.json"),
     ],

@@ -45,7 +45,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml: search: missing; this key is required; docs/extensions/studies.md shows an example": lambda: plan(
         "scenario: paper-random\nrecipe: ppo\n"
     ),
-    "t.yaml, line 4: search, at learning_rate.strat=0.0001: recipe 'ppo': learning_rate.strat: unknown": lambda: plan(
+    "t.yaml, line 4: search: the recipe rejects learning_rate.strat=0.0001: recipe 'ppo': learning_rate": lambda: plan(
         search={"learning_rate.strat": RATE}
     ),
     "must be whole numbers, written without a decimal": lambda: plan(search={"n_epochs": {"low": 1.0, "high": 4.0}}),
@@ -71,7 +71,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 4: search.gamma = {choices: [0.9, 0.9]}: the value 0.9 is listed twice": lambda: plan(
         search={"gamma": {"choices": [0.9, 0.9]}}
     ),
-    "t.yaml, line 4: search, at network.policy=[0]: recipe 'ppo': network.policy[0] = 0: must be greater": lambda: plan(
+    "t.yaml, line 4: search: the recipe rejects network.policy=[0]: recipe 'ppo': network.policy[0] = 0:": lambda: plan(
         search={"network.policy": {"choices": [[8], [0]]}}
     ),
     "t.yaml, line 4: search.seed: this key cannot be searched: a good seed is luck; give one seed for all": lambda: (
@@ -89,7 +89,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 4: search.algorithm: this key cannot be searched: a recipe has the keys of one": lambda: plan(
         search={"algorithm": {"choices": ["ppo", "sac"]}}
     ),
-    "t.yaml, line 4: search.mass_t: is a key of the scenario; give a key of the recipe": lambda: plan(
+    "t.yaml, line 4: search.mass_t: this is a key of the scenario; give a key of the recipe": lambda: plan(
         search={"mass_t": {"low": 1, "high": 2}}
     ),
     "t.yaml, line 4: search.gamma: the file also sets gamma; delete one of the two keys": lambda: plan(
@@ -98,7 +98,7 @@ TUNINGS: dict[str, Callable[[], object]] = {
     "t.yaml, line 8: search.learning_rate.start: the file also sets learning_rate; delete one of": lambda: plan(
         search={"learning_rate.start": RATE, "learning_rate": {"choices": [1, 2]}}
     ),
-    "search, at offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824: recipe 'quick'": lambda: plan(
+    "search: the recipe rejects offset.largest=0.1080873589761303, offset.smallest=0.16819777065410824": lambda: plan(
         recipe="quick",
         search={"offset.smallest": {"low": 0.01, "high": 0.2}, "offset.largest": {"low": 0.1, "high": 0.5}},
     ),
@@ -172,7 +172,7 @@ def sweep(content: Any) -> SweepPlan:
 
 
 SWEEPS: dict[str, Callable[[], object]] = {
-    "s.yaml: requests 0 jobs; the number of jobs must be from 1 to 10,000": lambda: sweep({}),
+    "s.yaml: the file requests 0 jobs; a sweep has from 1 to 10,000 jobs": lambda: sweep({}),
     "s.yaml, line 4: grid.seed = []: must not be empty": lambda: sweep({"grid": {**GRID, "seed": []}}),
     "must be a whole number, written without a decimal point": lambda: sweep({"grid": {**GRID, "seed": ["one"]}}),
     "s.yaml, line 5: grid.seed.cont: unknown key; did you mean count?": lambda: sweep(
@@ -182,7 +182,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "s.yaml, line 5: grid.seed.count = 20000: must be less than or equal to 10000": lambda: sweep(
         {"grid": {**GRID, "seed": {"count": 20_000}}}
     ),
-    "s.yaml: requests 10,001 jobs; the number of jobs must be from 1 to 10,000": lambda: sweep(
+    "s.yaml: the file requests 10,001 jobs; a sweep has from 1 to 10,000 jobs": lambda: sweep(
         {"grid": {**GRID, "seed": {"count": 10_000}}, "jobs": [GRID]}
     ),
     "s.yaml, line 1: grid.scenario: missing; this key is required; docs/extensions/studies.md": lambda: sweep(
@@ -193,7 +193,7 @@ SWEEPS: dict[str, Callable[[], object]] = {
     "recipe 'ppo': reward.terminl: unknown key; did you mean terminal?": lambda: sweep(
         {"set": {"reward.terminl": 1}, "jobs": [GRID]}
     ),
-    "the seed is not given under set; give the key seed next to recipe": lambda: sweep(
+    "the seed must not be given under set; give it as the key seed, next to the key recipe": lambda: sweep(
         {"set": {"seed": 3}, "jobs": [GRID]}
     ),
     's.yaml, line 4: set = {"gamma=0.9, x": 3}: "gamma=0.9, x": a key must not contain': lambda: sweep(
@@ -303,7 +303,7 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "scenario 'paper-scenario-1': has nothing random, so all its worlds are the same": lambda: ranges(
         load_scenario("paper-scenario-1")
     ),
-    "--against coast: --measure harm compares with no other agent; leave --against out": lambda: Measure.of(
+    "--against coast: --measure harm uses no second agent; leave --against out": lambda: Measure.of(
         "harm", "full_brake", "coast", PAPER, "first"
     ),
     "--measure difference compares two agents; give the second agent with --against AGENT": lambda: Measure.of(
@@ -312,7 +312,7 @@ FALSIFICATIONS: dict[str, Callable[[], object]] = {
     "agent 'full_brake' is listed twice; list each agent once": lambda: Measure.of(
         "regret", "full_brake", "full_brake", PAPER, "first"
     ),
-    "agent 'full_brake': has no shield, but --measure bound compares the harm with the": lambda: Measure.of(
+    "agent 'full_brake' has no shield, but --measure bound compares the harm with the": lambda: Measure.of(
         "bound", "full_brake", None, PAPER, "first"
     ).falsify(10, 0),
     "search: budget = 0: must be a whole number, at least 1": lambda: search(lambda points: points[:, 0], 2, 0, 0),

@@ -122,7 +122,7 @@ def test_table__of_a_run_that_is_damaged_is_named(again, capsys, damage: bytes) 
     damaged.write_bytes(damage)
     assert sweep(file, folder) == 2
     (told,) = capsys.readouterr().err.splitlines()
-    assert f"{damaged}: is damaged (" in told and told.endswith("; delete its folder to train again")
+    assert f"{damaged}: is damaged (" in told and told.endswith("; delete the run's folder to train again")
 
 
 def test_run__of_another_training_is_not_done(again, capsys) -> None:
@@ -139,7 +139,7 @@ def test_run__of_another_training_is_not_done(again, capsys) -> None:
 def test_file__that_cannot_be_written_at_the_end_is_told_at_once(write_sweep, tmp_path, capsys, name: str) -> None:
     (tmp_path / "out" / name).mkdir(parents=True)
     assert sweep(write_sweep(grid=GRID), tmp_path / "out") == 2
-    assert f"{name}: is a folder; give the name of a file" in capsys.readouterr().err
+    assert f"{name}: is a folder; give the path of a file" in capsys.readouterr().err
 
 
 @pytest.mark.slow
