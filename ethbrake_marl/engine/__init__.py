@@ -1,1 +1,1 @@
-"""The engine: a batch of running episodes, its compiled step, its stream of worlds."""
+"""The engine: it runs a batch of episodes, with a compiled step and a stream of worlds for new episodes."""

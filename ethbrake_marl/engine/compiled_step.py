@@ -1,7 +1,8 @@
-"""The engine's compiled step: actions to commands, motion, ends of episodes, and the reward that vehicles share.
+"""The compiled step of an engine: it turns actions into commands, moves the vehicles, ends episodes, computes rewards.
 
 Each of n worlds is a row of the arrays ``state`` and ``params``, whose columns ``physics.columns`` defines. The array
-``clock`` [n, 4] contains the time of the first decision, the numbers of steps, and whether the episode has ended.
+``clock`` [n, 4] contains, for each world, the time of the first decision, the number of steps taken, the number of the
+last step, and whether the episode has ended.
 """
 
 from __future__ import annotations
@@ -101,17 +102,17 @@ class Step(NamedTuple):
 
     @property
     def shared(self) -> dict[str, Floats]:
-        """Unweighted reward terms that are the same for all vehicles of a world: name -> value, [n]."""
+        """Reward terms that all vehicles of a world share, unweighted: dictionary from name to values, [n]."""
         return self.params.shared(self.counted_harm, self.outcome[SAFE_END])
 
     @property
     def terms(self) -> dict[str, Floats]:
-        """Every unweighted reward term: name -> value, [n] if it is the same for all vehicles, otherwise [n, N]."""
+        """All reward terms, unweighted: dictionary from name to values, [n] (the same for all vehicles) or [n, N]."""
         return self.shared | self.further
 
     @property
     def counted_harm(self) -> Floats:
-        """Harm that the step added to the whole line: first-impact or total harm, as the reward counts, [n] m2/s2."""
+        """Harm that the step added to the whole line, in the count of harm that the reward uses, [n] m2/s2."""
         return self.first_impact_harm if self.params.harm_count == "first" else self.total_harm
 
     def _is(self, row: int) -> Bools:
@@ -120,11 +121,11 @@ class Step(NamedTuple):
 
 @compiled(apart=True, bare=True)
 def place_row(table: Floats, state: Floats, params: Floats, k: int, pieces: Floats) -> None:
-    """Write quantities that matter only if brakes take time to build up into the ``table`` of world ``k``.
+    """Write into the ``table`` of world ``k`` the quantities that matter only if brakes take time to build up.
 
-    The quantities are accelerations in force and rates of build-up, from row ``k`` of ``state`` and ``params``, and the
-    braking profiles ``pieces`` [N, 2 K]. This is a separate function, because its code would slow down the loop for
-    worlds without build-up.
+    These are the present accelerations and the rates of build-up, both read from row ``k`` of ``state`` and ``params``,
+    and the braking profiles ``pieces`` [N, 2 K] (sequences of K constant commands). If this code were inside the loop
+    of ``step_worlds``, it would slow down worlds without build-up.
     """
     column, N = columns(state), pieces.shape[0]
     command, brake_rate, release_rate = column.command, column.brake_rate, column.release_rate
@@ -146,20 +147,21 @@ def step_worlds(  # noqa: C901  # one loop on purpose: handing these arrays to f
 
     Args:
         state: motion and harm of the worlds, [n, S]; changed in place.
-        params: parameters of the vehicles, [n, K].
-        clock: times and numbers of steps, [n, CLOCK_WIDTH]; changed in place.
+        params: parameters of the vehicles, one row per world, in the layout of ``physics.columns``.
+        clock: times and numbers of steps (see the module), [n, CLOCK_WIDTH]; changed in place.
         actions: actions of the learners, [n, L].
         learners: indices of the learners, [L].
         settings: ``TIME_STEP``, ``HORIZON``, ``HARM_WEIGHT``, ``HARM_IS_TOTAL``, ``TERMINAL_WEIGHT``, [5].
-        no_rows: ``NO_ROWS``, so that no single impact is recorded.
-        builds_up: True if brakes build up in some world, or if a script follows a profile.
-        pieces: braking profiles with K intervals of constant command, [N, 2 K]; used only if ``builds_up``.
-        wanted: commands, [n, N] m/s2; the learners' commands are written.
-        reward: result, reward of each vehicle, [n, N].
-        outcome: result, harm and end of the step in each world, [OUTCOME_ROWS, n].
+        no_rows: ``NO_ROWS``, an empty array of impacts, so that no single impact is recorded.
+        builds_up: True if brakes take time to build up in some world, or if a script follows a braking profile.
+        pieces: braking profiles with K intervals of constant command, [N, 2 K]; used only if ``builds_up`` is True.
+        wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
+        reward: array that receives the reward of each vehicle, [n, N].
+        outcome: array that receives the harm of the step in each world and whether the episode has ended,
+            [OUTCOME_ROWS, n].
 
-    Returns ``(-1, FLAG.DONE)``, or the row of a world and its error: ``BAD_ACTION``, or the status of a world that
-    could not be advanced.
+    Returns ``(-1, FLAG.DONE)`` if all worlds were advanced. Otherwise returns the row of a world and its error:
+    ``BAD_ACTION``, or the status of the physics.
 
     """
     n, N = wanted.shape
@@ -277,13 +279,15 @@ class Rules(NamedTuple):
 
         Args:
             worlds: rows of n worlds; changed in place.
-            clock: times and numbers of steps, [n, CLOCK_WIDTH]; changed in place.
+            clock: times and numbers of steps (see the module), [n, CLOCK_WIDTH]; changed in place.
             actions: actions of the learners in [-1, 1], [n, L].
-            wanted: commands, [n, N] m/s2; the learners' commands are written.
-            reward: result, reward of each vehicle, [n, N].
-            outcome: result, harm and end of the step in each world, [OUTCOME_ROWS, n].
+            wanted: commands of all vehicles, [n, N] m/s2; this function overwrites the learners' commands.
+            reward: array that receives the reward of each vehicle, [n, N].
+            outcome: array that receives the harm of the step in each world and whether the episode has ended,
+                [OUTCOME_ROWS, n].
 
-        The status is ``FLAG.DONE``, ``BAD_ACTION`` (no world was moved), or the code of a check that failed.
+        The status is ``FLAG.DONE``; ``BAD_ACTION`` if an action is outside [-1, 1], so that no world was moved; or the
+        code of a check of the physics that failed.
 
         """
         _, status = step_worlds(

@@ -50,8 +50,9 @@ Actions = Mapping[int, NDArray[np.floating]] | NDArray[np.floating]
 class Watcher(Protocol):
     """Observer that follows an engine's episodes without changing them, for example to record them for a picture.
 
-    The engine stores the watcher's memory together with its own state. State and memory change in a single assignment,
-    so neither has changed after an error or an interrupt. A watcher must therefore never change its memory in place.
+    The engine stores the watcher's memory together with its own state. The engine replaces its state and the watcher's
+    memory in a single assignment, so neither has changed after an error or an interrupt. A watcher must therefore never
+    change its memory in place.
     """
 
     def begun(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
@@ -68,7 +69,7 @@ class Watcher(Protocol):
 
 
 class Ruling(NamedTuple):
-    """Answer of a guard in one step, for n worlds and L learners."""
+    """Answer of a guard (shield) in one step, for n worlds and L learners."""
 
     proposed: Floats  # [n, L] actions that the learners proposed; NaN: none, or not a number
     applied: Floats  # [n, L] actions to apply, in [-1, 1]
@@ -81,9 +82,10 @@ class Ruling(NamedTuple):
 class Guard(Protocol):
     """A shield inside an engine: it replaces proposed actions by the actions that are applied.
 
-    The engine calls the guard inside ``Engine.step``, so no action bypasses the guard. The engine stores the guard's
-    memory together with its own state. State, memory and ruling change in a single assignment, so none of them has
-    changed after an error or an interrupt. A guard must therefore never change its memory in place.
+    The engine calls the guard in every ``Engine.step``, so no action can bypass the guard. The engine stores the
+    guard's memory together with its own state. The engine replaces its state, the guard's memory and the guard's answer
+    in a single assignment, so none of them has changed after an error or an interrupt. A guard must therefore never
+    change its memory in place.
     """
 
     def begin(self, memory: Any, alert: Worlds, rows: Ints) -> Any:
@@ -104,7 +106,7 @@ class Guard(Protocol):
         """
 
     def check(self, ruling: Ruling, after: Engine) -> Any:
-        """Return the memory to keep after the step, or raise ``UncertifiedStep`` to undo the step.
+        """Return the guard's memory after the step, or raise ``UncertifiedStep`` to undo the step.
 
         ``ruling``: the guard's answer before the step. ``after``: the engine after the step.
         """
@@ -112,12 +114,13 @@ class Guard(Protocol):
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
         """Return the guard's information about the last step, for ``info``: dictionary name -> values, [n, N].
 
-        Before the first step of an episode, the information is about the alert. ``running`` is the engine.
+        Before the first step of an episode, the information is about what the guard decided at the alert. ``running``
+        is the engine.
         """
 
 
 class Now(NamedTuple):
-    """Everything that a reset or a step of an engine changes; a single assignment replaces all of it."""
+    """Everything that a reset or a step of an engine changes; the engine replaces all of it in a single assignment."""
 
     state: State  # the running episodes
     roster: Roster  # the world that runs in each row, and the worlds that could not be advanced
@@ -134,10 +137,9 @@ class Now(NamedTuple):
         return self._replace(state=self.state.copy(), roster=self.roster.apart(), stream=copy.copy(self.stream))
 
     def kept(self, packed: Packed) -> Packed:
-        """Return ``packed`` with the same columns as the rows of this engine.
+        """Return the worlds ``packed`` with the same columns as the worlds of this engine.
 
-        Columns for an obstacle and for messages are added if the engine has them, even if these worlds do not need
-        them.
+        Columns for an obstacle and for messages are added if the engine's worlds have such columns.
         """
         return packed.widened(self.obstacle, self.by_link)
 
@@ -145,9 +147,10 @@ class Now(NamedTuple):
 class Engine:
     """A batch of ``n`` running episodes of one scenario.
 
-    A step goes from one decision of the ``deciders`` to the next. The first step begins when the first decider may act.
-    With a ``guard`` (a shield), the applied actions may differ from the proposed actions. If the physics cannot advance
-    a world, its episode is truncated and the ``roster`` lists the world; the other worlds continue.
+    A step goes from one decision of the ``deciders`` to the next. The first step begins when the latency of the first
+    decider has elapsed. With a ``guard`` (a shield), the applied actions may differ from the proposed actions. If the
+    physics cannot advance a world, the world's episode is truncated and ``roster`` lists the world; the other worlds
+    continue.
 
     Args:
         scenario: the scenario of all episodes, or another ``Game``.
@@ -158,10 +161,11 @@ class Engine:
         observation: observation of all vehicles, or a dictionary vehicle name -> observation; None: the observation of
             the scenario.
         seed: seed of the training stream, from which the worlds come if ``worlds`` is None.
-        deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. In an evaluation, which
-            has no learners, the evaluated agents are the deciders.
+        deciders: indices of the vehicles whose decisions delimit the steps; None: the learners. In an evaluation the
+            engine has no learners, so the vehicles that the evaluated agent drives are passed here.
         worlds: worlds of the first episodes, at t = 0; None: the first worlds of the training stream.
-        guard: function that makes the guard of this engine; None: proposed actions are applied unchanged.
+        guard: function that receives this engine and returns its guard (shield); None: proposed actions are applied
+            unchanged.
         reward_vector: components of a vector reward in addition to the reward (``game.reward_vector``); None: no vector
             reward.
 
@@ -188,7 +192,7 @@ class Engine:
         reward_vector: RewardVector | None = None,
     ) -> None:
         if not n >= 1:
-            raise InvalidInput(f"engine: n = {n}: must be at least 1 world")
+            raise InvalidInput(f"engine: n = {n}: the number of worlds must be at least 1")
         self.scenario, self.n = scenario, n
         self.learners = tuple(learners)
         self.scripts = dict(scripts)
@@ -201,7 +205,7 @@ class Engine:
         self.deciders = self.learners if deciders is None else tuple(deciders)
         if not set(self.deciders) <= set(range(scenario.vehicles)):
             raise InvalidInput(
-                f"engine: deciders = {self.deciders}: must be vehicle indices from 0 to {scenario.vehicles - 1}"
+                f"engine: deciders = {self.deciders}: all must be vehicle indices from 0 to {scenario.vehicles - 1}"
             )
         self._terms = Terms(reward, scenario, self.learners or self.deciders, reward_vector)
         self.reward, self.components = self._terms.params, self._terms.components  # components of the vector reward
@@ -221,7 +225,7 @@ class Engine:
         self._now = self._started(stream, None, worlds, {})
 
     def check_time_step(self, drivers: Mapping[int, Script]) -> None:
-        """Raise ``InvalidInput`` if an agent was made for another time between decisions than the scenario's.
+        """Raise ``InvalidInput`` if an agent was made for a time between decisions that differs from the scenario's.
 
         ``drivers`` maps vehicle indices to agents or scripts. An agent without the attribute ``time_step_s`` fits every
         scenario.
@@ -272,9 +276,9 @@ class Engine:
     def _begin(self, rows: Ints, start: Start) -> None:
         """Start episodes in the rows with the indices ``rows``, in place.
 
-        ``start`` contains their worlds at the alert and at the first decision. Scripts, guard and watchers get their
-        first memory. Messages that arrive before the first step are delivered, and scripts that decide before the first
-        step are asked.
+        ``start`` contains the worlds of these episodes, at the alert and at the first decision. Scripts, guard and
+        watchers get their first memory. Messages that arrive before the first step are delivered, and scripts that
+        decide before the first step choose their commands.
         """
         if not self._nobody_refuses_episodes:
             alert, memories = start.alert, self.memories
@@ -313,9 +317,9 @@ class Engine:
         """Advance every running episode by one time step and return the results.
 
         ``actions`` contains a number in [-1, 1] for each learner: an array [n, L] with columns in the order of
-        ``learners``, or a mapping from vehicle index to [n]. With a guard, the mapping may leave learners out. An
-        episode that has ended does not move until ``renew`` or ``reset``. If the guard raises ``UncertifiedStep``,
-        nothing changes.
+        ``learners``, or a mapping from vehicle index to [n]. If the engine has a guard, the mapping may leave out
+        learners that propose no action. An episode that has ended does not move until ``renew`` or ``reset``. If the
+        guard raises ``UncertifiedStep``, nothing changes.
         """
         columns = self._columns(actions)
         if self._nobody_refuses_steps:
@@ -335,11 +339,11 @@ class Engine:
 
     @property
     def _nobody_refuses_steps(self) -> bool:
-        """Whether a step cannot fail, so that the arrays can be changed in place, which is faster."""
+        """Whether a step cannot fail. The engine then changes its arrays in place, which is faster."""
         return not (self.guard or self._now.watched or self._terms.are_foreign or self._own_grid.scripts)
 
     def _columns(self, actions: Actions) -> Floats:
-        """Return the learners' actions as an array [n, L], from an array or a mapping as in ``step``.
+        """Return the learners' actions, which are an array or a mapping as in ``step``, as an array [n, L].
 
         The range of the actions is checked later.
         """
@@ -367,7 +371,7 @@ class Engine:
     def _in_range(self, columns: Floats) -> Floats:
         """Return the actions ``columns`` [n, L], clipped to [-1, 1] where they exceed it by a float32 rounding error.
 
-        Raises ``InvalidInput`` for values farther outside [-1, 1].
+        Raises ``InvalidInput`` for an action that is outside [-1, 1] by more than a rounding error.
         """
         each = [checked_action(columns[:, c], (self.n,), f"vehicle_{i + 1}") for c, i in enumerate(self.learners)]
         return np.stack(each, axis=1) if each else columns
@@ -400,7 +404,7 @@ class Engine:
         return step
 
     def _ask_scripts(self) -> dict[int, Memory]:
-        """Ask the scripts with a memory whose vehicles decide at every step; return vehicle index -> new memory.
+        """Let the scripts with a memory that decide once per step choose commands; return vehicle index -> new memory.
 
         The commands of these scripts are written to ``state.wanted``.
         """
@@ -438,10 +442,9 @@ class Engine:
         return Step(reward, outcome, self.reward, {}), some_failed
 
     def _drive_own_grid(self, columns: Floats) -> Way:
-        """Move the worlds to the last decision that a script makes within the step; return this part of the step.
+        """Move the worlds to the last decision that a script makes between two decisions of the deciders.
 
-        These scripts decide at times of their own, between the decisions of the deciders. ``columns`` [n, L] are the
-        learners' actions.
+        Returns this first part of the step. ``columns`` [n, L] are the learners' actions.
         """
         way = self._own_grid.drive_step(self.state, self._now.rules, self._in_range(columns))
         self._change(memories=way.memories)
@@ -453,7 +456,7 @@ class Engine:
 
         Args:
             step: the step just made; changed in place.
-            harm_before: harm before the step; None if the reward counts the harm of the whole line.
+            harm_before: harm of each pair before the step; None if the reward counts the harm of the whole line.
             start: the worlds before the step; None if the reward has no measure of single impacts.
 
         """
@@ -521,11 +524,11 @@ class Engine:
 
     @property
     def _nobody_refuses_episodes(self) -> bool:
-        """Whether the start of an episode cannot fail, so that the arrays can be changed in place, which is faster."""
+        """Whether the start of an episode cannot fail. The engine then changes its arrays in place, which is faster."""
         return not (self._now.watched or self._remembering or self.guard or self._terms.count_impacts)
 
     def cut(self, step: Step, most_steps: int) -> None:
-        """Truncate the episodes that have taken ``most_steps`` steps.
+        """Truncate the episodes that have taken ``most_steps`` steps or more.
 
         ``step``, the result of the last step, is changed accordingly.
         """
@@ -533,11 +536,11 @@ class Engine:
         step.outcome[TRUNCATED, cut] = self._now.state.clock[cut, ENDED] = 1.0
 
     def segments(self, before: Worlds, last_mps2: Floats) -> Iterator[tuple[Worlds, Floats, Floats]]:
-        """Yield the parts of the last step: usually one part, but a script that decides within the step begins another.
+        """Yield the parts of the last step, which are separated by decisions that scripts made within the step.
 
-        Right after a reset, the parts lead from the alert to the first step. Each part is a tuple: the worlds at the
-        start of the part, the commands that the vehicles followed [n, N] m/s2, and the time at the end of the part [n]
-        s.
+        After a reset and before the first step, the parts lead from the alert to the first decision. Each part is a
+        tuple of the worlds at its start, the commands that the vehicles followed in it [n, N] m/s2, and the time of its
+        end [n] s.
 
         Args:
             before: the worlds at the start of the step.
@@ -551,14 +554,14 @@ class Engine:
         yield before, last_mps2, self.state.time_s.copy()
 
     def protect(self, guard: Guard | None) -> None:
-        """Use this guard from the next reset on; None removes the present guard."""
+        """Use ``guard`` from the next reset on; None removes the present guard."""
         self.guard = guard
         self._now = self._now._replace(state=self._now.state._replace(guarded=None), ruling=None)
 
     def remember(self, guarded: Any) -> None:
-        """Set the memory of the guard, for a caller that moves the worlds by ``place`` instead of ``step``.
+        """Set the memory of the guard; for callers that move the worlds by ``place`` instead of ``step``.
 
-        ``guarded`` is what ``Guard.begin`` or ``Guard.check`` has returned.
+        ``guarded`` is a memory that ``Guard.begin`` or ``Guard.check`` has returned.
         """
         self._now = self._now._replace(state=self._now.state._replace(guarded=guarded))
 
@@ -567,11 +570,11 @@ class Engine:
         return self._now.watched[watcher]
 
     def watch(self, watcher: Watcher, memory: Any) -> None:
-        """Add an observer of the episodes. ``memory`` is the observer's memory until the next episode begins."""
+        """Add a watcher of the episodes; ``memory`` is its memory until the next episode begins."""
         self._now = self._now._replace(watched={**self._now.watched, watcher: memory})
 
     def snapshot(self) -> Arrays:
-        """Return copies of everything that changes while the engine runs, by name, for ``restore``.
+        """Return a dictionary of copies of all arrays that change while the engine runs; ``restore`` takes it.
 
         The snapshot contains the state, the position in the stream of worlds, and the memories of the scripts.
         """
@@ -585,8 +588,8 @@ class Engine:
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Continue exactly from ``arrays``, a ``snapshot`` of an engine of the same scenario, size and scripts.
 
-        Raises ``InvalidInput``, before anything changes, for a missing array, for an array of another shape, and for an
-        engine with a guard, whose memory the snapshot does not contain.
+        Raises ``InvalidInput``, before anything changes, for a missing array and for an array of another shape. Also
+        raises it if the engine has a guard, because a snapshot does not contain a guard's memory.
         """
         if self.guard is not None:
             raise InvalidInput(
@@ -612,7 +615,8 @@ class Engine:
     def _rules_for(self, state: State) -> Rules:
         """Return the settings of steps that advance the worlds of ``state`` instead of this engine's worlds.
 
-        They differ from the present settings if only the worlds of ``state`` have brakes that take time to build up.
+        The settings differ from the settings of this engine if brakes take time to build up in ``state`` but not in the
+        engine's own worlds.
         """
         builds_up = self.scenario.builds_up or state.packed.builds_up or self.in_pieces
         return self._now.rules._replace(builds_up=builds_up)
@@ -625,11 +629,12 @@ class Engine:
 
         Args:
             worlds: n worlds at any time of their episodes.
-            ledger: harm so far; None: no harm.
-            ended: whether each episode has ended, so that no step moves its world, [n]. None: an episode has ended if
-                its world's time is at or after the horizon.
+            ledger: harm and impacts since the episodes began; None: no harm and no impacts.
+            ended: whether each episode has ended, so that no step moves its world, [n]. None: the episodes whose time
+                is at or after the horizon have ended.
 
-        Raises ``InvalidInput`` for another number of worlds or vehicles, and if the reward needs every single impact.
+        Raises ``InvalidInput`` for another number of worlds or vehicles than the engine's, and if the reward needs
+        every single impact.
 
         """
         state = self.state
@@ -653,7 +658,7 @@ class Engine:
         return self.state.copy()
 
     def first_moments(self, count: int) -> tuple[Worlds, State]:
-        """Return the first ``count`` worlds of the training stream: at the alert, and at the first decision."""
+        """Return the first ``count`` worlds of the training stream at the alert, and their state at the first step."""
         stream = copy.copy(self._now.stream)
         stream.restart(self.seed)
         alert, new = stream.take(count).alert, self._unwatched(count, self._now)
@@ -662,13 +667,13 @@ class Engine:
         return alert, new.moment()
 
     def branch(self, state: State) -> Engine:
-        """Return another engine whose episodes continue from ``state``, under the same guard.
+        """Return a new engine whose episodes continue from ``state``, under the same guard.
 
-        This engine does not change. Raises ``InvalidInput`` for a reward with shaping, whose potentials depend on more
-        than the state.
+        This engine does not change. Raises ``InvalidInput`` for a reward with shaping, because potentials of shaping
+        depend on more than the state.
         """
         if self.reward.shaping > 0.0:
-            raise InvalidInput(f"branches: the reward has shaping = {self.reward.shaping:g}; it must be 0 for branches")
+            raise InvalidInput(f"branch: the reward has shaping = {self.reward.shaping:g}; it must be 0 to branch")
         n = len(state.motion)
         roster = Roster(n, self.seed, None)
         roster.warns = False
@@ -689,7 +694,7 @@ class Engine:
 
     @property
     def state(self) -> State:
-        """State of the running episodes. It is not a copy, so do not change it."""
+        """State of the running episodes. The state is not a copy, so do not change it."""
         return self._now.state
 
     @property
@@ -699,17 +704,17 @@ class Engine:
 
     @property
     def packed(self) -> Packed:
-        """Running worlds, packed into two arrays (``physics.columns``). They are not a copy, so do not change them."""
+        """Running worlds as two arrays (layout: ``physics.columns``), without copying; do not change them."""
         return self._now.state.packed
 
     @property
     def wanted_mps2(self) -> Floats:
-        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2. The array is not a copy."""
+        """Acceleration that each vehicle commanded in the last step, [n, N] m/s2, without copying."""
         return self._now.state.wanted
 
     @property
     def ledger(self) -> Ledger:
-        """Harm and number of impacts of the running episodes so far, by pair of vehicles (a copy)."""
+        """Harm and number of impacts of each pair of vehicles since the running episodes began (a copy)."""
         return self._now.state.ledger
 
     @property
@@ -724,7 +729,7 @@ class Engine:
 
     @property
     def roster(self) -> Roster:
-        """Number of the world in each row, and the worlds that the physics could not advance."""
+        """Record of the number of the world in each row, and of the worlds that the physics could not advance."""
         return self._now.roster
 
     @property

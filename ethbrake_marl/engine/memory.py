@@ -1,4 +1,4 @@
-"""Memories of scripts: trees of arrays with one row per world, and checked calls of scripts."""
+"""Memories of scripts (nested tuples and mappings of arrays, one row per world), and calls of scripts with checks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SHAPES = (
 
 
 def map_memory(function: Callable[..., Any], memory: Memory, *others: Memory) -> Memory:
-    """Return a memory in which every array is replaced by ``function(array, ...)``.
+    """Return a copy of a memory in which every array is replaced by ``function(array, ...)``.
 
     ``others`` are memories of the same form; their corresponding arrays are passed as further arguments.
     """
@@ -43,7 +43,7 @@ def take_memory(memory: Memory, rows: Ints) -> Memory:
 
 
 def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
-    """Return a copy of ``memory`` in which the worlds ``rows`` have the memory ``part``.
+    """Return a copy of ``memory`` in which the memory of the worlds with the indices ``rows`` is replaced by ``part``.
 
     Entries that are missing or None in ``part`` keep their old values. Raises ``InvalidInput`` if ``part`` has keys
     that ``memory`` lacks.
@@ -64,19 +64,17 @@ def renew_memory(memory: Memory, rows: Ints, part: Memory) -> Memory:
 def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
     """Return ``memory`` if it is valid; otherwise raise ``InvalidInput``.
 
-    Every array must have ``n`` rows. Arrays of objects are also refused, because a copy still contains the same
-    objects. Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` names the memory in
-    the message.
+    Every array must have ``n`` rows. Arrays of objects are invalid, because a copy of such an array still contains the
+    same objects. Keys of mappings must be identifiers, because a snapshot joins them with dots. ``what`` is the name of
+    the memory for the message.
     """
 
     def check(array: Any) -> Any:
         shape = tuple(getattr(array, "shape", ()))
         if not shape or shape[0] != n:
-            raise InvalidInput(
-                f"{what}: {type(array).__name__} of shape {shape}; its first axis must be the {n} worlds"
-            )
+            raise InvalidInput(f"{what}: {type(array).__name__} of shape {shape}; arrays must have length {n} (worlds)")
         if array.dtype.hasobject:
-            raise InvalidInput(f"{what}: an array of objects; it must contain numbers, booleans or texts")
+            raise InvalidInput(f"{what}: contains an array of objects; arrays must contain numbers, booleans or texts")
         return array
 
     parts = [memory]
@@ -84,7 +82,7 @@ def checked_memory(memory: Memory, n: int, what: str = "state") -> Memory:
         if isinstance(part, Mapping):
             for key in part:
                 if not (isinstance(key, str) and key.isidentifier()):
-                    raise InvalidInput(f"{what}: key {key!r}; must be a name, for instance 'asked_s'")
+                    raise InvalidInput(f"{what}: key {key!r}: must be an identifier, for instance 'asked_s'")
             parts += part.values()
         elif isinstance(part, tuple | list):
             parts += part
@@ -97,7 +95,7 @@ Arrays = dict[str, NDArray[Any]]
 def flat(memory: Memory) -> Arrays:
     """Return the arrays of a memory as a dictionary from path to array.
 
-    For ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. An empty array stands for None.
+    For ``{"a": x, "b": (y, z)}`` the result is ``{"a": x, "b.0": y, "b.1": z}``. None becomes an empty array.
     """
     if isinstance(memory, Mapping | tuple):
         parts = memory.items() if isinstance(memory, Mapping) else enumerate(memory)
@@ -108,7 +106,7 @@ def flat(memory: Memory) -> Arrays:
 def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
     """Return a copy of the memory that ``flat`` wrote to ``arrays`` under the path ``place``, such as ``script.2``.
 
-    Raises ``InvalidInput`` if there is nothing under this path.
+    Raises ``InvalidInput`` if ``arrays`` has no array under this path.
     """
     if place in arrays:
         return np.array(arrays[place]) if arrays[place].shape != (0,) else None
@@ -122,8 +120,8 @@ def unflat(arrays: Mapping[str, NDArray[Any]], place: str) -> Memory:
 def _check_kept(before: Memory, after: Memory, who: str) -> None:
     """Raise ``InvalidInput`` if a call of ``act`` changed the keys, shapes or dtypes of a memory.
 
-    After such a change, single rows could not be restarted. ``before`` and ``after`` are the memory before and after
-    the call. The message begins with ``who``.
+    After such a change, the engine could not restart the episodes of single rows. ``before`` and ``after`` are the
+    memory before and after the call. ``who`` is the beginning of the message.
     """
     began, kinds = (map_memory(lambda array: (array.dtype, *array.shape[1:]), each) for each in (before, after))
     if began != kinds:
@@ -177,9 +175,9 @@ def begin_script(script: Script, alert: Worlds, vehicle: int, scripts: Mapping[i
 def ask_script(script: Script, worlds: Worlds, memory: Memory, vehicle: int) -> tuple[Floats, Memory]:
     """Return a script's command for ``vehicle`` (index, 0 = front), [n] m/s2, and its new memory.
 
-    ``memory`` is the script's memory for these worlds; None for a script without memory. Raises ``AgentFailed``, with
-    script, world, time and shape, if the command is not one number per world. Raises ``InvalidInput``, which names the
-    script, if a user's script raises an exception or changes its own attributes.
+    ``memory`` is the script's memory for these worlds; None for a script without memory. Raises ``AgentFailed``, which
+    names script, world and time, if the script does not return one number per world. Raises ``InvalidInput``, which
+    names the script, if a user's script raises an exception or changes its own attributes.
     """
     remembers = hasattr(script, "begin")
     try:
@@ -231,13 +229,13 @@ def _who(script: Script, vehicle: int) -> str:
 def _named(error: Exception, script: Script, what: str, worlds: Worlds, vehicle: int) -> Exception:
     """Return the exception to raise in place of ``error``, which a script raised.
 
-    The result is an ``InvalidInput`` that names the script. Errors of this package, and errors from scripts of this
-    package, are returned unchanged.
+    The result is an ``InvalidInput`` that names the script. An ``error`` that is an exception class of this package, or
+    that a script of this package raised, is returned unchanged.
 
     Args:
         error: the exception.
         script: the script.
-        what: name of the method that raised it.
+        what: name of the method that raised the error.
         worlds: the worlds that were passed to the method.
         vehicle: index of the script's vehicle.
 
@@ -259,7 +257,7 @@ def within_capacity(
         worlds: n worlds.
         vehicle: index of the vehicle (0 = front).
         script: the script, for the message.
-        due: whether the command is checked in each world, [n]; None: it is checked in all worlds.
+        due: whether to check the command in each world, [n]; None: check it in all worlds.
 
     """
     low, high = -worlds.vehicles.braking_capacity_mps2[:, vehicle], worlds.vehicles.driving_capacity_mps2[:, vehicle]

@@ -1,7 +1,7 @@
-"""Scripts that decide on a time grid of their own, at moments between the engine's steps.
+"""Scripts that decide at their own regular times, which lie within the engine's steps.
 
-A script's own grid begins when the latency of its vehicle has elapsed; the engine's steps begin with the first decision
-of its *deciders*, the learners or the evaluated agents.
+The decisions of a script begin when the latency of its vehicle has elapsed. The engine's steps begin with the first
+decision of the *deciders*, which are the learners or the evaluated agents.
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ class Way(NamedTuple):
 
 
 class OwnGrid:
-    """Scripts with a memory that decide within an engine's steps.
+    """Scripts with a memory whose decisions fall between the decisions of an engine's deciders.
 
-    Each script decides when the latency of its vehicle has elapsed, and every time step from then on. An engine's step
-    goes from one decision of its deciders (the learners or the evaluated agents) to the next, so the script of another
-    vehicle decides within the step.
+    Each script first decides when the latency of its vehicle has elapsed, and then after every time step. An engine's
+    step goes from one decision of its deciders (the learners or the evaluated agents) to the next, so a script with
+    another latency decides within the step.
 
     Args:
         scripts: dictionary from vehicle index to script.
@@ -83,7 +83,7 @@ class OwnGrid:
         self._time_step_s, self._horizon_s = time_step_s, horizon_s
 
     def drive_step(self, state: State, rules: Rules, actions: Floats) -> Way:
-        """Let the scripts decide within the step that begins, and return this first part of the step.
+        """Let the scripts decide within the step that begins; return the result of this first part of the step.
 
         ``state`` is changed in place: each world is moved to its last decision that changed a command. ``rules``:
         settings of the step. ``actions``: actions of the learners, [n, L].
@@ -98,9 +98,9 @@ class OwnGrid:
         return way._replace(in_force=in_force)
 
     def drive_to_start(self, state: State, rules: Rules, rows: Ints, start_s: Floats) -> Way:
-        """Let the scripts decide from the alert to the first step of new episodes, and return this part.
+        """Let the scripts decide between the alert and the first step of new episodes; return their result (``Way``).
 
-        Learners and deciders coast until the first step, and other vehicles see them coast.
+        Learners and deciders coast until the first step, and the scripts observe this.
 
         Args:
             state: all running episodes, with the new episodes at the alert. The new episodes are moved to their first
@@ -124,11 +124,11 @@ class OwnGrid:
         return way
 
     def _decide(self, state: State, rules: Rules, running: Bools, until_s: Floats, actions: Floats) -> Way:
-        """Make all decisions of the scripts before ``until_s`` [n], and return this part of the step.
+        """Make all decisions of the scripts before ``until_s`` [n]; return the result of this part of the step.
 
-        Only the ``running`` [n] worlds of ``state`` are advanced, in place. A world is moved to a decision only if this
-        decision changes a command, because the rounding of the motion depends on where it is interrupted. ``rules``:
-        settings of the step. ``actions``: actions of the learners, [n, L].
+        Only the worlds of ``state`` that the mask ``running`` [n] marks are advanced, in place. A world is moved to a
+        decision only if this decision changes a command, because the rounding of the motion depends on where it is
+        interrupted. ``rules``: settings of the step. ``actions``: actions of the learners, [n, L].
         """
         motion, params, _, wanted_so_far, *_ = state
         (n, N), column = wanted_so_far.shape, state.packed.column
@@ -172,10 +172,10 @@ class OwnGrid:
     def _look_ahead(
         self, state: State, rules: Rules, until_s: Floats, decision_s: Floats, actions: Floats
     ) -> tuple[Packed, Floats, Floats]:
-        """Return copies of the worlds at ``until_s``, their reward [n, N] and outcome [OUTCOME_ROWS, n] up to then.
+        """Return copies of the worlds, advanced to ``until_s``, with their reward [n, N] and outcome [OUTCOME_ROWS, n].
 
         Args:
-            state: the worlds; only the learners' commands in ``wanted`` are changed.
+            state: the worlds; only the learners' commands in its array ``wanted`` are changed.
             rules: settings of the step.
             until_s: times, [n] s; a world whose time is not before ``until_s`` does not move.
             decision_s: time of the deciders' next decision, [n] s; periodic messages depend on it.

@@ -1,4 +1,4 @@
-"""Command profiles of whole episodes and their harm: the optimisation problem that searches and shields solve.
+"""Search problem of searches and shields: which command profiles of whole episodes cause the least harm?
 
 A *profile* contains the commands of the controlled vehicles from the first decision to the horizon, in at most K
 phases. A *phase* is an interval of constant command that ends at a decision.
@@ -26,7 +26,7 @@ MOST_PHASES = 12
 
 
 class SearchWorld(NamedTuple):
-    """One world of a ``ProfileProblem``, prepared for running candidate profiles."""
+    """One world of a ``ProfileProblem``, prepared for simulating candidate profiles."""
 
     episode: Episode  # working memory in which the world is simulated (``physics.episode``)
     bounds: Floats  # [C, 2] smallest and largest command of each controlled vehicle (m/s2)
@@ -38,7 +38,7 @@ def copy_rows(rows: Floats, to_rows: Floats, n: int) -> None:
     """Copy the first ``n`` rows of ``rows`` to the first ``n`` rows of ``to_rows``, element by element.
 
     Both arrays have at least ``n`` rows and the same columns. An assignment of slices would take ten times longer to
-    compile, because of its error message.
+    compile, because numba also compiles its error message.
     """
     for k in range(n):
         for c in range(rows.shape[1]):
@@ -74,12 +74,12 @@ class ProfileProblem(NamedTuple):
         return len(self.start)
 
     def take(self, rows: Ints) -> ProfileProblem:
-        """Return the problem restricted to the worlds with the indices ``rows``."""
+        """Return the search problem of only the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self._fields[1:]}
         return self._replace(**arrays)
 
     def put(self, rows: Ints, new: ProfileProblem) -> ProfileProblem:
-        """Return a copy in which the worlds of ``new`` replace the worlds with the indices ``rows``, in order."""
+        """Return a copy in which the worlds of ``new``, in order, replace the worlds with the indices ``rows``."""
         arrays: dict[str, Any] = {name: getattr(self, name).copy() for name in self._fields[1:]}
         for name, array in arrays.items():
             array[rows] = getattr(new, name)
@@ -94,8 +94,8 @@ class ProfileProblem(NamedTuple):
         """Return profiles of constant commands.
 
         ``commands_mps2`` [n, Q, C] are Q constant commands for each world and controlled vehicle. The result has n * Q
-        profiles, in the order of the first two axes. Each profile has ``MOST_PHASES`` phases with the same command, so
-        that a search can change them later.
+        profiles: first the Q profiles of world 0, then the Q profiles of world 1, and so on. Each profile has
+        ``MOST_PHASES`` phases with the same command, so that a search can change them later.
         """
         n, Q, C = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -110,17 +110,17 @@ class ProfileProblem(NamedTuple):
     def even_grid(self, number: int) -> Floats:
         """Return ``number`` evenly spaced commands of each vehicle, [n, number, C] m/s2.
 
-        The commands include the vehicle's smallest and largest command. Rounding cannot lead beyond the largest
-        command.
+        The commands include the vehicle's smallest and largest command. No command exceeds the largest command by a
+        rounding error.
         """
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
         return np.asarray(np.minimum(low + share * (high - low), high), np.float64)
 
     def minimising(self, weights: Floats, *, largest: bool = False) -> ProfileProblem:
-        """Return the same problem, in which a search minimises weighted harm of the vehicles.
+        """Return a copy of this problem in which a search minimises the weighted harm of the vehicles.
 
-        The count of harm (first-impact or total) does not change, and ``identity`` does not depend on the weights.
+        The count of harm (first-impact or total) stays the same. ``identity`` stays the same, too.
 
         Args:
             weights: weight of the harm that each vehicle bears, at least 0, [n, N], without a column for an obstacle.
@@ -146,10 +146,10 @@ class ProfileProblem(NamedTuple):
         return line_sum(first, np.zeros(self.n)), line_sum(total, np.zeros(self.n))
 
     def values(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the value that a search minimises, for one profile per world: count of harm -> value, [n] m2/s2.
+        """Return the value that a search minimises, for one profile per world: {count of harm: value, [n] m2/s2}.
 
-        The value is the harm of the line, the weighted sum of the harms that its vehicles bear, or the largest of these
-        weighted harms. Raises the same errors as ``follow``.
+        The value is the harm of the line or, after ``minimising``, the sum or the largest of the vehicles' weighted
+        harms. Raises the same errors as ``follow``.
         """
         if (self.clock[:, CLOCK.AIM] == WHOLE).all():
             return dict(zip(HARM_COUNTS, self.follow(profiles), strict=True))
@@ -163,7 +163,7 @@ class ProfileProblem(NamedTuple):
         return harms
 
     def borne(self, profiles: Profiles) -> dict[HarmCount, Floats]:
-        """Return the harm that each vehicle bears under one profile per world: count of harm -> harm, [n, N] m2/s2.
+        """Return the harm that each vehicle bears under one profile per world: {count of harm: [n, N] m2/s2}.
 
         There is no column for an obstacle. The harm equals the harm in the engine to the last bit. Raises the same
         errors as ``follow``.
@@ -193,8 +193,8 @@ class ProfileProblem(NamedTuple):
     def check(self, profiles: Profiles) -> None:
         """Raise ``InvalidInput`` for profiles that do not fit this problem.
 
-        There must be one profile per world. Commands must be within the capacities. Phases must end in order, and the
-        last phase must end at the last step.
+        There must be one profile per world. Commands must be within the capacities. No phase may end before the
+        previous phase, and the last phase must end at the last step.
         """
         n, C = self.n, len(self.vehicles)
         K = profiles.ends.shape[-1]
@@ -213,7 +213,7 @@ class ProfileProblem(NamedTuple):
             profiles.ends[:, -1] == self.last_step
         ).all()
         if not ordered:
-            raise InvalidInput("profiles: phases must end in order, and the last phase must end at the last step")
+            raise InvalidInput("profiles: phases must end one after the other, the last one at the last step")
 
 
 def profile_problem(
@@ -232,19 +232,19 @@ def profile_problem(
     Args:
         worlds: n worlds.
         vehicles: indices of the controlled vehicles (0 = front).
-        harm_count: harm that is minimised: ``first`` (first-impact harm) or ``total`` (total harm).
+        harm_count: count of harm to minimise: ``first`` (first-impact harm) or ``total`` (total harm).
         horizon_s: end of the episodes, s.
         time_step_s: time between two decisions, s.
         others_mps2: constant commands of the other vehicles, [n, N] m/s2 (columns of ``vehicles`` are ignored); None:
             full braking.
-        deciders: indices of the vehicles that determine the first decision, which is at their smallest latency, or at
-            the worlds' time if this is later. None: ``vehicles``.
+        deciders: indices of the vehicles whose smallest latency is the time of the first decision. If this time has
+            passed in a world, the first decision is at the world's present time. None: ``vehicles``.
         written_out: whether every world gets an obstacle as the vehicle in front (``Worlds.with_obstacle``) even if no
             world has an obstacle. An added obstacle is out of reach. If some world has an obstacle, every world gets
             one.
 
-    Raises ``InvalidInput`` without vehicles, and for a repeated or unknown vehicle, an unknown harm count, a command
-    beyond capacity, or a horizon before the first decision.
+    Raises ``InvalidInput`` if ``vehicles`` is empty, and for a repeated or unknown vehicle, an unknown harm count, a
+    command beyond capacity, or a horizon before the first decision.
 
     """
     chosen = _checked_vehicles(vehicles, worlds.N)
@@ -300,7 +300,7 @@ def profile_problem(
 
 
 def identities(worlds: Worlds, command: Floats, clock: Floats, vehicles: Ints) -> UInt64s:
-    """Return a hash of each world's problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
+    """Return a hash of each world's search problem, [n]: 8 bytes of BLAKE2b over everything that the harm depends on.
 
     The harm depends on the world's state and parameters, the other vehicles' ``command`` [n, N], the times of decisions
     and the horizon in ``clock`` [n, CLOCK.WIDTH], and the indices ``vehicles`` of the controlled vehicles. The hash
@@ -345,7 +345,7 @@ def _checked_vehicles(vehicles: Sequence[int], N: int) -> Ints:
 class Profiles(NamedTuple):
     """One profile per world: ``commands_mps2[k, j]`` is in force from decision ``ends[k, j - 1]`` to ``ends[k, j]``.
 
-    Unused phases are empty: they end at the last step, like the phase before them.
+    Phases that are not needed are empty: they begin and end at the last step.
     """
 
     ends: Ints  # [n, K] number of the decision at which each phase ends
@@ -365,7 +365,7 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int) -> list[Profiles]:
-        """Return copies of all ``parts`` with the same number of phases, at least ``least``.
+        """Return copies of all ``parts`` with the same number of phases, which is at least ``least``.
 
         The added phases are empty: they end at the end of the last phase.
         """

@@ -49,7 +49,7 @@ class State(NamedTuple):
 
     @property
     def ledger(self) -> Ledger:
-        """Harm and number of impacts of the episodes so far, by pair of vehicles (a copy)."""
+        """Harm and number of impacts of each pair of vehicles since the episodes began (a copy)."""
         packed, column = self.packed, self.packed.column
         params = packed.params
         weight = params[:, column.harm_weight : column.own_latency]
@@ -72,11 +72,11 @@ class State(NamedTuple):
     def join(states: list[State]) -> State:
         """Return one state with the rows of several states, one after the other.
 
-        All states must come from one engine. Raises ``InvalidInput`` if this engine has a guard, because memories of
-        guards cannot be joined.
+        All states must come from one engine. Raises ``InvalidInput`` if the engine has a guard (shield), because
+        memories of guards cannot be joined.
         """
         if states[0].guarded is not None:
-            raise InvalidInput("moments: their engine has a shield, whose memory cannot be joined; remove the shield")
+            raise InvalidInput("states: the engine has a shield, whose memories cannot be joined; use no shield")
         joined = State(*map_memory(lambda *parts: np.concatenate(parts), *(state[:6] for state in states)))
         impacts = [state.impacts for state in states if state.impacts is not None]
         return joined._replace(impacts=EpisodeImpacts.join(impacts) if impacts else None)

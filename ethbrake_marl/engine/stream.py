@@ -45,7 +45,7 @@ class Start(NamedTuple):
 
 
 class FailedWorld(UserWarning):
-    """Warning: a world could not be advanced, so its episode was truncated. The other worlds continue."""
+    """Warning that a world could not be advanced, so that its episode was truncated. The other worlds continue."""
 
 
 class Roster:
@@ -54,9 +54,9 @@ class Roster:
     Args:
         n: number of rows.
         seed: seed of the stream of worlds.
-        first: number in the stream of the world in row 0; the next worlds are in the next rows. None: the caller passed
-            the worlds, and they have no numbers.
-        given: the worlds that the caller passed, at the alert; None: the worlds come from the stream.
+        first: number, in the stream, of the world in row 0; row k has world ``first + k``. None: the worlds have no
+            numbers, because the caller passed them.
+        given: the worlds at the alert, if the caller passed them; None: the worlds come from the stream.
 
     """
 
@@ -83,7 +83,7 @@ class Roster:
             del self.failed[row]
 
     def mark(self, status: Ints, from_s: Floats, until_s: Floats) -> None:
-        """Record the worlds that a step could not advance, and warn of them with ``FailedWorld``.
+        """Record the worlds that a step could not advance, and give a ``FailedWorld`` warning.
 
         Args:
             status: status of the physics, [n]; 0 for a world without failure.
@@ -102,12 +102,12 @@ class Roster:
 class Stream:
     """The training worlds of a seed, one after the other, each advanced to its first decision.
 
-    Until the first decision, learners and scripts with a memory coast. An engine whose scripts decide earlier advances
-    the worlds again from the alert.
+    Until the first decision, learners and scripts with a memory coast. If scripts decide before the first step, the
+    engine therefore advances the worlds from the alert again.
 
     Args:
         scenario: the scenario from which worlds are drawn.
-        deciders: indices of the vehicles (0 = front); the first decision is when the first decider may act.
+        deciders: indices of the vehicles (0 = front); the first decision is at the smallest latency of these vehicles.
         scripts: dictionary from the index of each scripted vehicle to the vehicle's script.
         seed: seed of the stream.
 
@@ -123,7 +123,7 @@ class Stream:
         self.restart(seed)
 
     def restart(self, seed: int, position: int = 0) -> None:
-        """Continue with world number ``position`` of the stream of ``seed``."""
+        """Make world number ``position`` of the stream of ``seed`` the next world."""
         self.seed, self._drawn = seed, position
         self._pool: Start | None = None
         self._next = 0
@@ -143,10 +143,10 @@ class Stream:
         return taken
 
     def _fill(self, count: int) -> None:
-        """Draw and prepare at least ``count`` more worlds; worlds that were not taken yet come first.
+        """Draw and prepare worlds, so that at least ``count`` worlds can be taken; append them to worlds not taken yet.
 
-        If a world cannot be advanced to its first decision, the next world that can be advanced replaces it, with a
-        ``FailedWorld`` warning. The other worlds therefore keep their positions in the stream.
+        If a world cannot be advanced to its first decision, the next world that can be advanced replaces it, and a
+        ``FailedWorld`` warning is given. The positions of the other worlds in the stream therefore do not change.
         """
         first, size = self.position, max(4 * count, SAMPLED_AT_ONCE)
         alert = self._scenario.sample(size, self.seed, first=self._drawn, channel="training").worlds
@@ -201,7 +201,7 @@ def check_alert(worlds: Worlds, n: int, vehicles: int) -> None:
 
 
 def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
-    """Return worlds advanced from the alert to their first decision, packed with the harm until this time.
+    """Return worlds advanced from the alert to their first decision, with the harm of this time, as packed arrays.
 
     Args:
         alert: n worlds at t = 0.
@@ -214,7 +214,7 @@ def moved(alert: Worlds, wanted: Floats, start_s: Floats) -> Packed:
 
 
 def packed_with(worlds: Worlds, harm: Impacts | Ledger) -> Packed:
-    """Return ``worlds`` packed into two arrays (``physics.columns``), with ``harm`` as their harm so far."""
+    """Return ``worlds`` as two arrays (layout: ``physics.columns``), with the harm since the alert set to ``harm``."""
     packed = Packed.of(worlds)
     column, pairs = packed.column, worlds.N - 1
     for group, values in enumerate((harm.first_impact_harm, harm.total_harm, harm.count)):

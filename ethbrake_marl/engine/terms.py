@@ -20,15 +20,15 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Terms:
-    """The reward of a batch: adds to every step the terms that the compiled step does not know.
+    """Reward of a batch of episodes: adds to every step the reward terms that the compiled step does not know.
 
-    An *objective* says whose harm a vehicle's reward counts; without an objective, the harm of the whole line counts.
-    *Shaping* adds differences of a potential.
+    An *objective* says whose harm a vehicle's reward includes; without an objective, this is the harm of the whole
+    line. *Shaping* adds to the reward the change of a function of the state, the *potential*.
 
     Args:
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         scenario: scenario whose objective is used if the reward has none.
-        learners: indices of the vehicles (0 = front) that learn, or that an evaluated agent controls.
+        learners: indices of the vehicles (0 = front) that learn or, in an evaluation, that the evaluated agent drives.
         vector: components of a vector reward (``game.reward_vector``); None: rewards are numbers.
 
     """
@@ -53,7 +53,7 @@ class Terms:
 
     @property
     def shared_harm(self) -> float:
-        """Weight of the whole line's harm, which the compiled step counts; 0 if each vehicle has its own objective."""
+        """Weight of the whole line's harm in the compiled step's reward; 0 if each vehicle has its own objective."""
         return 0.0 if self._objectives else self.params.harm
 
     def vector(self, step: Step, before: Ledger, state: State) -> Floats:
@@ -74,15 +74,15 @@ class Terms:
         impacts_before: EpisodeImpacts | None,
         worlds: Worlds | None,
     ) -> State:
-        """Add the further terms to the reward of a step, in place, and return the state with its new potentials.
+        """Add the reward terms of this class to the reward of a step, in place; return the state with new potentials.
 
-        Episodes that had ended before the step get no reward.
+        Episodes that had ended before the step get the reward 0.
 
         Args:
             step: results of the compiled step; ``further`` and ``reward`` are changed.
             state: state after the step.
             scenario: the scenario.
-            before: harm before the step; None without objectives.
+            before: harm before the step; None if there are no objectives.
             impacts_before: impacts of the episodes before the step; None if no measure needs them.
             worlds: worlds after the step if the reward is shaped, otherwise None.
 

@@ -22,7 +22,7 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints, Worlds, checked_num
 
 @compiled
 def finite_among(values: Floats) -> int:
-    """Return how many entries of ``values`` [n] are below infinity."""
+    """Return the number of entries of ``values`` [n] that are below infinity."""
     count = 0  # this kind of loop is compiled to vector instructions
     for k in range(values.size):
         count += 1 if values[k] < math.inf else 0
@@ -36,7 +36,7 @@ def advance_worlds(
     command: Floats, until: Floats, braking: Floats, driving: Floats, latency: Floats, mass: Floats, limit: Floats,
     restitution: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats, failed: Ints, at: int, rows: Floats,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Advance every world to its time ``until``, in place; return the number of impacts and whether the input is valid.
+    """Advance every world to its time ``until``, in place; return the number of impacts and if the input is valid.
 
     A world that fails keeps its state; the other worlds are advanced. The second result is False if some ``until`` or
     command is invalid. Arguments that are not listed are fields of ``Worlds`` and ``Vehicles`` under short names, for
@@ -112,7 +112,7 @@ def advance(
     record: bool = False,
     threads: int = 1,
 ) -> tuple[Worlds, Impacts]:
-    """Advance ``worlds`` exactly, each under constant commands, and return the new worlds and their impacts.
+    """Advance ``worlds`` exactly under constant commands, and return the new worlds and their impacts.
 
     Raises ``InvalidInput`` for an invalid command, end time or ``threads``, and ``PhysicsError``, which lists the
     failed worlds, if a check of the kernel fails.
@@ -162,7 +162,7 @@ def advance(
 
 
 class _Part(NamedTuple):
-    """Result of the kernel ``advance_worlds`` for a contiguous part of the worlds."""
+    """Result of the kernel ``advance_worlds`` for a contiguous slice of the worlds."""
 
     first: int  # row in the whole batch of the part's first world
     rows: Floats  # [capacity, LISTED.WIDTH] recorded impacts; worlds are numbered within the part

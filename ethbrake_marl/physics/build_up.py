@@ -5,11 +5,11 @@ vehicle or pair.
 
 The *force* of a vehicle (row FORCE) is the acceleration that its brakes or engine alone would cause at the moment. The
 force falls at the rate BRAKE_RATE and rises at the rate RELEASE_RATE until it equals the command; before the latency
-has elapsed, the command counts as 0. The force also changes while the vehicle stands, is held, or is struck.
+has elapsed, the command counts as 0. The force also changes while the vehicle stands.
 
 A *body* is a vehicle, or several touching vehicles that move together. Between events each body has a constant jerk.
 There are two kinds of events that ``physics.constant_motion`` does not have: a force reaches its command or passes 0,
-and touching vehicles separate or a body that was held starts to move.
+and touching vehicles separate or a body that its brakes held starts to move.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _PARTS_LATE_MPS2 = 1e-12  # smallest difference of accelerations at a separation
 
 @compiled(bare=True)
 def built_up(table: Floats) -> bool:
-    """Return whether every force equals its command, so that no force changes before the next latency elapses.
+    """Return whether every vehicle's force equals its command, so that no force changes until a latency elapses.
 
-    The force of a vehicle is the acceleration by its brakes or engine. If a vehicle brakes in *pieces* (by a fixed
-    sequence of commands), its last piece must also have begun. If the result is True, ``constant_motion.move`` is
+    The force of a vehicle is the acceleration by its brakes or engine. If a vehicle follows a fixed sequence of
+    commands (*pieces*), the last command must also have begun. If the result is True, ``constant_motion.move`` is
     exact. ``table``: one world in the layout of ``physics.rows``.
     """
     built = True
@@ -84,11 +84,12 @@ def gap_after(gap: float, closing: float, pressing: float, jerk: float, time: fl
 
 @compiled
 def contact_within(gap: float, closing: float, pressing: float, jerk: float, end: float) -> tuple[float, float]:
-    """Return the time (s) and closing speed (m/s) of a pair's first contact before ``end``; ``(inf, 0)`` if none.
+    """Return time (s) and closing speed (m/s) of a pair's first contact before ``end``; no contact: ``(inf, 0)``.
 
-    This is ``contact`` for a closing acceleration that changes with time. The closing speed ``w + b t + j t^2 / 2`` has
+    ``motion.contact`` does the same for a constant closing acceleration. The closing speed ``w + b t + j t^2 / 2`` has
     at most two roots, and between them the gap is monotone. The contact lies in the first monotone interval that ends
-    with a gap of at most 0. Newton's method finds the contact; bisection keeps the iterates inside this interval.
+    with a gap of at most 0. Newton's method finds the contact. If a Newton step leaves this interval, bisection
+    replaces the step.
 
     Args:
         gap: present gap of the pair, m.
@@ -163,7 +164,8 @@ def force_ranges(force: float, rate: float, speed: float, limit: float) -> tuple
     """Return a vehicle's own acceleration for motion forward and for motion backward, and the rates of both.
 
     The result is ``(forward, backward, rate of forward, rate of backward)``, in m/s2 and m/s3. The two accelerations
-    differ if the force depends on the direction of motion, as brakes at standstill do (see ``motion.force_range``).
+    differ if the force depends on the direction of motion, as the force of brakes at standstill does (see
+    ``motion.force_range``).
 
     Args:
         force: present acceleration by brakes or engine, m/s2.
@@ -191,7 +193,8 @@ def settle_moving(low: float, high: float, low_jerk: float, high_jerk: float) ->
     """Return acceleration (m/s2) and jerk (m/s3) of a body (a vehicle, or several vehicles that move as one).
 
     The body's own forces allow every acceleration in the range ``[low, high]`` (m/s2). The ends of this range change at
-    the rates ``low_jerk`` and ``high_jerk`` (m/s3). The body takes the value nearest to 0, as in ``motion.settle``.
+    the rates ``low_jerk`` and ``high_jerk`` (m/s3). The body's acceleration is the value in this range that is nearest
+    to 0, as in ``motion.settle``.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
@@ -206,8 +209,8 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 
     The vehicles are the columns ``first..last`` of ``table`` and have the same speed. If the acceleration of a vehicle
     is at least the acceleration of the vehicle in front, up to rounding, both move as one body with a common
-    acceleration and jerk. Different jerks may separate them later. The time is infinite if no vehicles separate.
-    Writes the rows ACCELERATION, JERK and JOINED.
+    acceleration and jerk. If their jerks differ, the two may separate later. The time is infinite if no vehicles
+    separate. Writes the rows ACCELERATION, JERK and JOINED.
     """
     count = 0
     for i in range(first, last + 1):
@@ -246,8 +249,8 @@ def pool_moving(table: Floats, first: int, last: int) -> float:
 def settle_block(table: Floats, block: int, out: int) -> None:
     """Write the common acceleration and jerk of a pooled block into column ``out`` of the table.
 
-    A block consists of touching vehicles that move as one body. ``block`` is its column in the rows BLOCK_*, which
-    contain its mass and the sums of mass times force.
+    A block consists of touching vehicles that move as one body. ``block`` is the block's column in the rows BLOCK_*,
+    which contain its mass and the sums of mass times force.
     """
     mass = table[ROW.BLOCK_MASS, block]
     table[ROW.ACCELERATION, out], table[ROW.JERK, out] = settle_moving(
@@ -260,8 +263,8 @@ def settle_block(table: Floats, block: int, out: int) -> None:
 def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) -> float:
     """Return the time until the joined vehicles ``head..tail`` stop moving as one body (s); infinite if they never do.
 
-    A moving body splits when its front vehicles alone would accelerate more than the whole body. A body that is held
-    starts to move when its front vehicles drive away or its rear vehicles would be pushed back.
+    A moving body splits when its front vehicles alone would accelerate more than the whole body. A body that brakes
+    hold at rest starts to move when its front vehicles drive away or its rear vehicles would be pushed back.
 
     Args:
         table: one world in the layout of ``physics.rows``.
@@ -297,10 +300,10 @@ def parting_s(table: Floats, head: int, tail: int, value: float, jerk: float) ->
 
 @compiled
 def crossing_s(below: float, rate: float) -> float:
-    """Return the time after which a difference of two accelerations is surely positive (s); infinite if never.
+    """Return the time (s) after which the difference of two accelerations is positive; infinite if it never is.
 
-    The present difference is ``below`` <= 0 (m/s2), and it grows at ``rate`` (m/s3). The time includes a small delay,
-    so that rounding cannot leave the difference at 0.
+    The present difference is ``below`` (m/s2), at most 0, and it grows at ``rate`` (m/s3). A small delay is added to
+    the time, because rounding could otherwise leave the difference at 0.
     """
     if rate <= 0.0:
         return math.inf
@@ -311,7 +314,7 @@ def crossing_s(below: float, rate: float) -> float:
 def accelerate_moving(table: Floats) -> float:
     """Set the acceleration and jerk of every vehicle; return the time until touching vehicles separate (s).
 
-    This is ``constant_motion.accelerate`` for brakes that build up; ``table`` is one world in the layout of
+    ``constant_motion.accelerate`` does the same for brakes that act at once; ``table`` is one world in the layout of
     ``physics.rows``. The function also sets how each vehicle's force changes next and marks the pairs that move as one
     body (row JOINED). The time is infinite if no touching vehicles separate.
     """
@@ -348,8 +351,8 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 
     An event is a contact, a separation, a vehicle that comes to rest or reaches its speed limit, a command that takes
     effect, or a force that reaches its command. The function also writes into the table when each vehicle next comes to
-    rest or reaches its speed limit, and when each pair comes into contact. This is ``constant_motion.next_event`` for
-    brakes that build up.
+    rest or reaches its speed limit, and when each pair comes into contact. ``constant_motion.next_event`` does the same
+    for brakes that act at once.
 
     Args:
         table: one world in the layout of ``physics.rows``, after ``accelerate_moving``.
@@ -403,7 +406,8 @@ def next_moving_event(table: Floats, now: float, end: float, parting: float) -> 
 def move_on_cubics(table: Floats, duration: float) -> bool:
     """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
 
-    This is ``constant_motion.move`` for brakes that build up; ``table`` is one world in the layout of ``physics.rows``.
+    ``constant_motion.move`` does the same for brakes that act at once; ``table`` is one world in the layout of
+    ``physics.rows``.
     """
     vehicles, sound = table.shape[1], True
     for p in range(vehicles - 1):
@@ -446,11 +450,11 @@ def move_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(apart=True, bare=True)
 def move_apart_on_cubics(table: Floats, duration: float) -> bool:
-    """Move every vehicle alone for ``duration`` (s) and return True, or return False if two vehicles may meet.
+    """Move every vehicle as if it were alone for ``duration`` (s); return False if two vehicles may meet, else True.
 
     If the result is False, speeds and gaps are unchanged. Two neighbours cannot meet if their gap exceeds ``duration``
-    times their largest possible closing speed. This is ``segment.move_apart`` for brakes that build up; ``table`` is
-    one world in the layout of ``physics.rows``.
+    times their largest possible closing speed. ``segment.move_apart`` does the same for brakes that act at once;
+    ``table`` is one world in the layout of ``physics.rows``.
     """
     vehicles = table.shape[1]
     slowest_in_front = math.inf
@@ -491,10 +495,10 @@ def move_apart_on_cubics(table: Floats, duration: float) -> bool:
 
 @compiled(bare=True)
 def move_alone(table: Floats, i: int, wanted: float, duration: float) -> tuple[float, float]:
-    """Move vehicle ``i`` alone under a constant command; return its lowest and its highest speed on the way (m/s).
+    """Move vehicle ``i`` as if it were alone, under a constant command; return its lowest and highest speed (m/s).
 
-    The motion starts at the speed in row SPEED_VALUE. The rows SPEED_VALUE and FORCE are updated, and the distance is
-    added to row WAY.
+    Row SPEED_VALUE contains the speed at the start. The function updates the rows SPEED_VALUE and FORCE, and adds the
+    distance to row WAY.
 
     Args:
         table: one world in the layout of ``physics.rows``.

@@ -1,6 +1,6 @@
 """Worlds packed into two arrays, state and parameters, one row per world: the layout that the engine uses.
 
-Two arrays are much cheaper to pass to a kernel, to copy and to replace row by row than a dozen arrays.
+Passing two arrays to a kernel, copying them and replacing their rows costs much less than doing so with a dozen arrays.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from ethbrake_marl.physics.state import Floats, Ints, Vehicles, Worlds
 class Columns(NamedTuple):
     """First column of each group of quantities in the rows of ``Packed``, for N vehicles and P = N - 1 pairs.
 
-    A group ends where the next group begins. *News by link* is the time from which each vehicle may act on information
-    about each other vehicle. Its columns exist only if some world needs them; without them every vehicle knows
-    everything from the end of its own latency on. The last columns are those of periodic messages
-    (``physics.messages``); their values change as messages arrive.
+    A group ends where the next group begins. The group *news by link* contains the times from which each vehicle may
+    act on information about each other vehicle. The group exists only if some world needs it; without the group every
+    vehicle knows everything from the end of its own latency on. The last columns belong to periodic messages
+    (``physics.messages``); their values change when messages arrive.
     """
 
     vehicles: int  # the number N itself, not a column
@@ -84,10 +84,10 @@ class Packed(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds) -> Packed:
-        """Pack ``worlds`` at the start of their episode, with harm 0.
+        """Pack ``worlds`` as at the start of an episode, with harm 0.
 
-        Columns of the obstacle exist only if some world needs them, and so do columns of news by link (the time from
-        which each vehicle may act on information about each other vehicle).
+        Columns for an obstacle and for news by link (the times from which each vehicle may act on information about
+        each other vehicle) exist only if some world needs them.
         """
         v, (n, N) = worlds.vehicles, worlds.speeds_mps.shape
         none = np.zeros((n, 3 * (N - 1)))
@@ -117,7 +117,7 @@ class Packed(NamedTuple):
 
     @property
     def has_news(self) -> bool:
-        """Whether the rows have columns for news by link: when each vehicle may act on information about others."""
+        """Whether the rows have columns for the times from which vehicles may act on information about each other."""
         return bool(self.params.shape[1] > self.column.own_latency)
 
     @property

@@ -16,7 +16,7 @@ from ethbrake_marl.physics.state import Floats
 
 @compiled(bare=True)
 def accelerate(table: Floats) -> None:
-    """Set the acceleration of every vehicle and mark the pairs that move as one body; touching vehicles are coupled.
+    """Set the acceleration of every vehicle, and mark the pairs of touching vehicles that move as one body.
 
     Reads speeds, commands and gaps of ``table``; writes the rows ACCELERATION and JOINED.
     """
@@ -83,8 +83,8 @@ def next_event(table: Floats, now: float, end: float) -> float:
 def move(table: Floats, duration: float) -> bool:
     """Move the world of ``table`` to its next event, ``duration`` (s) later; return False if a contact was missed.
 
-    Quantities that reach an event are set to its exact value: a gap to 0, a speed to 0 or the speed limit. A missed
-    contact shows as a negative gap.
+    Quantities that reach an event are set to its exact value: a gap to 0, a speed to 0 or the speed limit. A contact
+    was missed if a gap is negative.
     """
     sound = True
     for p in range(table.shape[1] - 1):
@@ -106,8 +106,8 @@ def move(table: Floats, duration: float) -> bool:
 def move_speeds(table: Floats, duration: float) -> None:
     """Advance the speeds of ``table`` by ``duration`` (s), at most to the next event.
 
-    Vehicles that move as one body get one common speed. If a pair comes into contact, the speeds of its vehicles differ
-    exactly by its closing speed.
+    Vehicles that move as one body get one common speed. If a pair comes into contact, the difference of its two speeds
+    is exactly its closing speed.
     """
     vehicles = table.shape[1]
     first = 0

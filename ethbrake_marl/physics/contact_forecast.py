@@ -1,6 +1,7 @@
 """Forecast of contacts: time and closing speed of the next impact of each pair under constant commands.
 
-The forecast uses the physics of ``advance`` on a table that the caller has filled, and does not return the motion.
+The forecast simulates the same physics as ``advance`` in a table that the caller has filled. It does not return the
+motion.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ CONTACT = _Contact()
 def forecast_contacts(table: Floats, restitution: float, duration: float, contacts: Floats) -> int:
     """Simulate one world for ``duration`` (s) and write each pair's next impact into ``contacts``; return a status.
 
-    The status is ``FLAG.DONE``, or the code of the check that failed. If a pair had an impact before the forecast, its
-    next impact is still reported, although it adds no first-impact harm.
+    The status is ``FLAG.DONE``, or the code of the check that failed. The next impact of a pair is also reported if the
+    pair had an impact before, although it then adds no first-impact harm.
 
     Args:
         table: the world in the layout of ``physics.rows``: a row per quantity, a column per vehicle or pair. The rows

@@ -1,9 +1,9 @@
-"""Exponential, logarithm and normal quantile from + - * / and sqrt alone, so that every machine gets the same bits.
+"""Exponential, logarithm and normal quantile, computed with + - * / and sqrt only, so all machines get the same bits.
 
-The C library and numpy choose implementations of exp, log and pow by processor, and these differ in the last bits. The
-functions of this module do the same IEEE operations in the same order on every machine, so worlds drawn from a seed
-have the same bits everywhere. Each error bound is the largest error in a comparison with values of 40 digits, rounded
-up (tests/physics/test_compiling.py).
+The C library and numpy choose their implementation of exp, log and pow by the processor, and the implementations differ
+in the last bits. The functions of this module do the same IEEE operations in the same order on every machine, so worlds
+drawn from a seed have the same bits everywhere. The error bounds were measured: each is the largest error, rounded up,
+in a comparison with values of 40 digits (tests/physics/test_compiling.py).
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def power_of_two(k: int) -> float:
 def exp_rest(x: float, k: int) -> float:
     """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
-    The result is Taylor's series to the 13th power of ``x - k ln 2``, which lies within ``ln(2) / 2`` of 0. The
-    relative error is 5e-18.
+    The result is Taylor's series to the 13th power of ``x - k ln 2``, whose absolute value is at most ``ln(2) / 2``.
+    The relative error is 5e-18.
     """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
@@ -122,11 +122,11 @@ def exp(x: float) -> float:
 
 @compiled
 def _log_parts(x: float) -> tuple[float, float]:
-    """Return two numbers whose sum is ``ln x``, for a finite x > 0; the sum is more accurate than a single number.
+    """Return two numbers whose sum is ``ln x``, for a finite x > 0; two numbers are more accurate than one.
 
-    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
-    ``ln 2``, without rounding. The second number is the rest of ``k ln 2``, plus the series of
-    ``ln m = 2 artanh((m - 1) / (m + 1))``.
+    With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of ``ln
+    2``, which is exact. The second number is the rest of ``k ln 2``, plus the series of ``ln m = 2 artanh((m - 1) / (m
+    + 1))``.
     """
     k, m = 0, x
     while m >= _SQRT2:

@@ -1,12 +1,12 @@
 """Compiled rules of one step of an episode: onset of commands, motion, harm, rest, and times of decisions.
 
-Search and shield advance an episode with ``step_episode``. They copy one world at a time into a table in the layout of
-``physics.rows``. The engine stores its worlds in rows and has its own loop, which uses the same rules (``step_end_s``,
-``onset_s``, ``force_at``, ``stands``) and the same ``advance_table``. Engine, search and shield therefore agree to the
-last bit (decision 0025).
+Searches and shields advance an episode with ``step_episode``. They copy one world at a time into a table in the layout
+of ``physics.rows``. The engine stores its worlds in the rows of two arrays and has its own loop. The loop uses the same
+rules (``step_end_s``, ``onset_s``, ``force_at``, ``stands``) and the same ``advance_table``. The results of engine,
+searches and shields are therefore equal to the last bit (decision 0025).
 
 A *profile* contains the commands of the controlled vehicles in each of its *phases*. Phases begin and end at decisions,
-so an agent can follow the profile. The following letters are used in addition to those of ``physics.state``:
+so an agent can carry out a profile. The following letters are used in addition to those of ``physics.state``:
 
 ===  ===========================================================
 C    controlled vehicles
@@ -128,7 +128,7 @@ def time_of(grid: Grid, step: int) -> float:
 
 @compiled
 def onset_s(latency_s: float, time_s: float) -> float:
-    """Return the time from ``time_s`` until a command takes effect (s); 0 or less if it takes effect at once.
+    """Return the time (s) from ``time_s`` until a vehicle's command takes effect; 0 or less if it acts at once.
 
     ``latency_s`` is the time from the alert at which commands begin to have effect; ``time_s`` also counts from the
     alert.
@@ -138,7 +138,7 @@ def onset_s(latency_s: float, time_s: float) -> float:
 
 @compiled
 def stands(speed_mps: float, command_mps2: float) -> bool:
-    """Return whether a vehicle stands still and its command does not drive (negative commands brake)."""
+    """Return whether a vehicle stands still and its command does not drive it (negative commands brake)."""
     return speed_mps == 0.0 and command_mps2 <= 0.0
 
 
@@ -162,8 +162,8 @@ def step_episode(
     """Advance one world from ``time`` to ``until`` under its commands, and add the harm of this step.
 
     Returns GOES_ON, AT_REST, AT_HORIZON (not at rest at the horizon), or minus the status of a failed kernel; after a
-    failure the table is invalid. The last bits of the result depend on where steps end. In the engine a step goes from
-    one decision to the next.
+    failure the table is invalid. The last bits of the result depend on the times at which steps end. To get the same
+    bits as the engine, let each step go from one decision to the next.
 
     Args:
         table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
@@ -171,7 +171,7 @@ def step_episode(
         time: present time, s.
         until: end of the step, s.
         horizon_s: end of the episode, s.
-        no_rows: an empty array of impacts, such as ``table[:0]``.
+        no_rows: ``table[:0]`` or another empty array, so that no single impact is recorded.
 
     """
     status = advance_table(table, restitution, until - time, time, 0, no_rows, 0)[1]
@@ -189,8 +189,7 @@ def step_episode(
 def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: int, no_rows: Floats) -> int:
     """Advance a world from decision number ``step`` to decision number ``end``; return the result of ``step_episode``.
 
-    The table must be as the previous step left it. This function computes the times at which commands take effect
-    again.
+    The table must be unchanged since the previous step. The function computes anew when commands take effect.
 
     Args:
         table: the world in the layout of ``physics.rows``, with its rows of an episode; it is advanced.
@@ -198,7 +197,7 @@ def step_again(table: Floats, restitution: float, grid: Grid, step: int, end: in
         grid: decision times.
         step: number of the decision to start at, from 0.
         end: number of the decision to stop at.
-        no_rows: an empty array of impacts, such as ``table[:0]``.
+        no_rows: ``table[:0]`` or another empty array, so that no single impact is recorded.
 
     """
     time = time_of(grid, step)
@@ -224,14 +223,16 @@ def harm_so_far(table: Floats, total: float) -> float:
 
 @compiled
 def value_of(table: Floats, clock: Floats, other_weight: float = OTHER_WEIGHT) -> float:
-    """Return the number that a search minimises (m2/s2), which never decreases during an episode.
+    """Return the value that a search minimises, m2/s2; it never decreases during an episode.
 
-    The number is the harm of the line, the weighted sum of its vehicles' harms, or the largest weighted harm of a
-    vehicle. To break ties, ``other_weight`` times the line's harm in the other count (first-impact or total) is added.
+    The value is the harm of the line, the weighted sum of its vehicles' harms, or the largest weighted harm of a
+    vehicle. To break ties, the function adds ``other_weight`` times the line's harm in the other count (first-impact or
+    total).
 
     Args:
         table: one world in the layout of ``physics.rows``, with its rows of an episode.
-        clock: settings, [CLOCK.WIDTH]: ``HARM_IS_TOTAL`` chooses the count, and ``AIM`` chooses whose harm counts.
+        clock: settings, [CLOCK.WIDTH]: ``HARM_IS_TOTAL`` chooses the count of harm, and ``AIM`` chooses one of the
+            three values.
         other_weight: weight of the line's harm in the other count.
 
     """
@@ -300,17 +301,18 @@ def follow(world: Episode, ends: Ints, commands: Floats, states: Floats, phase: 
     """Simulate a profile from ``phase`` on; return its value (m2/s2) and the number of phases until the episode ends.
 
     A profile is a sequence of constant commands; a phase is the time interval of one command. The value is the harm
-    that a search minimises (``value_of``). The number of phases is -1 if the kernel failed. If
-    ``world.clock[CLOCK.STEPWISE]`` is 1, the simulation goes from decision to decision and has the same bits as the
-    engine. Otherwise it goes from phase to phase, which is several times faster and differs by rounding.
+    that a search minimises (``value_of``). The number of phases is -1 if a check of the physics failed. If
+    ``world.clock[CLOCK.STEPWISE]`` is 1, the simulation steps from decision to decision, and its result has the same
+    bits as in the engine. Otherwise it steps from phase to phase, which is several times faster; the result then
+    differs by rounding.
 
     Args:
         world: the world and its decision times; its table is overwritten.
-        ends: number of the decision at which each phase ends, [K].
-        commands: commands of the C controlled vehicles in each phase, [K, C] m/s2.
+        ends: for each phase, the number of the decision at which it ends, [K].
+        commands: for each phase, the commands of the C controlled vehicles, [K, C] m/s2.
         states: state at the start of each phase, [K + 1, S]: entry ``phase`` is read, later entries are written.
         phase: number of the first phase to simulate, from 0.
-        bound: value at which the simulation stops early, m2/s2.
+        bound: the simulation stops early when the value reaches this bound, m2/s2.
 
     """
     table, clock, controlled = world.table, world.clock, world.controlled

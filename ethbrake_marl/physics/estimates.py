@@ -1,4 +1,4 @@
-"""A vehicle's estimate of the others' states, from the newest periodic messages, which may be old."""
+"""A vehicle's estimate of the other vehicles' states from the newest periodic messages, which may be old."""
 
 from __future__ import annotations
 
@@ -26,11 +26,12 @@ def estimate_rows(state: Floats, params: Floats, observer: int, out: Floats) -> 
     """Fill ``out`` with the worlds as vehicle ``observer`` estimates them from the messages it has received.
 
     If the observer knows a vehicle, the newest place and speed that it has received are extrapolated to the present,
-    under the command received with them and without contact. A pair has its true gap if the information about both of
-    its vehicles is current. Hit flags are known only for the observer's own pairs. A vehicle that the observer does not
-    know is placed at rest at the position of the next vehicle towards the observer, so that it gives no information.
-    A quantity that messages do not contain is replaced in the same way: a place by the place of the next vehicle
-    towards the observer, a speed or a command by 0.
+    under the command received with them and without contact. The estimate of a pair's gap is its true gap if the
+    information about both of its vehicles is current. Flags that a pair has had an impact are known only for the pairs
+    of the observer itself. The estimate places a vehicle that the observer does not know at rest, at the position of
+    the next vehicle towards the observer, so that the estimate contains no information about it. If messages do not
+    contain a quantity, it is replaced in a similar way: a place by the place of the next vehicle towards the observer,
+    a speed or a command by 0.
 
     Args:
         state: true state rows of the worlds, [n, S], in the layout of ``physics.columns``.

@@ -21,8 +21,8 @@ def forecast(
 ) -> tuple[Floats, Floats]:
     """Return the first-impact harm and the total harm up to ``until_s`` for each candidate command of ``vehicle``.
 
-    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. It is 0 in
-    a world whose time is ``until_s`` or later. A pair that had an impact before adds no first-impact harm.
+    Both results are [n, K] in m2/s2. Harm is summed over all pairs and the obstacle ahead, if there is one. Harm is 0
+    in a world whose time is ``until_s`` or later. A pair that has already had an impact adds no first-impact harm.
 
     Args:
         worlds: n worlds of N vehicles.
@@ -31,8 +31,8 @@ def forecast(
         candidates_mps2: K candidate commands for the vehicle in each world, [n, K] m/s2.
         until_s: absolute end of the forecast, s.
 
-    Raises ``InvalidInput`` for arrays of wrong shape or a candidate beyond capacity; ``PhysicsError`` with the worlds
-    in which a check of the kernel failed.
+    Raises ``InvalidInput`` for arrays of wrong shape or a candidate beyond capacity; raises ``PhysicsError``, which
+    lists the failed worlds, if a check of the physics failed.
 
     """
     n, N = worlds.speeds_mps.shape

@@ -1,17 +1,18 @@
-"""Impacts and resting contact of touching vehicles, by one law that does not depend on the order of the pairs.
+"""Impacts and resting contact of touching vehicles, resolved by one law for all pairs at once.
 
-If pairs were resolved one after another, the result would depend on their order. Here a *cluster*, a run of touching
-vehicles, is resolved at once by a mass-weighted isotonic regression ``P`` (pool adjacent violators):
+If pairs were resolved one after another, the result would depend on their order. Here all vehicles of a *cluster* (a
+sequence of touching vehicles) are resolved together by a mass-weighted isotonic regression ``P`` (pool adjacent
+violators) of values in the order of the vehicles:
 
 * impact: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the paper's eq. (13);
-* resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block accelerates with
-  ``sum(m u) / sum(m)``. The brakes of a vehicle at rest enter as a range of forces, so a block at rest moves only if
-  the push exceeds the braking force of its braked vehicles.
+* resting contact: the accelerations are ``P`` of the vehicles' own accelerations; a pooled block of vehicles with
+  masses m and own accelerations u accelerates with ``sum(m u) / sum(m)``. The brakes of a vehicle at rest can have any
+  force up to a limit, so a block at rest moves only if the push exceeds the braking force of its vehicles.
 
 In the result no vehicle is faster than the vehicle in front of it.
 
 The kernels work on one table of floats per world, ``table[row, vehicle or pair]``, with the rows of ``physics.rows``.
-One array is cheap to pass from function to function; passing twenty small arrays costs more than the physics.
+Passing one array from function to function is cheap; passing twenty small arrays would cost more than the physics.
 """
 
 from __future__ import annotations
@@ -73,9 +74,9 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
     """Replace the speeds of touching vehicles ``first..last`` by their speeds after the impact.
 
     The impact is plastic (restitution 0) if the largest closing speed is below ``PLASTIC_SPEED_MPS``. ``pool`` groups
-    the vehicles into blocks with one common speed before the bounce. This speed is corrected by the mean of the
-    remaining rounding error, so the momentum error is at most 4 eps times ``sum(m |v|)`` for any masses. The speed of a
-    vehicle that is not struck stays the same to the last bit.
+    the vehicles into blocks and gives each block one common speed, as in a plastic impact. This speed is corrected by
+    the mean of the remaining rounding error, so the error of the momentum is at most 4 machine epsilons times ``sum(m
+    |v|)`` for any masses. The speed of a vehicle that is not struck stays the same to the last bit.
 
     The corrected speeds are ordered only up to rounding. In a plastic impact each speed is therefore limited to the
     speed of the vehicle in front. Without this limit, two blocks could exchange a rounding error forever.
@@ -110,7 +111,7 @@ def resolve_cluster(table: Floats, restitution: float, first: int, last: int) ->
 
 @compiled(bare=True)
 def resolve_impacts(table: Floats, restitution: float) -> bool:
-    """Resolve every run of touching vehicles in which some pair approaches, once; return False if no pair approaches.
+    """Resolve, once, every cluster of touching vehicles in which some pair approaches; return False if there is none.
 
     ``table``: one world in the layout of ``physics.rows``; ``restitution``: coefficient of restitution in [0, 1].
     Updates SPEED, writes the rows CLOSING, BEFORE and STRUCK of this round of impacts, and clears CONTACT_SPEED.
@@ -154,7 +155,7 @@ def record_impacts(table: Floats, time_s: float, world: int, rows: Floats, recor
         time_s: time of the impacts, s.
         world: number of this world, written into ``rows``.
         rows: array of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
-        recorded: number of impacts before this round.
+        recorded: number of impacts that ``rows`` already contains.
 
     """
     for p in range(table.shape[1] - 1):

@@ -1,14 +1,14 @@
 """``compiled``, the decorator of all compiled kernels: strict floating point, and a cache that is safe to share.
 
-Numba's own cache has two problems. It looks only at the file of the function itself, so after an edit to a *callee* in
-another file it would still use the old machine code. And its index file is read, changed and written back, which is not
-safe if several processes share a folder.
+Numba's own cache has two problems. First, it checks only the file of the function itself. After an edit to another
+file, with a function that this function calls, it would still use the old machine code. Second, each process reads its
+index file, changes it and writes it back, which is not safe if several processes share a folder.
 
 The cache of this module has one file for each kernel and signature. The name of the file is a hash of everything that
-determines the code: sources, versions, signature and processor, but not the location of the package. After an edit,
-only the kernels that may use the edited code are compiled again. A second environment or a moved checkout reuses the
-existing files. A file is written under a temporary name and renamed when it is complete, so any number of processes may
-share a folder.
+determines the machine code: sources, versions, signature and processor. It does not depend on the location of the
+package. After an edit, only the kernels that may use the edited code are compiled again. A second Python environment,
+or a copy of the package in another folder, reuses the existing files. A file is written under a temporary name and
+renamed when it is complete, so any number of processes may share a folder.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ _loaded: list[str] = []
 
 
 class _Linkable(JITCodeLibrary):  # type: ignore[misc]
-    """Code of a kernel that is only inlined into its callers; no machine code is generated for this kernel."""
+    """Code of a kernel that is only inlined into its callers, so that it needs no machine code of its own."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -81,11 +81,11 @@ class _Linkable(JITCodeLibrary):  # type: ignore[misc]
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """A compiled function like the result of numba's ``njit``, with its own cache and less to compile.
+    """A compiled function like the result of numba's ``njit``, but with the cache of this module, and compiled faster.
 
     If one compiled function calls another, numba generates machine code and two wrappers for the called function,
     although the caller already contains its code. Numba also compiles a function again for each integer literal that is
-    passed as an argument. This class avoids both.
+    passed as an argument. This class avoids both kinds of additional compilation.
     """
 
     def __init__(self, *given: Any, **options: Any) -> None:
@@ -171,9 +171,9 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         Args:
             way: ``"entry"`` for a kernel called from Python, ``"linked"`` for a kernel called from other kernels.
             kinds: numba types of the arguments, and for an entry also the type of the result.
-            make: function that compiles the kernel. It returns whether the kernel must not be cached, and the parts of
-                the kernel, which can be pickled.
-            load: function that makes the kernel usable in this process from these parts.
+            make: function that compiles the kernel. It returns whether the kernel must not be cached, and the compiled
+                parts, which can be pickled.
+            load: function that makes a kernel from the compiled parts in this process.
 
         """
         name = self._name(way, kinds)
@@ -210,7 +210,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
 
 
 def _without_c_wrapper(flags: Any) -> Any:
-    """Set numba's compiler ``flags`` to omit the C wrapper, because only Python and other kernels call a kernel."""
+    """Set numba's compiler ``flags`` to omit the C wrapper, because no C code calls kernels."""
     flags.no_cfunc_wrapper = _KNOWN
     return flags
 
@@ -229,8 +229,8 @@ def _described(kind: Any) -> str:
 def load_kernel(name: str) -> bytes | None:
     """Return the content of the cache file ``name`` (as ``keep_kernel`` wrote it); None if it cannot be used.
 
-    A file cannot be used if it is missing or damaged, or if its owner is neither this user nor root. The owner matters
-    because a cached kernel is executed.
+    A file cannot be used if it is missing or damaged, or if its owner is neither this user nor root. The owner is
+    checked because the cached code is executed.
     """
     try:
         with (cache_folder() / name).open("rb") as file:
@@ -246,7 +246,7 @@ def load_kernel(name: str) -> bytes | None:
 
 
 def keep_kernel(name: str, content: bytes) -> None:
-    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails, as on a full disk."""
+    """Write ``content`` to the cache file ``name`` for ``load_kernel``; warn if this fails (full disk)."""
     folder = cache_folder()
     try:
         handle, part = tempfile.mkstemp(dir=folder, prefix=".")
@@ -286,18 +286,18 @@ def _alone(name: str) -> Iterator[None]:
 
 @cache
 def digest_of_sources(source: Path) -> str:
-    """Return a hash of all files that the kernels in the file ``source`` may be compiled from; empty if not known.
+    """Return a hash of all files that determine the kernels in the file ``source``; empty if the hash is not known.
 
-    The hash is not known for code outside a file (in an interactive shell), and for a file that was edited after this
-    process started, because the process may have imported the older version. A file with a date in the
-    future counts as edited, and a warning is given.
+    The hash is not known for code that is not in a file (in an interactive shell). It is also not known for a file that
+    was edited after this process started, because the process may have imported the older version. A file with a date
+    in the future counts as edited, and a warning is given.
     """
     digest = hashlib.sha256()
     for file in kernel_sources(source) if source.is_file() else ():
         written_s = file.stat().st_mtime
         if written_s > time.time():
             warnings.warn(
-                f"{_PACKAGE}: dates of files lie in the future, so each process compiles the kernels again; correct the"
+                f"{_PACKAGE}: files have dates in the future, so each process compiles the kernels again; correct the"
                 " clock of this machine, or the dates (find FOLDER -exec touch {} +)",
                 stacklevel=2,
             )
@@ -366,15 +366,15 @@ def compiled(*, apart: bool = False, within: bool = False, bare: bool = False) -
 def compiled(function: Any = None, *, apart: bool = False, within: bool = False, bare: bool = False) -> Any:
     """Compile a function with numba: no fast-math, no bounds checks, no GIL, cached on disk.
 
-    By default a kernel is inlined into its callers (``forceinline``). A real call would count the references to its
-    arrays with atomic operations, which takes more than half as long as the physics itself.
+    By default a kernel is inlined into its callers (``forceinline``). A call that is not inlined counts the references
+    to its arrays with atomic operations, which takes more than half as long as the physics itself.
 
     Args:
         function: the function, if the decorator is used without arguments.
-        apart: do not inline this kernel. Use this for a large kernel that many kernels call, but rarely. If such a
-            kernel were inlined, it would be compiled once per caller, which takes minutes instead of seconds.
-        within: inline this kernel into its callers before they are compiled. In contrast to ``forceinline``, this
-            avoids the counting of references in each function that passes an array on.
+        apart: do not inline this kernel. Use this for a large kernel that many kernels contain but rarely call. If such
+            a kernel were inlined, it would be compiled once per caller, which takes minutes instead of seconds.
+        within: inline this kernel into the code of its callers before numba compiles them. In contrast to
+            ``forceinline``, this avoids the counting of references in each function that passes an array on.
         bare: compile without any reference counting. Use this for kernels that neither create nor return arrays. A
             callee with ``forceinline`` still counts references unless it is also ``bare``.
 
@@ -394,7 +394,7 @@ Result = TypeVar("Result")
 
 
 def by_parts(work: Callable[[slice], Result], n: int, threads: int) -> list[Result]:
-    """Return the results of ``work`` on contiguous slices that divide the rows 0 to n - 1, in the order of the rows.
+    """Call ``work`` for contiguous slices of the rows 0 to n - 1; return the results in the order of the slices.
 
     There is one slice per thread. The calling thread works on the first slice, so ``threads=1`` starts no thread. If
     ``work`` fails on a slice, the other slices are still finished before the error is raised. If several slices fail,

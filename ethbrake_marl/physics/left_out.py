@@ -1,4 +1,4 @@
-"""Leave out and report worlds that cannot be advanced; the results of the other worlds do not change."""
+"""Leave out and report worlds that the physics cannot advance; the results of the other worlds do not change."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ LeftOutRows = tuple[tuple[int, str], ...]  # row of each world that was left out
 def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[Result, Ints, LeftOutRows]:
     """Measure n worlds without failed worlds; return the result, the rows that were measured, and the failed rows.
 
-    The failed rows are returned as pairs (row, reason), in ascending order. Raises ``PhysicsError`` if every world
-    fails; otherwise the function works like ``leaving_out_failed``.
+    The failed rows are returned as pairs (row, reason), in ascending order. The function works like
+    ``leaving_out_failed``, but raises ``PhysicsError`` if every world fails.
 
     Args:
         measure: function of rows (indices of worlds, from 0 to n - 1). It raises a ``PhysicsError`` that lists the
@@ -35,10 +35,10 @@ def measured_without_failed(measure: Callable[[Ints], Result], n: int) -> tuple[
 
 
 def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Result | None, Ints, dict[int, str]]:
-    """Run ``work`` without the rows that fail; return its result, the rows it used, and a dictionary row -> reason.
+    """Call ``work`` for the rows that do not fail; return its result, the rows it used, and {failed row: reason}.
 
-    The dictionary lists the failed rows. A world's result does not depend on its batch, so ``work`` is repeated without
-    the failed rows until no row fails. The result is None if no row is left.
+    ``work`` is repeated without the failed rows until no row fails. This is possible because a world's result does not
+    depend on the other worlds. The result is None if no row is left.
 
     Args:
         work: function of rows of a batch. It raises a ``PhysicsError`` that lists the failed worlds by their position
@@ -59,7 +59,7 @@ def leaving_out_failed(work: Callable[[Ints], Result], rows: Ints) -> tuple[Resu
 
 @dataclass(frozen=True, slots=True)
 class ImpactRows:
-    """Every impact of a segment (an interval of constant commands), ordered by world and then by time; arrays [k]."""
+    """The k impacts of a segment (an interval of constant commands), ordered by world and then by time; arrays [k]."""
 
     world: Ints  # row of the world in the batch
     pair: Ints  # index of the pair; -1: Vehicle 1 and the obstacle ahead

@@ -1,15 +1,15 @@
 """Periodic messages: the information that each vehicle has received about each other vehicle, and its age.
 
 A vehicle samples its state at every decision, starting at the alert. A message contains the sender's newest sample. On
-each link a message is sent every period. The link's channel is good or bad (Gilbert-Elliott model): after the first
-message that arrives, it turns bad with probability p per message, and good again with probability r. A message sent
-while the channel is bad is lost. The random numbers are a pure function of the world's key, the link and the message's
-number, so they do not depend on the batch or the step. A vehicle measures a neighbour in sight, so it knows the
-neighbour's present state.
+each link (from one vehicle to another) a message is sent once per period. The link's channel is good or bad
+(Gilbert-Elliott model): after the first message that arrives, a good channel turns bad with probability p per message,
+and a bad channel turns good with probability r. A message sent while the channel is bad is lost. The random numbers
+depend only on the world's key, the link and the message's number. A vehicle measures a neighbour in sight, so it knows
+the neighbour's present state.
 
-For N vehicles the messages use the following columns of the parameters, after the news (``physics.columns.Columns``).
-These columns are the memory of the channel and change during an episode. If the period is 0, the world has no periodic
-messages, and vehicles know the present state.
+For N vehicles the messages use the following columns of the parameters. They come after the group *news by link*
+(``physics.columns.Columns``). These columns store the state of the channels and what was received, and change during an
+episode. If the period is 0, the world has no periodic messages, and vehicles know the present state.
 
 head    period (s), delay from sending to use (s), p, r, key (a whole number below 2^53), number of samples taken, place
         of the obstacle ahead (m; infinite: none)
@@ -18,9 +18,9 @@ links   N * N times the columns of ``_Link``, ordered by receiver, then sender
 ring    the newest samples in a ring buffer, RING_HEAD + 3 N columns each: time, whether Vehicle 1 has hit the obstacle,
         and places, speeds and commands in force of all vehicles
 
-If the scenario says what a message contains (``v2x: tells``), the link of Vehicle 1 to itself is marked, and each
-sample also contains the commands chosen at the last decision (*intents*, N columns). Then three more groups of columns
-exist between links and ring, even in a world without periodic messages:
+If the scenario says what a message contains (``v2x: tells``), an entry of the link from Vehicle 1 to itself marks this,
+and each sample also contains the commands chosen at the last decision (*intents*, N columns). In this case three more
+groups of columns exist between *links* and *ring*, even in a world without periodic messages:
 
 contents    N * CONTENTS: 1 if messages of this vehicle contain this piece of information
 intents     N, present intent of each vehicle (m/s2)
@@ -112,25 +112,25 @@ def link_at(receiver: int, sender: int, vehicles: int) -> int:
 
 @compiled
 def contents_at(vehicles: int) -> int:
-    """Return the first column of the contents, counted from the first column of the messages.
+    """Return the first column of the group *contents*, counted from the first column of the messages.
 
-    Without contents, the ring buffer begins at this column.
+    If this group does not exist, the ring buffer begins at this column.
     """
     return CHANNEL.WIDTH + vehicles + LINK.WIDTH * vehicles * vehicles
 
 
 @compiled
 def intent_at(vehicles: int) -> int:
-    """Return the first column of the present intents, counted from the first column of the messages.
+    """Return the first column of the group *intents*, counted from the first column of the messages.
 
-    The intents in the newest messages received begin N columns later.
+    The group *told* (the intents in the newest messages received) begins N columns later.
     """
     return contents_at(vehicles) + CONTENTS * vehicles
 
 
 @compiled
 def has_contents(messages: Floats, vehicles: int) -> bool:
-    """Return whether a row of message columns says what messages contain."""
+    """Return whether a row of message columns has the group *contents*, which says what messages contain."""
     return bool(messages.shape[0] > 0 and messages[link_at(0, 0, vehicles) + LINK.NUMBER] == 1.0)
 
 
@@ -154,9 +154,10 @@ def sample_width(messages: Floats, vehicles: int) -> int:
 def knows_piece(messages: Floats, vehicles: int, receiver: int, sender: int, piece: int, time: float) -> bool:
     """Return whether ``receiver`` knows one of ``PIECES`` (such as the mass) of ``sender`` at ``time`` (s).
 
-    By this time the first message must have arrived, or the sender must be in sight. ``messages`` is a row of message
-    columns, or empty. Place, speed and acceleration are measured once the sender is in sight. The intent becomes known
-    only by a message. Every other piece that messages contain is known from the first message or sight on.
+    The function assumes that by this time the first message has arrived, or the sender is in sight. ``messages`` is a
+    row of message columns, or empty. Place, speed and acceleration are measured once the sender is in sight. The intent
+    becomes known only by a message. Every other piece is known, if messages contain it, as soon as a message has
+    arrived or the sender is in sight.
     """
     if not has_contents(messages, vehicles):
         return piece != INTENT
@@ -186,9 +187,9 @@ def _known_pieces(messages: Floats, time: Floats, vehicles: int, receiver: int, 
 
 
 class Told(NamedTuple):
-    """Newest states of all vehicles that one receiving vehicle has received, by message or by sight.
+    """Newest states of all vehicles, as one vehicle has received them by message or by sight.
 
-    Arrays are [n, N] unless stated otherwise, with column j for sender j. They are views of the message columns.
+    Arrays are [n, N] unless stated otherwise, with column j for vehicle j. They are views of the message columns.
     """
 
     at_s: Floats  # time at which the state was sampled (s); below 0: nothing received
@@ -213,7 +214,7 @@ class Messages(NamedTuple):
 
     @staticmethod
     def ring_length(delay_s: float, time_step_s: float) -> int:
-        """Return the number of samples to store: the samples taken during a message's delay, and spare ones.
+        """Return the number of samples to store: those taken during a message's delay, and some more.
 
         ``delay_s``: time from sending a message to its use (s); ``time_step_s``: time between two samples (s).
         """
@@ -227,7 +228,7 @@ class Messages(NamedTuple):
         """Return the messages of n worlds at the alert (time 0), before any message is sent.
 
         Args:
-            heard_s: time at which vehicle i can first use a message of vehicle j, [n, N, N] s; infinite: never.
+            heard_s: time from which vehicle i can use the first message of vehicle j, [n, N, N] s; infinite: never.
             seen_s: time from which vehicle i measures vehicle j, [n, N, N] s; infinite: never.
             key: seed of the message losses, [n], whole numbers below 2^53.
             samples: length of the ring buffer, see ``ring_length``.
@@ -276,7 +277,7 @@ class Messages(NamedTuple):
 
     @property
     def says_contents(self) -> bool:
-        """Whether the columns say what messages contain, which is the same for all worlds of a batch."""
+        """Whether the columns contain the group *contents*; this is the same for all worlds of a batch."""
         marked: bool = self.columns.shape[1] > 0 and bool((self.links[:, 0, 0, LINK.NUMBER] == 1.0).any())
         return marked
 
@@ -286,17 +287,17 @@ class Messages(NamedTuple):
         return tuple(piece for piece in pieces if not always[PIECES.index(piece)])
 
     def withhold_from(self, vehicle: int) -> Bools:
-        """Return whether messages of some vehicle other than ``vehicle`` lack a usual piece, [n]."""
+        """Return whether messages of some vehicle other than ``vehicle`` lack one of ``USUAL_PIECES``, [n]."""
         others = np.delete(self.contents, vehicle, axis=1)[:, :, : len(USUAL_PIECES)]
         return np.asarray(~others.all(axis=(1, 2)))
 
     def seen_from_s(self, vehicle: int, other: int) -> Floats:
-        """Return the time from which ``vehicle`` measures ``other``, [n] s; infinite: never or without columns."""
+        """Return the time from which ``vehicle`` measures ``other``, [n] s; infinite: never, or no message columns."""
         seen = self.links[:, vehicle, other, LINK.SEEN_FROM] if self.columns.shape[1] else None
         return np.full(len(self.columns), np.inf) if seen is None else seen
 
     def known_pieces(self, vehicle: int, time_s: Floats) -> Bools:
-        """Return which of ``PIECES`` ``vehicle`` knows of each other vehicle at ``time_s`` [n], [n, N, CONTENTS].
+        """Return which of ``PIECES`` the ``vehicle`` knows about each vehicle at ``time_s`` [n], [n, N, CONTENTS].
 
         The result is valid for vehicles whose first message has arrived by this time or that are in sight.
         """
@@ -305,7 +306,7 @@ class Messages(NamedTuple):
         return known
 
     def intents(self, vehicle: int) -> Floats:
-        """Return the newest intent of each vehicle that ``vehicle`` has received, [n, N] m/s2; 0 without contents."""
+        """Return the newest intent of each vehicle that ``vehicle`` has received, [n, N] m/s2; 0 if unknown."""
         n, N = len(self.columns), self.vehicles
         if not self.says_contents:
             return np.zeros((n, N))
@@ -314,7 +315,7 @@ class Messages(NamedTuple):
         return np.where(periodic, self.columns[:, messages : messages + N], self.columns[:, at : at + N])
 
     def with_intents(self, intents_mps2: Floats) -> Floats:
-        """Return the columns with the present intents set to ``intents_mps2`` [n, N]; unchanged without contents."""
+        """Return the columns with ``intents_mps2`` [n, N] as present intents; unchanged if they have no intents."""
         if not self.says_contents:
             return self.columns
         columns, at = self.columns.copy(), intent_at(self.vehicles)
@@ -334,9 +335,9 @@ class Messages(NamedTuple):
     def age_s(self, time_s: Floats) -> Floats:
         """Return the age at ``time_s`` [n] of the newest state that vehicle i received from vehicle j, [n, N, N] s.
 
-        The age is the time since the state was sampled. The age is 0 in worlds without periodic messages, where the
-        present state is known, and infinite if nothing has been received yet. Vehicle i may use the state from the time
-        ``Vehicles.known_from_s`` on.
+        The age is the time since the state was sampled. The age is infinite if nothing has been received yet. It is 0
+        in worlds without periodic messages, because the present state is known there. Vehicle i may use the state from
+        the time ``Vehicles.known_from_s`` on.
         """
         age, periodic = np.zeros((len(time_s), self.vehicles, self.vehicles)), self.periodic
         if periodic.any():
@@ -356,9 +357,9 @@ def refuse_untold(
     needs: Sequence[Piece] = LOOK_AHEAD,
     senders: Sequence[int] | None = None,
 ) -> None:
-    """Raise ``InvalidInput`` if messages lack a piece that ``who``, which controls ``vehicles``, needs to know.
+    """Raise ``InvalidInput`` if messages lack a piece of information that ``who``, which controls ``vehicles``, needs.
 
-    Vehicles that are controlled together also need each other's messages. ``needs``: the pieces that must be known.
+    Vehicles that are controlled together also need each other's messages. ``needs``: the pieces that ``who`` must know.
     ``senders``: the vehicles whose messages are needed; None: all vehicles.
     """
     messages = Messages.of(worlds)
@@ -399,14 +400,14 @@ def hear_rows(
 ) -> None:  # fmt: skip
     """Advance the messages and the state of every world from its present time to ``until_s``, in place.
 
-    All vehicles are sampled every ``time_step_s``, counted back from the next decision. If ``until_s`` lies between two
-    samples, vehicles in sight are measured at ``until_s`` too, and this last sample is not stored. If the kernel cannot
-    advance a world, the vehicles of this world receive nothing more.
+    All vehicles are sampled at the next decision, and at multiples of ``time_step_s`` before it. If ``until_s`` lies
+    between two samples, vehicles in sight are also measured at ``until_s``, but this sample is not stored. If the
+    kernel cannot advance a world, the vehicles of this world receive nothing more.
 
     Args:
         moving: state rows of the worlds, [n, S], in the layout of ``physics.columns``; they are advanced.
         params: parameter rows of the worlds; their columns of messages are updated.
-        wanted: commands of the vehicles until then, [n, N] m/s2.
+        wanted: commands of the vehicles until ``until_s``, [n, N] m/s2.
         until_s: end times, [n] s.
         decision_s: time of the next decision, [n] s.
         time_step_s: time between two decisions, s.
@@ -442,7 +443,7 @@ def hear_rows(
 
 @compiled
 def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> None:
-    """Begin the messages of one world at the alert. Updates the rows ``state`` and ``params``.
+    """Begin the messages of one world at the alert, in the rows ``state`` and ``params``.
 
     The function sets the place of each vehicle along the road, stores the first sample of all states, and lets each
     vehicle measure the vehicles in sight.
@@ -474,8 +475,8 @@ def _start(state: Floats, params: Floats, column: Columns, wanted: Floats) -> No
 def _choose(params: Floats, column: Columns, wanted: Floats, time: float) -> None:
     """Write the present intents at ``time`` (s): the commands ``wanted`` that were chosen at the last decision.
 
-    If the channel extends a vehicle's latency, the vehicle does not know of the emergency before the latency has
-    elapsed. Until then its intent is 0.
+    If the channel extends a vehicle's latency, the vehicle does not know of the emergency until the latency has
+    elapsed. Until this time its intent is 0.
     """
     messages, N = params[column.messages :], column.vehicles
     if not has_contents(messages, N):
@@ -546,7 +547,7 @@ def _move(
 
 @compiled
 def _sample(state: Floats, messages: Floats, column: Columns) -> None:
-    """Store a sample of every vehicle's state, in place of the oldest sample of the ring buffer.
+    """Store a sample of every vehicle's state in the ring buffer; it replaces the oldest sample.
 
     ``state``: state row of one world, [S]; ``messages``: its message columns, updated; ``column``: layout of the state.
     """
@@ -566,7 +567,7 @@ def _sample(state: Floats, messages: Floats, column: Columns) -> None:
 
 @compiled
 def _receive(time: float, messages: Floats, N: int) -> None:
-    """Process every message of one world that can be used by ``time`` (s), and measure the vehicles in sight.
+    """Process all messages of one world that may be used from ``time`` (s) or earlier; measure the vehicles in sight.
 
     ``messages``: columns of messages of the world, updated; ``N``: number of vehicles.
     """

@@ -1,7 +1,7 @@
-"""Closed formulas for motion under constant acceleration: times of the next events, gaps, and stopping distances.
+"""Closed formulas for motion at constant acceleration: time until the next event, gap, stopping distance.
 
-Between events every gap is quadratic in time, so the next event is found exactly and no event is missed. Only + - * /
-and sqrt are used, so the results have the same bits in any batch.
+Between events every gap is quadratic in time, so the next event is found exactly and no event is missed. The formulas
+use only + - * / and sqrt, so a world's results have the same bits in any batch.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ ONSET_ROUNDING_S = 1e-9  # a latency that elapses this shortly before the end of
 
 
 def has_acted(latency_s: Any, time_s: Any) -> Any:
-    """Return whether a command has taken effect before the end of a time interval, for numbers (in kernels) or arrays.
+    """Return whether a command has taken effect before the end of a time interval; accepts numbers and arrays.
 
-    A command that takes effect at the start of the interval counts. A command that would take effect at its end does
-    not count, because the next decision replaces it before it acts.
+    The result is True for a command that takes effect at the start of the interval. It is False for a command that
+    would take effect exactly at the end, because the next decision replaces the command before it acts.
 
     Args:
         latency_s: time from the start of the interval until the command takes effect, s; may be negative.
@@ -51,9 +51,10 @@ command_acts = compiled(has_acted)
 def contact(gap: float, closing: float, pressing: float) -> tuple[float, float]:
     """Return the time (s) and the closing speed (m/s) of a pair's first contact; ``(inf, 0)`` if there is no contact.
 
-    With ``D = w^2 + 2 b g``: for ``w > 0`` there is no contact if ``D < 0``, otherwise ``t = 2 g / (w + sqrt(D))``. For
-    ``w <= 0`` there is a contact only if ``b > 0``, at ``t = (sqrt(D) - w) / b``. The closing speed at the contact is
-    computed as ``sqrt(D)``, because the equal expression ``w + b t`` loses digits by cancellation.
+    Let g be the gap, w the closing speed, b the closing acceleration, and ``D = w^2 + 2 b g``. If ``w > 0``, there is
+    no contact for ``D < 0``; otherwise the contact is at ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is a contact
+    only for ``b > 0``, at ``t = (sqrt(D) - w) / b``. The closing speed at the contact is computed as ``sqrt(D)``,
+    because ``w + b t``, which is mathematically equal, loses digits by cancellation.
 
     Args:
         gap: present gap g >= 0, m.
@@ -91,8 +92,8 @@ def drift(gap: float, closing: float, pressing: float, duration: float) -> float
 def speed_event(speed: float, acceleration: float, command: float, limit: float) -> tuple[float, float]:
     """Return the time (s) until the speed next reaches a value at which forces change, and this value (m/s).
 
-    Forces change at standstill, where brakes hold, and at the speed limit of a vehicle that drives. The result is
-    ``(inf, 0)`` if the speed reaches neither.
+    Forces change at standstill, where brakes hold the vehicle, and at the speed limit of a vehicle that drives. The
+    result is ``(inf, 0)`` if the speed reaches neither standstill nor the limit.
 
     Args:
         speed: present speed, m/s.
@@ -159,7 +160,7 @@ def settle(low: float, high: float) -> float:
 def solo_motion(
     speed: float, command: float, onset: float, limit: float, duration: float
 ) -> tuple[float, float, float]:
-    """Move a vehicle alone; return its final speed (m/s), its distance (m) and its acceleration (m/s2).
+    """Move a vehicle without contact; return its final speed (m/s), its distance (m) and its acceleration (m/s2).
 
     The vehicle coasts until ``onset``, and then brakes to standstill or drives up to the limit. The acceleration is NaN
     if it was not constant.

@@ -1,32 +1,35 @@
-"""The paper's fixed-step map (eq. dynamics2): impacts are detected, and take effect, at sample times only.
+"""The paper's fixed-step map (eq. dynamics2), in which impacts are detected and take effect only at sample times.
 
 With the sampling period h, one step of a vehicle with command u, from sample n to sample n + 1, is
 
     x(n + 1) = x(n) + h f(n) + h^2 / 2 u(n)
     v(n + 1) = f(n) + h u(n)
 
-where f(n) is the vehicle's speed after the impacts of sample n. A closing pair with a gap <= 0 at a sample exchanges
-velocity by the paper's eq. (13). For Vehicle 2 this means f = f1 after f3: the rear impact comes first, then the front
-impact with the changed speed. The speed of the other vehicle of each pair changes at the same time.
+where f(n) is the vehicle's speed after the impacts of sample n. If at a sample the gap of a pair is at most 0 and
+closes, the pair exchanges velocity by the paper's eq. (13). In the paper, f3 is the impact of Vehicles 2 and 3, and f1
+the impact of Vehicles 1 and 2. For Vehicle 2, f is f1 applied after f3: first the rear impact, then the front impact
+with the changed speed. The speed of the other vehicle of each pair changes at the same time.
 
 The paper leaves some points open. This map resolves them as follows:
 
 * f1 uses the state that f3 has changed, so the front impact has the changed closing speed. Its harm is the square of
-  this speed. The printed J_harm uses the speeds before both impacts, which makes a difference only if both pairs meet
-  at one sample.
-* The printed f1 and f3 also act on overlapping vehicles that separate, and would pull them together again. The text
-  below eq. (13) asks for a positive relative velocity. This map therefore requires it for the exchange and for harm.
-* Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves exactly
-  and no impact is detected, because the paper assumes that there is no impact.
-* The command of a step is the command in force at its first sample (zero-order hold). If a latency ends between two
-  samples, the command takes effect at the later sample.
-* In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. Here the command of every vehicle is
-  limited so that its speed satisfies the constraint at the next sample. An impact can leave a negative speed. Clamping
-  this speed would violate conservation of momentum, so the map keeps it, and the brakes bring it back to 0.
+  this speed. The paper's formula of J_harm uses the speeds before both impacts, which makes a difference only if both
+  pairs have an impact at the same sample.
+* The paper's formulas of f1 and f3 also act on overlapping vehicles that are separating, and would pull them together
+  again. The text below eq. (13) requires a positive relative velocity. This map therefore exchanges velocities and
+  counts harm only if the relative velocity is positive.
+* Samples are at ``tau_2 + n h``, where tau_2 is the latency of Vehicle 2. Before its first sample a world moves
+  exactly, and no impact is detected, because the paper assumes that none happens before.
+* The command of a step is the command in force at its first sample (zero-order hold). If the latency of a vehicle ends
+  between two samples, its command takes effect at the later sample.
+* In the paper ``0 <= v <= v_max`` is a constraint on u and not part of the map. This map limits the command of every
+  vehicle so that the vehicle's speed satisfies the constraint at the next sample. An impact can leave a negative speed.
+  Setting it to 0 would violate conservation of momentum, so the map does not change the negative speed, and the brakes
+  bring it back to 0.
 
-The paper defines the map for N = 3. For any N, the pairs are treated once per sample, from the rear pair to the front
-pair. A gap is negative between a contact and the next sample, and as long as the vehicles overlap; nothing pushes the
-vehicles apart. Source: the paper, section "Optimization Problem".
+The paper defines the map for N = 3. For any N, this map resolves each pair once per sample, from the rear pair to the
+front pair. A gap is negative while the vehicles of the pair overlap; nothing pushes the vehicles apart. Source: the
+paper, section "Optimization Problem".
 """
 
 from __future__ import annotations
@@ -56,8 +59,8 @@ def exchange(
 ) -> tuple[float, float]:
     """Return the speeds of a pair (front, rear) after its impact, by the paper's eq. (13), in m/s.
 
-    With w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ = v_{i+1} - m_i (1 + e)
-    w / (m_i + m_{i+1})``.
+    With the closing speed w = v_{i+1} - v_i: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ =
+    v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})``.
 
     Args:
         front_mps: speed v_i of the front vehicle, m/s.
@@ -78,8 +81,8 @@ def exchange_at_sample(
 ) -> None:  # fmt: skip
     """Apply the impacts of world ``k`` at a sample, from the rear pair to the front pair, and add their harm.
 
-    As in ``advance``, harm is the squared closing speed of the impact itself, and a closing speed of at most
-    ``TOUCH_SPEED_MPS`` is a touch without harm.
+    Harm is computed as in ``advance``: it is the squared closing speed just before the impact, and an impact with a
+    closing speed of at most ``TOUCH_SPEED_MPS`` is a touch without harm.
 
     Args:
         k: row of the world in all arrays.
@@ -114,8 +117,9 @@ def exchange_at_sample(
 def held_motion(speed: float, command: float, limit: float, step: float) -> tuple[float, float]:
     """Return speed (m/s) and distance (m) after a step of constant command: ``v + h u`` and ``h v + h^2 u / 2``.
 
-    The command u is limited so that the speed passes neither standstill nor the speed limit. The distance is computed
-    as h times the mean of the speeds at both ends, which is equal for constant u. Brakes act against the motion.
+    First, the command u is limited so that the speed does not go beyond standstill or the speed limit. The distance is
+    computed as h times the mean of the speeds at the start and the end of the step, which is the same for constant u.
+    Brakes act against the motion.
 
     Args:
         speed: speed v at the start, m/s; may be negative after an impact.
@@ -149,7 +153,7 @@ def held_speeds(speeds: Floats, command: Floats, limit: Floats, step: float) -> 
 def move_to_grid(
     k: int, duration: float, time: float, gaps: Floats, speeds: Floats, command: Floats, latency: Floats, limit: Floats
 ) -> None:
-    """Move world ``k`` exactly, before its first sample and without impacts. Updates ``gaps`` and ``speeds``.
+    """Move world ``k`` exactly and without impacts, at a time before its first sample. Updates ``gaps`` and ``speeds``.
 
     Args:
         k: row of the world in all arrays.
@@ -219,11 +223,13 @@ def advance_sampled(
     """Advance ``worlds`` by the paper's fixed-step map under constant commands; return new worlds and impacts.
 
     The first sample is at the latency of Vehicle 2; samples are ``step_s`` apart. A world ends at its first sample at
-    or after ``until_s``, or at ``until_s`` itself if this is before its first sample. Impacts of the last sample belong
-    to the next call, so calls can be chained. The returned state is the paper's s(n), before the impacts of the last
-    sample. ``Impacts.rows`` is None. The result of a world does not depend on its batch. Inputs are not changed.
+    or after ``until_s``, or at ``until_s`` itself if this is before its first sample. Impacts of the last sample are
+    left to the next call, so that the result can be passed to this function again. The returned state is the paper's
+    s(n), the state before the impacts of the last sample. ``Impacts.rows`` is None. The result of a world does not
+    depend on the other worlds. Inputs are not changed.
 
-    Gaps of the result may be negative. Continue such worlds with this function and not with ``advance``.
+    Gaps of the result may be negative. Worlds with negative gaps must be advanced with this function and not with
+    ``advance``.
 
     Args:
         worlds: n worlds of N vehicles.

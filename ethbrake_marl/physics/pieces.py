@@ -1,7 +1,7 @@
-"""Braking in pieces: after its latency, a vehicle follows a fixed sequence of commands that nothing else can change.
+"""Braking profiles: after its latency, a vehicle follows a fixed sequence of commands (*brakes in pieces*).
 
-A *piece* is a time interval of constant command. A world with pieces is advanced like a world whose brakes build up,
-with rates that may be infinite.
+A *piece* is a time interval in which the command of this vehicle is constant. Worlds with such vehicles are advanced by
+the kernels for brakes that build up (``physics.build_up``); the rates of build-up may be infinite.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ def force_at(table: Floats, i: int, command: float, latency_s: float, time_s: fl
 
 @compiled
 def force_now(force: float, wanted: float, brake_rate: float, release_rate: float) -> float:
-    """Return the force (m/s2) just after a command takes effect; it equals the command if its rate is infinite.
+    """Return the force (m/s2) just after a command takes effect; it equals the command if the force can jump.
 
-    The force is the acceleration by brakes or engine. At a finite rate it does not jump.
+    The force is the acceleration by brakes or engine. The force jumps only if its rate of change is infinite.
 
     Args:
         force: force just before the command takes effect, m/s2.

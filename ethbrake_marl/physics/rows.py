@@ -1,7 +1,7 @@
 """The table of one world on which the compiled kernels work: a row per quantity, a column per vehicle or pair.
 
 The constants of ``ROW`` name the rows: ``table[ROW.SPEED, i]`` is the speed of vehicle i. In a row for pairs, column p
-is the pair (vehicle p, vehicle p + 1). If there is an obstacle ahead, it takes column 0 as if it were a vehicle.
+is the pair (vehicle p, vehicle p + 1). An obstacle ahead is treated as a vehicle in column 0.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def builds_up(table: Floats) -> bool:
 def rows_for(pieces: int) -> int:
     """Return the number of rows of a table for vehicles that follow K pieces each; ``pieces`` is 2 K.
 
-    A piece is a time interval of constant command. For ``pieces`` = 0 the result is ROW.OF_BUILD_UP.
+    A piece is a time interval of constant command. If ``pieces`` is 0, the result is ROW.OF_BUILD_UP.
     """
     return ROW.PIECES + pieces if pieces > 0 else ROW.OF_BUILD_UP
 
@@ -161,8 +161,8 @@ def rows_for(pieces: int) -> int:
 def place_rates(table: Floats, brake_rate: Floats, release_rate: Floats, pieces: Floats) -> None:
     """Write brake rates, release rates and sequences of commands of one world's vehicles into its table.
 
-    A piece is one interval of a fixed sequence of commands. If all rates are infinite and no vehicle has pieces,
-    BUILDS_UP is 0 and forces are not used.
+    A piece is one interval of a fixed sequence of commands. If all rates are infinite and no vehicle follows a fixed
+    sequence of commands, the entry BUILDS_UP is set to 0, and forces are not used.
 
     Args:
         table: table to fill, [rows_for(2 K), N or N + 1]; with N + 1 columns, column 0 is an obstacle.
@@ -192,7 +192,7 @@ def place_forces(
     """Write brake and release rates, sequences of commands and present forces of one world's vehicles into its table.
 
     ``force``: present acceleration by brakes or engine, [N] m/s2. The other arguments are the same as in
-    ``place_rates``. Forces are written only if BUILDS_UP is 1.
+    ``place_rates``. Forces are written only if the entry BUILDS_UP of the table is 1.
     """
     place_rates(table, brake_rate, release_rate, pieces)
     if table[ROW.BUILDS_UP, 0] == 1.0:

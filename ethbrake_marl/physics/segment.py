@@ -62,9 +62,9 @@ def _advance(
     table: Floats, restitution: float, duration: float, start_s: float, world: int, rows: Floats, recorded: int,
     building: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Do the work of ``advance_table`` for both kinds of motion; the arguments and the result are the same.
+    """Do the work of ``advance_table`` for brakes that act at once or build up; arguments and result are the same.
 
-    Callers pass ``building`` (whether brakes build up) as a constant, so only one kind of motion is compiled.
+    Callers pass ``building`` (whether brakes build up) as a constant, so only the code for this case is compiled.
     """
     for p in range(table.shape[1] - 1):
         table[ROW.FIRST_HARM, p] = 0.0
@@ -87,8 +87,8 @@ def move_apart(table: Floats, duration: float, building: bool) -> bool:
     """Move a world to the end of the segment and return True, or return False if two vehicles may touch.
 
     If the result is False, the world has not moved. If both vehicles of a pair have constant accelerations, the time of
-    their contact is computed exactly. Otherwise a bound is used: speeds are monotone within a segment, so a gap shrinks
-    by at most ``(max rear speed - min front speed) T``.
+    their contact is computed exactly. Otherwise the function uses a bound: without contact speeds are monotone within a
+    segment of length T, so a gap shrinks by at most ``(max rear speed - min front speed) T``.
 
     Args:
         table: the world in the layout of ``physics.rows``.
@@ -143,7 +143,7 @@ def start_events(table: Floats, building: bool) -> None:
 
 @compiled(bare=True)
 def to_next_impact(table: Floats, restitution: float, now: float, duration: float, building: bool) -> tuple[int, float]:
-    """Move a world up to and including its next round of impacts, or to the end of the segment.
+    """Move a world to its next impacts and resolve them, or move it to the end of the segment.
 
     Returns a status and the time reached (s). The status is IMPACT (call the function again), DONE, or the code of the
     check that failed.
@@ -197,7 +197,7 @@ def to_next_event(table: Floats, now: float, duration: float, building: bool) ->
 def begin_commands(table: Floats, now: float, passed: float, building: bool) -> None:
     """Put into effect the commands that begin between ``now`` and ``now + passed``.
 
-    This includes the next command of each vehicle that follows a fixed sequence of commands.
+    The function does the same for the next command of each vehicle that follows a fixed sequence of commands.
 
     Args:
         table: the world in the layout of ``physics.rows``.

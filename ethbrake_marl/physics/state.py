@@ -41,10 +41,10 @@ _ON_ROADS = ("braking_capacity_mps2", "driving_capacity_mps2")  # limited by fri
 
 
 def as_road_allows(quantities: Mapping[str, Floats], friction: Floats) -> dict[str, Floats]:
-    """Return ``quantities`` with the braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
+    """Return a copy of ``quantities`` with braking and driving capacities limited to ``friction * GRAVITY_MPS2``.
 
     ``quantities`` maps field names such as ``braking_capacity_mps2`` to arrays; ``friction`` broadcasts to their shape.
-    Other fields are returned unchanged.
+    All other entries are unchanged.
     """
     most = friction * GRAVITY_MPS2
     return {key: np.minimum(value, most) if key in _ON_ROADS else value for key, value in quantities.items()}
@@ -96,7 +96,7 @@ class Vehicles:
         pieces: Floats | None = None,
         harm_weight: Floats | None = None,
     ) -> Vehicles:
-        """Return vehicles without a channel: each vehicle knows everything from its own latency on.
+        """Return parameters of vehicles without a V2X channel: each vehicle knows everything from its own latency on.
 
         Arguments are arrays as in the fields of this class: capacities, latency, mass (t) and speed limit are [n, N],
         ``restitution`` is [n], rates are [n, N]. If a rate is None, commands take full effect at once. If ``pieces`` is
@@ -114,7 +114,7 @@ class Vehicles:
 
     @staticmethod
     def known_at_once(latency_s: Floats) -> Floats:
-        """Return ``known_from_s`` [n, N, N] without a channel, from the latencies [n, N] s.
+        """Return the field ``known_from_s`` [n, N, N] of vehicles without a V2X channel, from their latencies [n, N] s.
 
         Vehicle i acts on news of every vehicle from its own latency on. The result is a read-only view of
         ``latency_s``; its last axis has stride 0, so it takes no memory.
@@ -127,22 +127,23 @@ class Vehicles:
 
     @property
     def build_up(self) -> Bools:
-        """Whether some vehicle of each world has a finite brake or release rate, or brakes in pieces, [n]."""
+        """Whether some vehicle of each world has a finite brake or release rate, or follows a braking profile, [n]."""
         rates = np.minimum(self.brake_rate_mps3, self.release_rate_mps3)
         return np.asarray(np.isfinite(rates).any(axis=1) | self.in_pieces)
 
     @property
     def in_pieces(self) -> Bools:
-        """Whether some vehicle of each world brakes in pieces, that is, by a fixed sequence of commands, [n]."""
+        """Whether some vehicle of each world follows a braking profile, that is, a fixed sequence of commands, [n]."""
         return np.asarray(np.isfinite(self.pieces).any(axis=(1, 2)))
 
     def piece_commands(self, command_mps2: Floats, time_s: Floats) -> Floats:
-        """Return the commands of all vehicles, [n, N] m/s2; vehicles that brake in pieces follow their current piece.
+        """Return the commands of all vehicles, [n, N] m/s2; vehicles with a braking profile get its present command.
 
         A piece is a time interval of constant command.
 
         Args:
-            command_mps2: commands of all vehicles, [n, N] m/s2; returned unchanged for vehicles without pieces.
+            command_mps2: commands of all vehicles, [n, N] m/s2; returned unchanged for vehicles without a braking
+                profile.
             time_s: absolute time in each world, [n] s.
 
         """
@@ -156,9 +157,9 @@ class Vehicles:
     def hide_from(self, vehicle: int) -> Bools:
         """Return whether a channel hides part of the line from ``vehicle`` (index from 0) at its first decision, [n].
 
-        The channel hides something if news of another vehicle has not arrived yet. It also hides something if another
-        vehicle reacts later than its own latency, because messages report only this latency. Without a channel nothing
-        is hidden.
+        The channel hides something if information about another vehicle has not arrived yet. It also hides something if
+        the channel delays another vehicle beyond that vehicle's own latency, because messages contain only the own
+        latency. If there is no channel, nothing is hidden.
         """
         late = self.latency_s > self.own_latency_s
         hidden = (self.known_from_s[:, vehicle] > self.latency_s[:, [vehicle]]) | late
@@ -167,7 +168,7 @@ class Vehicles:
 
     @property
     def is_known_at_once(self) -> bool:
-        """Whether every vehicle knows everything from its own latency on, so that no channel has an effect."""
+        """Whether every vehicle knows everything from its own latency on, as without a V2X channel."""
         if self._is_view:
             return True
         own, latency = self.own_latency_s, self.latency_s
@@ -270,7 +271,7 @@ class Worlds:
         command_mps2: ArrayLike = 0.0,
         pair_hit: ArrayLike = False,
     ) -> Worlds:
-        """Return these worlds with a later state, for example from another simulator.
+        """Return these worlds with another state at a later time, for example from another simulator.
 
         >>> import ethbrake_marl as eb
         >>> alert = eb.load_scenario("paper-random").sample(2, seed=7).worlds
@@ -298,7 +299,7 @@ class Worlds:
         )
 
     def read_only(self) -> Worlds:
-        """Return the same worlds as read-only views."""
+        """Return the same worlds, with their arrays as read-only views."""
         return self._each(_unwritable)
 
     def on_road(self, friction: Floats, dry: Mapping[str, Floats] | None = None) -> Worlds:
@@ -327,11 +328,11 @@ class Worlds:
         return value
 
     def play_pieces(self, pieces: Mapping[int, Sequence[tuple[float, float]]]) -> Worlds:
-        """Return these worlds with some vehicles braking in pieces, that is, by a fixed sequence of commands.
+        """Return these worlds, in which some vehicles follow a braking profile, that is, a fixed sequence of commands.
 
-        ``pieces`` maps a vehicle (index from 0) to its sequence of (start, deceleration). The start is in s after the
-        vehicle's latency, 0 for the first piece; the deceleration is in m/s2. All other vehicles, and vehicles with a
-        single piece, do not brake in pieces.
+        ``pieces`` maps a vehicle (index from 0) to its profile, a sequence of pairs (start, deceleration). The start of
+        an interval is in s after the vehicle's latency, and 0 for the first interval; the deceleration is in m/s2. A
+        vehicle whose profile has a single interval is treated as a vehicle without a profile.
         """
         several = {i: np.array(each, np.float64) for i, each in pieces.items() if len(each) > 1}
         if not several and not self.vehicles.pieces.shape[2]:
@@ -343,14 +344,15 @@ class Worlds:
         return replace(self, vehicles=replace(self.vehicles, pieces=commands.reshape(self.n, self.N, 2 * most)))
 
     def refuse_build_up(self, who: str) -> None:
-        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or brakes in pieces.
+        """Raise ``InvalidInput`` if some vehicle has a finite brake or release rate, or follows a braking profile.
 
-        Callers whose results are not exact in such worlds use this check. ``who``: name of the caller in the message.
+        Callers use this check if their results are not exact in such worlds. ``who``: name of the caller in the
+        message.
         """
         slow = self.vehicles.build_up
         if self.vehicles.in_pieces.any():
             raise InvalidInput(
-                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} brakes in pieces (profile), and"
+                f"{who}: a vehicle of world {int(np.argmax(self.vehicles.in_pieces))} follows a braking profile, and"
                 " the result would not be exact; use a constant command"
             )
         if slow.any():
@@ -413,12 +415,13 @@ class Worlds:
         )
 
     def with_post_ahead(self, duration_s: Floats) -> Worlds:
-        """Return these worlds with an obstacle in each: its own, or one that is out of reach for ``duration_s`` [n].
+        """Return these worlds with an obstacle in each; added obstacles are out of reach for ``duration_s`` [n].
 
-        The change of the gap to the obstacle is the distance that Vehicle 1 travels, which worlds do not store. An
-        added obstacle changes no motion: it is farther away than ``T sqrt(2 E / m_1)``, the distance that Vehicle 1
-        would travel in the duration T if it had all the energy E that the line can ever have. Impacts and brakes only
-        remove energy. Driving adds at most ``m a v`` per second, and only up to the speed limit.
+        The gap to an added obstacle shows how far Vehicle 1 travels, which worlds do not store. An added obstacle
+        changes no motion, because it is farther away than ``T sqrt(2 E / m_1)``. This is the distance that Vehicle 1,
+        of mass m_1, would travel in the duration T if it had all the energy E that the line can ever have. Impacts and
+        brakes only remove energy. A vehicle of mass m that drives at the speed v with the acceleration a adds at most
+        the energy ``m a v`` per second, and only up to the speed limit.
         """
         vehicles = self.vehicles
         driving = vehicles.driving_capacity_mps2 * vehicles.speed_limit_mps * duration_s[:, np.newaxis]
@@ -428,10 +431,10 @@ class Worlds:
 
 
 def _alike(parts: Sequence[Worlds]) -> Sequence[Worlds]:
-    """Return the batches ``parts`` with equal columns, so that they can be joined.
+    """Return the batches ``parts`` with equal numbers of columns, so that they can be joined.
 
-    All batches get columns for the same number of pieces of braking. If some batches have a road, the other batches get
-    a road with infinite friction.
+    All batches get columns for equally long fixed sequences of commands (``Vehicles.pieces``). If the friction of the
+    road is modelled in some batches, the other batches get infinite friction.
     """
     most = max(part.vehicles.pieces.shape[2] for part in parts)
     if any(part.vehicles.pieces.shape[2] < most for part in parts):
@@ -465,7 +468,7 @@ def _unwritable(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _span(values: Floats) -> str:
-    """Format the smallest and the largest value; only one value if they are equal, ``none`` without values."""
+    """Format the smallest and the largest value; only one number if they are equal; ``none`` if there are no values."""
     if not values.size:
         return "none"
     low, high = float(values.min()), float(values.max())
@@ -562,10 +565,10 @@ def make_worlds(
         mass_t: mass, t, broadcast to [n, N].
         restitution: coefficient of restitution of every impact, in [0, 1], broadcast to [n].
         speed_limit_mps: speed up to which a vehicle drives, m/s, broadcast to [n, N].
-        brake_rate_mps3: rate at which the acceleration in force falls to a lower command, m/s3, broadcast to [n, N];
-            inf: it falls at once.
-        release_rate_mps3: rate at which the acceleration in force rises to a higher command, m/s3, broadcast to [n, N];
-            inf: it rises at once.
+        brake_rate_mps3: rate at which a vehicle's acceleration falls to a lower command, m/s3, broadcast to [n, N];
+            inf: the acceleration falls at once.
+        release_rate_mps3: rate at which a vehicle's acceleration rises to a higher command, m/s3, broadcast to [n, N];
+            inf: the acceleration rises at once.
         obstacle_gap_m: gap from Vehicle 1 to an obstacle ahead, m, broadcast to [n]; None: no obstacle.
         friction: friction coefficient of the road, broadcast to [n]; it limits capacities to
             ``friction * GRAVITY_MPS2``. None: no limit.

@@ -1,4 +1,4 @@
-"""The exact motion within a segment (an interval of constant commands) for drawings, as pieces of constant jerk."""
+"""The exact motion within a segment (an interval of constant commands) for drawings, as intervals of constant jerk."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _CAPACITY = 64
 
 @compiled
 def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) -> int:
-    """Write the state at the start of each piece of constant jerk into ``rows``; return the number of pieces.
+    """Write the state at the start of each interval of constant jerk into ``rows``; return the number of intervals.
 
-    The state consists of time, gaps, speeds, accelerations and jerks. Pieces that do not fit into ``rows`` are only
+    The state consists of time, gaps, speeds, accelerations and jerks. Intervals that do not fit into ``rows`` are only
     counted. The number is negative if a contact was missed.
 
     Args:
@@ -62,7 +62,7 @@ def _pieces(table: Floats, restitution: float, duration: float, rows: Floats) ->
 
 
 def segment_pieces(worlds: Worlds, command_mps2: Floats, until_s: Floats) -> list[Floats]:
-    """Return the motion of each world up to ``until_s`` under constant commands, by intervals of constant jerk.
+    """Return the motion of each world until ``until_s`` under constant commands, as intervals of constant jerk.
 
     Args:
         worlds: n worlds of N vehicles; they are not changed.

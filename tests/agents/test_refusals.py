@@ -133,19 +133,19 @@ OWN: dict[str, Callable[[], object]] = {
     "and returned the form (dtype('float64'), 2); keys": lambda: evaluated(
         Remembers(lambda n: np.zeros((n, 1)), lambda m, n: np.zeros((n, 2)))
     ),
-    "agent 'mine' of vehicle_2: memory: key 'b.c'; must be a name": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory: key 'b.c': must be an identifier": lambda: evaluated(
         Remembers(lambda n: {"a": (np.zeros(n), {"b.c": np.zeros(n)})}, lambda m, n: m)
     ),
-    "agent 'mine' of vehicle_2: memory: key 0; must be a name": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory: key 0: must be an identifier": lambda: evaluated(
         Remembers(lambda n: {0: np.zeros(n)}, lambda m, n: m)
     ),
-    "agent 'mine' of vehicle_2: memory: an array of objects; it must contain numbers": lambda: evaluated(
+    "agent 'mine' of vehicle_2: memory: contains an array of objects; arrays must contain numbers": lambda: evaluated(
         Remembers(lambda n: np.array([[]] * n + [[1]], object)[:n], lambda m, n: m)
     ),
     "the closed form of E-V2X-BM and planner: brakes of world 0 build up (brake_rate_mps3": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), SLOW
     ),
-    "the closed form of E-V2X-BM and planner: a vehicle of world 0 brakes in pieces (profile)": lambda: evaluated(
+    "the closed form of E-V2X-BM and planner: a vehicle of world 0 follows a braking profile": lambda: evaluated(
         make_agent("e_v2x_bm:pairwise"), PIECES
     ),
 }
@@ -362,7 +362,7 @@ def test_policy__gives_one_action_per_world_and_a_state_per_world() -> None:
     with refused("predict fails for 27 features: a state array has shape (1, 8) for two worlds and (1, 8) for three"):
         eb.policy_agent(Shared())
     states = eb.policy_agent(lambda seen, state: (seen, state), name="mine", initial_state=lambda n: np.zeros(3))
-    with refused("initial_state(12): state: ndarray of shape (3,); its first axis must be the 12 worlds", AgentFailed):
+    with refused("initial_state(12): state: ndarray of shape (3,); arrays must have length 12", AgentFailed):
         states.begin(WORLDS, 1, {})
 
 

@@ -165,7 +165,7 @@ def test_objective__is_refused(message: str) -> None:
 
 
 ENGINE: dict[str, Callable[[], object]] = {
-    "engine: deciders = (3,): must be vehicle indices": lambda: Engine(
+    "engine: deciders = (3,): all must be vehicle indices": lambda: Engine(
         PAPER, 1, learners=(), scripts=SCRIPTS, deciders=(3,)
     ),
     "engine snapshot: the array state has the shape (6, 20); the shape (7, 20) is": lambda: make_engine(
@@ -211,7 +211,7 @@ def test_episode__starts_at_the_alert_without_an_impact() -> None:
 
 def test_branch__has_an_end_and_no_shaping() -> None:
     shaped = make_engine(PAPER, 2, reward={"harm": 1.0, "shaping": 0.1})
-    with refused("branches: the reward has shaping = 0.1; it must be 0 for branches"):
+    with refused("branch: the reward has shaping = 0.1; it must be 0 to branch"):
         shaped.branch(shaped.moment())
 
 

@@ -94,8 +94,8 @@ EVALUATIONS: dict[str, Callable[[], object]] = {
     "agent 'confused': predicted_harm in its memory has type float64 and shape (3, 2); must be one": lambda: (
         eb.evaluate(WORLDS, {"x": Confused((3, 2))}, scenario=PAPER)
     ),
-    "agent 'confused' of vehicle_2: memory: ndarray of shape (2,); its first axis must be the 3 worlds": lambda: (
-        eb.evaluate(WORLDS, {"x": Confused((2,))}, scenario=PAPER)
+    "agent 'confused' of vehicle_2: memory: ndarray of shape (2,); arrays must have length 3": lambda: eb.evaluate(
+        WORLDS, {"x": Confused((2,))}, scenario=PAPER
     ),
     "agent 'ppo' was not evaluated; evaluated agents: full_brake": lambda: eb.evaluate(
         WORLDS, BRAKE, scenario=PAPER

@@ -107,7 +107,7 @@ SAMPLED: dict[str, Callable[[], object]] = {
     "advance_sampled: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3)": lambda: advance_sampled(
         line([5.0], [9.0, 9.0], brake_rate_mps3=9.0), [[0.0, 0.0]], until_s=1.0
     ),
-    "advance_sampled: a vehicle of world 0 brakes in pieces (profile), and the result would not be exact": lambda: (
+    "advance_sampled: a vehicle of world 0 follows a braking profile, and the result would not be exact": lambda: (
         advance_sampled(line([5.0], [9.0, 9.0]).play_pieces({1: [(0, 3), (1, 5)]}), [[0.0, 0.0]], until_s=1.0)
     ),
 }

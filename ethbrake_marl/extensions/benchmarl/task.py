@@ -1,7 +1,8 @@
-"""A scenario as a TorchRL environment and as a BenchMARL task. Needs the extra ``marl``.
+"""A scenario as a TorchRL environment and as a BenchMARL task. The module needs the package's extra ``marl``.
 
-The environment runs ``n`` worlds in one engine. All learners of a world form one group, and their episodes end at the
-same time. ``state``, the input of a central critic, is the full state of the line (``game.full_state.full_state``).
+The environment runs ``n`` worlds in one engine. All learners of a world form one group in TorchRL. The episode of a
+world ends for all of them at the same time. ``state``, the input of a central critic, is the full state of the line
+(``game.full_state.full_state``).
 
 Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
 """
@@ -35,7 +36,7 @@ GROUP = "learners"
 class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the extra is not installed
     """TorchRL environment with ``n`` worlds of one scenario and ``L`` learners.
 
-    Shapes: observation [n, L, F], action [n, L, 1] (discrete action: [n, L]), reward [n, L, 1], state [n, S], done
+    Shapes: observation [n, L, F], action [n, L, 1] (with discrete actions [n, L]), reward [n, L, 1], state [n, S], done
     [n, 1]. F is the number of features of an observation, S of the state.
 
     Args:
@@ -43,10 +44,10 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         n: number of worlds.
         seed: seed of the worlds.
         reward: reward of the learners: a name such as ``harm``, or weights.
-        horizon_is_end: True: an episode that the horizon ends counts as terminated; False: as truncated.
-        shield: mode of a shield for the learners (``step`` if there are several learners); None: no shield.
-        actions: number of discrete actions; an action is then an index (for QMIX, for instance). None: continuous
-            actions.
+        horizon_is_end: whether an episode that ends at the horizon counts as terminated (True) or as truncated (False).
+        shield: mode of a shield for the learners; it must be ``step`` if there are several learners. None: no shield.
+        actions: number of discrete actions, for learners such as QMIX; an action is then an index. None: actions are
+            numbers in [-1, 1].
 
     """
 
@@ -106,7 +107,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start new episodes in all worlds, with worlds drawn from ``seed``. None has no effect."""
+        """Start new episodes in all worlds, with worlds drawn from ``seed``. If ``seed`` is None, nothing happens."""
         if seed is not None:
             self.engine.reset(seed=seed)
 
@@ -122,9 +123,9 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
-        config: mapping with the keys ``scenario``, ``reward``, ``horizon_is_end`` and, optionally, ``shield`` and
+        config: mapping with the keys ``scenario``, ``reward`` and ``horizon_is_end``, and optionally ``shield`` and
             ``actions``. The scenario is the name of a shipped scenario, the path of a YAML file, a mapping with the
-            content of such a file, or a ``Scenario``. All other keys are arguments of ``LineEnv``.
+            content of such a file, or a ``Scenario``. The values of the other keys are arguments of ``LineEnv``.
 
     """
 
@@ -140,7 +141,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
             seed: seed of the worlds; None: 0.
             device: unused.
 
-        Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete ones, or the reverse.
+        Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete actions, or the other
+        way round.
 
         """
         config, actions = self.config, self.config.get("actions")
@@ -153,11 +155,11 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
 
     def supports_continuous_actions(self) -> bool:
-        """Return whether actions are continuous, which is so if the key ``actions`` is None or missing."""
+        """Return whether actions are continuous: True if the key ``actions`` of the task is None or missing."""
         return self.config.get("actions") is None
 
     def supports_discrete_actions(self) -> bool:
-        """Return whether actions are discrete, which is so if the key ``actions`` is a number."""
+        """Return whether actions are discrete: True if the key ``actions`` of the task is a number."""
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
@@ -166,7 +168,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
     def has_render(self, env: Any) -> bool:
-        """Return False, because the environment cannot draw itself."""
+        """Return False, because the environment cannot be drawn."""
         return False
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
@@ -200,7 +202,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     @staticmethod
     def env_name() -> str:
-        """Return the name of the group of tasks in BenchMARL."""
+        """Return the name under which BenchMARL groups these tasks."""
         return "ethbrake"
 
 

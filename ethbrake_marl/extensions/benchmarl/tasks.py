@@ -1,8 +1,8 @@
-"""Register every shipped scenario that has a learner as a BenchMARL task. Needs the extra ``marl``.
+"""Register every shipped scenario that has a learner as a BenchMARL task (needs the extra ``marl``).
 
-``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is the command line of
-BenchMARL, Hydra overrides included, with these tasks. BenchMARL searches tasks in its own folder only. This module
-therefore adds the tasks to BenchMARL's tables before BenchMARL reads the command line.
+``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` is BenchMARL's own
+command line, which then knows these tasks and takes Hydra overrides. BenchMARL searches tasks only in its own folder.
+This module therefore adds the tasks to BenchMARL's tables of tasks before BenchMARL reads the command line.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ethbrake_marl.scenario.catalogue import list_scenarios, load_scenario
 
 
 class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra is not installed
-    """BenchMARL's enumeration of tasks, one for each shipped scenario that has a learner."""
+    """Enumeration of tasks in BenchMARL's form: one task for each shipped scenario that has a learner."""
 
     @staticmethod
     def associated_class() -> type[LineTask]:
@@ -26,7 +26,7 @@ class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra 
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return the task for the scenario file ``path``; None: for the shipped scenario of this member.
+        """Return the task for the scenario file ``path``, or, if it is None, for the shipped scenario of this entry.
 
         The reward is minus the harm, and the task has no shield.
         """
@@ -49,7 +49,7 @@ EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
 
 
 def register_tasks() -> None:
-    """Add the tasks to BenchMARL's tables, with names such as ``ethbrake/paper_random``. May be called repeatedly."""
+    """Add the tasks to BenchMARL's tables, with names such as ``ethbrake/paper_random``; may be called repeatedly."""
     store = ConfigStore.instance()
     for task in EthBrakeTask:
         name = task.name.lower()

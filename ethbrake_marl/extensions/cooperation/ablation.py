@@ -63,7 +63,7 @@ class Cost(NamedTuple):
         return {**self._asdict(), "damaged": [str(file) for file in self.damaged], "total_s": self.total_s}
 
     def __str__(self) -> str:
-        """Return the estimate as text, with one line for each damaged file."""
+        """Return the estimate as text, with a line for each damaged file of an earlier run."""
         speed = f" at {self.decisions / self.training_s:,.0f}/s" if self.training_s > 0.0 else ""
         text = Timed.in_words
         line = (
@@ -84,7 +84,7 @@ def ablation_cost(plan: Plan) -> Cost:
     """Estimate the remaining work of an ablation, as processor time of one core.
 
     The function times a short training for each level and recipe, a short evaluation, and a short search. In a sweep it
-    does so for one level, because all levels of a sweep take about the same time.
+    times only one level, because all levels of a sweep take about the same time.
 
     Raises the exceptions of ``TrainingJob.steps_left``. Raises the exceptions of ``load_team`` if the policies of a
     finished training cannot be loaded.

@@ -42,16 +42,21 @@ def ablate_command(
     ] = None,
     search_episodes: Annotated[
         int | None,
-        typer.Option(help="Number of these worlds in which to search the joint optimum.", show_default="600", min=1),
+        typer.Option(
+            help="Number of worlds (of --episodes) in which to search the joint optimum.", show_default="600", min=1
+        ),
     ] = None,
     shield: Annotated[
         str | None,
-        typer.Option(metavar="step", help="Also evaluate with this shield for all learners.", show_default="none"),
+        typer.Option(metavar="step", help="Also evaluate all learners with this shield.", show_default="none"),
     ] = None,
     settings: SettingsOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="Use few seeds, worlds and decisions.")] = False,
     cost: Annotated[
-        bool, typer.Option("--cost", help="Estimate the time by short trials, print it with the folders, and exit.")
+        bool,
+        typer.Option(
+            "--cost", help="Estimate the time by short trials, print the estimate and the output folders, and exit."
+        ),
     ] = False,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
@@ -61,8 +66,8 @@ def ablate_command(
     The command first prints how long it will take. It writes ablation.html, ablation.md, ablation.csv, ablation.json
     and three figures. After an interruption, repeat the command to continue.
 
-    With --sweep, one level is trained with several values of one key. The two figures of a sweep show harm against
-    these values.
+    With --sweep, the levels are copies of one scenario with different values of one key. The two figures of a sweep
+    show harm against these values.
     """
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.extensions.cooperation.ablation import HOW_MEASURED, ablation_cost, run_ablation
@@ -70,7 +75,7 @@ def ablate_command(
         from ethbrake_marl.extensions.studies.machine import this_machine
 
         if sweep is not None and len(sweep) > 1:
-            raise InvalidInput("--sweep is given twice; give it once, because the figures have one axis for the values")
+            raise InvalidInput("--sweep is given twice; give it once, because the figures can show only one swept key")
         plan = plan_ablation(
             levels, recipes, settings, sweep=sweep[0] if sweep else None, quick=quick, tell=out.note,
             seeds=seeds, steps_per_learner=steps, episodes=episodes, search_episodes=search_episodes, shield=shield,

@@ -1,10 +1,10 @@
 """Compare levels of cooperation: harm at each level, change of harm between levels, and distance to the joint optimum.
 
-A *level* is a scenario. The *ladder* is the sequence of levels, in which each level is compared with the previous one.
+A *level* is a scenario. The *ladder* is the sequence of levels; each level in it is compared with the level before it.
 The *joint optimum* is the least known harm that all learners of a level can achieve together.
 
-The confidence intervals account for the choice of training seeds and of worlds: both are resampled
-(``evaluation.seeds``). Worlds from one recording are resampled together.
+The confidence intervals account for the random choice of training seeds and of worlds, because seeds and worlds are
+both resampled (``evaluation.seeds``). Worlds from one recording are resampled together.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from ethbrake_marl.shields.episodes import Shielded
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Return the comparison of all levels as a mapping for JSON. docs/extensions/cooperation.md describes it.
+    """Return the comparison of all levels as a mapping for JSON. docs/extensions/cooperation.md describes the keys.
 
     The mapping has four keys with lists:
 
@@ -68,9 +68,10 @@ def _undertrained(measured: Sequence[Measured]) -> list[str]:
 
 
 def _level(one: Measured, searched: int) -> Json:
-    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the first ``searched``.
+    """Return the results of one level with one algorithm: harm (m2/s2) in all worlds, and in the searched worlds.
 
-    For the first ``searched`` worlds, the result also has the joint optimum and the share of the possible reduction.
+    The searched worlds are the first ``searched`` worlds. For them the result also has the joint optimum and the share
+    of the possible reduction.
     """
     scenario = one.level.scenario
     of_searched = None if one.clusters is None else one.clusters[:searched]
@@ -124,7 +125,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
         one: results of the level without a shield.
         shielded: results of the same teams in the same worlds, with a shield that bounds the harm ``harm_count``.
         harm_count: impacts that count as harm: the first impact of each pair (``first``), or all (``total``).
-        searched: number of worlds, counted from the first, whose means the entry ``searched`` of the result has.
+        searched: number of worlds in which the joint optimum was searched. The entry ``searched`` of the result has
+            means over these first worlds.
 
     """
     before, after = one.reached.vehicle[harm_count], shielded.vehicle_harm
@@ -151,8 +153,8 @@ def _behind(one: Measured, shielded: Shielded, harm_count: HarmCount, searched: 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     """Return the change of harm from level ``before`` to level ``after`` in the same worlds; positive: more harm.
 
-    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``. It
-    has the changes of the whole line and of each vehicle, for both counts of harm. ``algorithm`` is the name to record.
+    The result has the form ``{"from": name, "to": name, "algorithm": name, "first": changes, "total": changes}``.
+    ``changes`` has the change of the harm of the whole line and of each vehicle. ``algorithm`` is the name to record.
     """
     entry: Json = {"from": before.level.name, "to": after.level.name, "algorithm": algorithm}
     if before.level.swept is not None and after.level.swept is not None:

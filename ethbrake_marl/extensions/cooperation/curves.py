@@ -36,7 +36,7 @@ def swept_axis(results: Json) -> str | None:
 
 
 def sweep_figures(results: Json, caption: str) -> list[Figure]:
-    """Return the two figures of a sweep, with the swept number on the x axis, linear axes, and 95 % intervals.
+    """Return the two figures of a sweep, with the swept number on a linear x axis, and with 95 % intervals.
 
     Args:
         results: content of ``ablation.json``.
@@ -47,9 +47,9 @@ def sweep_figures(results: Json, caption: str) -> list[Figure]:
 
 
 def _harm_curves(results: Json, caption: str) -> Figure:
-    """Draw both counts of harm, with full braking and the joint optimum for comparison.
+    """Draw first-impact and total harm of each value, with full braking and the joint optimum for comparison.
 
-    The figure is for the worlds in which the joint optimum was searched.
+    The values are means over the worlds in which the joint optimum was searched.
     """
     figure, panels = new_panels((10.5, 4.8), columns=2)
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -81,7 +81,7 @@ def _harm_curves(results: Json, caption: str) -> Figure:
 
 
 def _who_bears(results: Json, caption: str) -> Figure:
-    """Draw the harm of each vehicle, in all worlds. Each algorithm has its own line style."""
+    """Draw the mean harm of each vehicle over all worlds. Each algorithm has its own line style."""
     figure, panels = new_panels((10.5, 4.8), columns=2)
     several = len(algorithms(results))
     for axes, harm_count in zip(panels, HARM_COUNTS, strict=True):
@@ -147,13 +147,13 @@ def _curve(
 
 
 def _places(levels: Sequence[Json], beside: int) -> list[float]:
-    """Return the x positions of the swept numbers, moved to the right by ``beside`` small steps."""
+    """Return the x positions of the swept numbers; algorithm number ``beside`` is moved that many small steps right."""
     low, high = _span(levels)
     return [level["swept_number"] + beside * _BESIDE * (high - low) for level in levels]
 
 
 def _span(levels: Sequence[Json]) -> tuple[float, float]:
-    """Return the ends of the x axis, which covers the swept numbers and 0."""
+    """Return the smallest and the largest number on the x axis, which covers the swept numbers and 0."""
     numbers = [level["swept_number"] for level in levels]
     return min(*numbers, 0.0), max(*numbers, 0.0)
 
@@ -161,7 +161,7 @@ def _span(levels: Sequence[Json]) -> tuple[float, float]:
 def _number_axis(axes: Axes, results: Json) -> None:
     """Set range, ticks and label of the x axis, and let the y axis begin at 0.
 
-    The ticks are 0 and the swept numbers if their labels do not overlap.
+    The ticks are at 0 and at the swept numbers, unless their labels would overlap.
     """
     numbers = sorted({0.0, *(level["swept_number"] for level in results["levels"])})
     low, high = _span(results["levels"])

@@ -1,8 +1,8 @@
-"""Equilibria of several learners, found by best responses in turn.
+"""Equilibria of several learners, found by best responses: the learners take turns to improve their commands.
 
-A *profile* is the sequence of a learner's commands in a whole episode. It is fixed at the alert (open loop), so no
-learner reacts to what the others do. The learners know the whole world. Each of them searches its best profile in turn,
-until no learner improves.
+A *profile* is the sequence of a learner's commands in a whole episode. The profile is fixed at the alert (open loop),
+so no learner reacts to what the others do. The learners know the whole world. One after the other, each learner
+searches its best profile while the others keep theirs, until no learner improves.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TOLERANCE = 0.01  # m2/s2; a learner changes its profile only if it gains more t
 
 
 class Equilibrium(NamedTuple):
-    """Result of best responses in turn from one start, in n worlds with N vehicles and C learners."""
+    """Result of alternating best responses from one start, in n worlds with N vehicles and C learners."""
 
     profiles: Profiles  # commands of the learners, with one phase for each decision
     borne: dict[HarmCount, Floats]  # count of harm -> [n, N] harm of each vehicle, m2/s2
@@ -62,7 +62,7 @@ class Spread(NamedTuple):
 
 
 class _Game(NamedTuple):
-    """The worlds, and what each learner minimises in them."""
+    """The worlds, and the objective that each learner minimises in them."""
 
     worlds: Worlds
     task: Task  # task of the learners
@@ -74,21 +74,21 @@ class _Game(NamedTuple):
         return self._replace(worlds=self.worlds.take(rows), joint=self.joint.take(rows), others=self.others[rows])
 
     def together(self, own: list[Profiles]) -> Profiles:
-        """Join the profiles of the learners into one joint profile, with one phase for each decision."""
+        """Join the learners' separate profiles into one profile of all learners, with one phase for each decision."""
         steps = np.arange(int(self.joint.last_step.max()))
         at = [np.concatenate([each.at(np.full(self.joint.n, step)) for each in own], axis=1) for step in steps]
         return Profiles(np.minimum(steps + 1, self.joint.last_step[:, np.newaxis]), np.stack(at, axis=1))
 
     def amount(self, c: int, own: list[Profiles]) -> Floats:
-        """Return the objective of learner number ``c`` if the learners follow the profiles ``own``, [n] m2/s2."""
+        """Return the value of learner ``c``'s objective if all learners follow their profiles in ``own``, [n] m2/s2."""
         problem = minimising(self.joint, self.worlds, self.declared, self.task.vehicles[c : c + 1])
         return problem.values(self.together(own))[self.task.harm_count]
 
     def response(self, c: int, own: list[Profiles], effort: Mapping[str, int]) -> Profiles:
         """Search the best profile of learner number ``c`` while the other learners follow their profiles in ``own``.
 
-        ``effort`` has keyword arguments of ``search_profiles``. The resulting harm differs by rounding from the harm in
-        the joint problem, because the profiles of the others are split at the times of the joint decisions.
+        ``effort`` has keyword arguments of ``search_profiles``. The harm in this search differs by rounding from the
+        harm in the joint search problem.
         """
         task, others = replace(self.task, vehicles=self.task.vehicles[c : c + 1]), self.others
         problem = profile_problem(
@@ -101,7 +101,7 @@ class _Game(NamedTuple):
         return search_profiles(problem, joined(starts, problem.n), **effort)[0]
 
     def _following(self, c: int, own: list[Profiles]) -> Vehicles:
-        """Return the vehicles, with the profiles ``own`` as fixed commands of all learners except number ``c``."""
+        """Return the vehicles' parameters; all learners except number ``c`` follow their profiles in ``own``."""
         vehicles, clock, old = self.worlds.vehicles, self.joint.clock, self.worlds.vehicles.pieces
         count = old.shape[2] // 2
         pieces = np.full((*old.shape[:2], 2, max(count, MOST_PHASES)), np.inf)
@@ -129,12 +129,13 @@ def find_equilibria(
     seed: int = 0,
     threads: int = 1,
 ) -> dict[str, Equilibrium]:
-    """Search equilibria of the scenario's learners by best responses in turn, one equilibrium from each of ``STARTS``.
+    """Search equilibria of the scenario's learners by alternating best responses, one equilibrium for each start.
 
-    A learner changes its profile if a search finds a profile that is better by more than ``tolerance``. If no learner
-    changes its profile in a round, the result is an approximate equilibrium of open-loop profiles. It is not exact,
-    because a search tries only ``budget`` candidates. Other equilibria may exist. The result for a world does not
-    depend on the other worlds or on ``threads``.
+    ``STARTS`` names the starts. In every round each learner searches a better profile; it changes its profile if the
+    search finds one that is better by more than ``tolerance``. If no learner changes its profile in a round, the result
+    is an approximate equilibrium of open-loop profiles. The equilibrium is not exact, because a search tries only
+    ``budget`` candidates. Other equilibria may exist. The result for a world does not depend on the other worlds or on
+    ``threads``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -166,7 +167,9 @@ def find_equilibria(
     if not 0.0 <= tolerance < math.inf:
         raise InvalidInput(f"tolerance = {tolerance!r}: the tolerance must be a finite number of m2/s2, at least 0")
     if not scenario.learners:
-        raise InvalidInput(f"scenario {scenario.name!r}: has no learner; give at least one vehicle the role learner")
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: the scenario has no learner; give at least one vehicle the role learner"
+        )
     task, declared = (
         Task(scenario, scenario.learners, harm_count),
         scenario.objective if objective is None else objective,
@@ -185,7 +188,7 @@ def find_equilibria(
 
 
 def _settle(game: _Game, own: list[Profiles], rounds: int, tolerance: float, effort: Mapping[str, int]) -> Equilibrium:
-    """Let the learners search in turn from the profiles ``own`` until no learner gains more than the tolerance."""
+    """Let the learners search in turns, from the profiles ``own``, until none gains more than the tolerance."""
     active, taken = np.arange(game.joint.n), np.zeros(game.joint.n, np.int64)
     for turn in range(rounds):
         part, mine = game.take(active), [each.take(active) for each in own]
@@ -212,7 +215,7 @@ def compare_starts(ends: Mapping[str, Equilibrium], harm_count: HarmCount, toler
     Args:
         ends: result of ``find_equilibria``.
         harm_count: count of harm to compare, ``first`` or ``total``.
-        tolerance: two equilibria count as equal if the harm of every vehicle differs by at most this, m2/s2.
+        tolerance: largest difference in the harm of any vehicle up to which two equilibria count as equal, m2/s2.
 
     """
     converged = np.stack([each.converged for each in ends.values()])
@@ -235,8 +238,8 @@ def best_joint_harm(
 ) -> dict[HarmCount, Floats]:
     """Return the harm of each vehicle in the joint optimum: count of harm -> [n, N] m2/s2.
 
-    The joint optimum is the least known harm of the line that the learners can do together. It is the better of a joint
-    search (``best_harm``) and the equilibria ``ends``. No equilibrium of ``ends`` does less harm.
+    The joint optimum is the least known harm of the line that the learners can achieve together. In each world it is
+    the least harm of a joint search (``best_harm``) and of the equilibria ``ends``.
 
     Args:
         scenario: scenario of the worlds.
@@ -261,8 +264,8 @@ def best_joint_harm(
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
     """Return (mean harm of the line in equilibrium) / (mean harm of the line in the joint optimum), with its interval.
 
-    For ``Spread.worst`` this ratio is called the price of anarchy, for ``Spread.best`` the price of stability. Returns
-    None if the joint optimum does no harm in any world.
+    With the harms of ``Spread.worst`` this ratio is called the price of anarchy, with ``Spread.best`` the price of
+    stability. Returns None if the harm of the joint optimum is 0 in every world.
 
     Args:
         borne: [n, N] harm of each vehicle in equilibrium, m2/s2. Worlds with NaN (no equilibrium) are left out.

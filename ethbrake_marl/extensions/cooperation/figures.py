@@ -42,7 +42,7 @@ def ablation_figures(results: Json, caption: str) -> list[Figure]:
     """Return the three figures of an ablation, or the two figures of a sweep (``sweep_figures``).
 
     The three figures show the harm at each level, the change of harm between levels, and the change for each vehicle.
-    Red text above a figure names the levels that are not trained enough.
+    Red text above a figure names the levels whose trained policies do worse than full braking.
 
     Args:
         results: content of ``ablation.json``.
@@ -152,7 +152,7 @@ def _who_pays(results: Json, caption: str) -> Figure:
 
 
 def signed_ticks(low: float, high: float) -> list[float]:
-    """Return ticks for an axis from ``low`` to ``high``: 0 and a few round numbers.
+    """Return the ticks of an axis from ``low`` to ``high``: 0 and a few round numbers.
 
     The axis is linear between -0.1 and 0.1 (``LINEAR``), and logarithmic outside this range.
     """
@@ -167,7 +167,7 @@ def signed_ticks(low: float, high: float) -> list[float]:
 
 
 def _place(level: Json, ladder: Sequence[str]) -> float:
-    """Return the x position of a level: its index in ``ladder``, the names of the compared levels in order.
+    """Return the x position of a level: its index in ``ladder``, the list of the names of the compared levels.
 
     A level with a worse V2X channel is drawn to the right of the same level with the better channel.
     """
@@ -177,7 +177,7 @@ def _place(level: Json, ladder: Sequence[str]) -> float:
 def _reached(
     axes: Axes, levels: Sequence[Json], ladder: Sequence[str], harm_count: HarmCount, algorithm: str, number: int
 ) -> None:
-    """Draw the harm that one algorithm reaches at each level, with a dot for each training seed.
+    """Draw the harm of one algorithm's trained policies at each level, with a dot for each training seed.
 
     Args:
         axes: axes to draw on.
@@ -217,12 +217,12 @@ def _reached(
 
 
 def _short(name: str) -> str:
-    """Return the name of a level for an axis: without ``cooperation-``, and on two lines (``2`` and ``paper``)."""
+    """Return the name of a level for an axis: without ``cooperation-``, on two lines of text (``2`` and ``paper``)."""
     return name.removeprefix("cooperation-").replace("-", "\n", 1)
 
 
 def _of_changes(results: Json) -> list[str]:
-    """Return a label ``LEVEL → LEVEL`` for each change between levels, and then for each worse V2X channel."""
+    """Return labels ``LEVEL → LEVEL``: of all changes between levels, then of all changes to a worse V2X channel."""
     changes, several = results["steps"] + results["channels"], len(algorithms(results)) > 1
     words = [f"{_short(change['from'])} → {_short(change['to'])}".replace("\n", " ") for change in changes]
     return [f"{each} ({c['algorithm']})" if several else each for each, c in zip(words, changes, strict=True)]

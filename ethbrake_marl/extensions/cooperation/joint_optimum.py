@@ -1,8 +1,9 @@
-"""Joint optimum of each level: in each world, the least known harm that the learners of the level can do together.
+"""Joint optimum of a level: in each world, the least known harm that the level's learners can achieve together.
 
 The joint optimum depends on the worlds, on the learners and on the scripts of the other vehicles. It does not depend on
-information or objectives. Levels that differ only in information or objectives therefore share one search. The result
-of one level is also used for every other level whose learners can give the same commands.
+what the learners know or on their objectives. Levels that differ only in information or objectives therefore share one
+search of the joint optimum. The result of one level is also used for every other level whose learners can give the same
+commands.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ from ethbrake_marl.training.training import Training
 
 @dataclass(frozen=True, slots=True)
 class LevelOptimum:
-    """Candidates for the joint optimum of one level: a search result, and trained teams, which may be better."""
+    """Candidates for the joint optimum of one level: the result of a search, and trained teams."""
 
     level: Level  # the level
     worlds: Worlds  # worlds in which the joint optimum was searched
@@ -53,7 +54,7 @@ class LevelOptimum:
 
 
 def questions(plan: Plan, samples: Sequence[Sample]) -> list[tuple[Level, Sample, list[Level]]]:
-    """Return the searches for joint optima that an ablation needs, as (first level, worlds, all levels).
+    """Return the searches for joint optima that an ablation needs: for each search (first level, worlds, all levels).
 
     All levels with the same search problem share one search. Levels without learners need no search.
 
@@ -124,10 +125,10 @@ def best_known(own: LevelOptimum, answers: Sequence[LevelOptimum]) -> dict[HarmC
 def _can_imitate(own: LevelOptimum, other: LevelOptimum) -> Bools:
     """Return for each world, [n] bool, whether the learners of ``own`` can imitate the learners of ``other``.
 
-    Imitation needs five conditions. The learners of ``other`` are also learners in ``own``. The scripts of ``own``
-    are also scripts in ``other``. The lines of vehicles are the same. The latencies are equal. The decision times
-    of ``other`` are also decision times of ``own``. If only ``own`` has an obstacle, the profiles are simulated
-    again with it.
+    They can imitate them if five conditions are met: the learners of ``other`` are also learners in ``own``; the
+    scripts of ``own`` are also scripts in ``other``; the lines of vehicles are the same; the latencies are equal; and
+    the decision times of ``other`` are also decision times of ``own``. An obstacle in ``own`` alone does not matter,
+    because ``_harms`` simulates the profiles again with it.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     same_scripts = all(theirs.scripts.get(i) == script for i, script in mine.scripts.items())
@@ -161,7 +162,7 @@ def _harms(own: LevelOptimum, other: LevelOptimum, rows: Ints) -> Iterator[dict[
 
 @dataclass(frozen=True, slots=True)
 class Harms:
-    """Harm of the trainings of one level in the same worlds. For a level of scripts, there is one seed."""
+    """Harm of the trainings of one level in the same worlds; a level without learners counts as one seed."""
 
     world: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds] harm of the whole line (m2/s2)
     vehicle: dict[HarmCount, Floats]  # count of harm -> [seeds, worlds, N] harm of each vehicle (m2/s2)
@@ -171,7 +172,7 @@ class Harms:
 
 
 class Goal(NamedTuple):
-    """Mean of the quantity that the trainings of a level minimise, for the trained policies and for full braking."""
+    """Quantity that the trainings of a level minimise: its mean for the trained policies and for full braking."""
 
     name: str  # name of the quantity: ``objective``, ``first-impact harm`` or ``total harm``
     reached: float  # mean over seeds, worlds and learners with the trained policies
@@ -179,10 +180,10 @@ class Goal(NamedTuple):
 
     @classmethod
     def of(cls, training: Training, reached: Harms, full_brake: Harms) -> Goal:
-        """Return the means of the quantity that a training minimises.
+        """Return the mean of the quantity that a training minimises, for its policies and for full braking.
 
-        The quantity is the objective of the learners if the recipe or the scenario has objectives, else the harm of the
-        whole line.
+        The quantity is the learners' objective if the recipe or the scenario has objectives. Otherwise it is the harm
+        of the whole line.
 
         Args:
             training: a training of the level.
@@ -203,7 +204,7 @@ class Goal(NamedTuple):
 
     @property
     def missed(self) -> bool:
-        """Whether the trained policies do worse than full braking of all vehicles."""
+        """Whether the mean of the trained policies is worse than the mean of full braking of all vehicles."""
         return self.reached > self.full_brake + TOLERANCE
 
 
@@ -227,8 +228,8 @@ class Measured:
 def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[Measured]:
     """Evaluate the trained policies of all levels in the same worlds, and search the joint optimum of each level.
 
-    Results of earlier searches are reused. If a policy does less harm in a world than the search, its harm is the best
-    known harm of this world.
+    Results of earlier searches are reused. If a policy causes less harm in a world than the best profile of the search,
+    the policy's harm is the best known harm of this world.
 
     Args:
         plan: settings of the ablation. All its trainings must be finished.
@@ -284,7 +285,7 @@ def measure(plan: Plan, jobs: int = 1, tell: OnProgress | None = None) -> list[M
 
 
 def _drive(scenario: Scenario, sample: Sample, drivers: Sequence[Driver], tell: OnProgress) -> Harms:
-    """Let several agents or teams drive in the worlds of ``sample``; return their harm, with one seed for each."""
+    """Let several agents or teams drive in the worlds of ``sample``; return their harm, with each agent as one seed."""
     outcomes = []
     for driver in drivers:
         result = evaluate(sample, {driver.name: driver}, scenario=scenario).complete()

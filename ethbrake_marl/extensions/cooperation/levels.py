@@ -74,20 +74,20 @@ class Level:
 
     @property
     def same_lines(self) -> bool:
-        """Whether world k has the same line of vehicles at all levels; False for a sweep of a key of the vehicles."""
+        """Whether world k has the same vehicles at all levels; False for a sweep of a key that changes vehicles."""
         return self.swept is None or self.swept.same_lines
 
     @property
     def columns(self) -> Json:
-        """Entries for tables on the swept value; empty without a sweep."""
+        """Columns about the swept value for tables of results; empty without a sweep."""
         return {} if self.swept is None else self.swept.columns
 
 
 def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list[Level]:
     """Load the levels of an ablation.
 
-    A level that differs only in ``v2x`` from an earlier level is compared with this earlier level (``Level.clear``).
-    All other levels form the *ladder*: each is compared with the previous one.
+    A level that differs from an earlier level only in ``v2x`` is compared with this earlier level (``Level.clear``).
+    All other levels form the *ladder*: each of them is compared with the level before it.
 
     Args:
         names: names or paths of scenarios, in the order of the comparison.
@@ -111,7 +111,7 @@ def read_levels(names: Sequence[str], settings: Sequence[Override] = ()) -> list
         ]
         levels.append(Level(scenario, same[0] if same else None))
     if len(levels) < 2:
-        raise InvalidInput(f"levels: only {count_of(len(levels), 'level')}; give at least two levels to compare")
+        raise InvalidInput(f"levels: {count_of(len(levels), 'level')} given; give at least two levels to compare")
     return levels
 
 
@@ -124,8 +124,9 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
         settings: settings ``KEY=VALUE`` that override other keys of the scenario.
         recipes: recipes of the ablation.
 
-    Raises ``InvalidInput`` if the key is not a key of a scenario; if ``settings`` or a recipe override it; or if levels
-    that differ in it cannot be compared. Also raises the exceptions of ``Swept.parse`` and ``load_runnable``.
+    Raises ``InvalidInput`` if the swept key is not a key of a scenario; if ``settings`` or a recipe override this key;
+    or if levels with different values of this key cannot be compared. Also raises the exceptions of ``Swept.parse`` and
+    ``load_runnable``.
 
     """
     values = Swept.parse(sweep)
@@ -133,7 +134,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     if not scenario:
         key = values[0].key
         raise InvalidInput(
-            f"--sweep {key}: is a key of a recipe, but must be a key of a scenario; to vary a recipe, use"
+            f"--sweep {key}: the key belongs to a recipe, but must be a key of a scenario; to vary a recipe, use"
             " ethbrake study sweep"
         )
     key, path = scenario[0].key, scenario[0].path
@@ -147,7 +148,7 @@ def sweep_levels(name: str, sweep: str, settings: Sequence[Override], recipes: S
     for recipe in recipes if path[0] == "objective" else ():
         if recipe.reward.objective is not None:
             raise InvalidInput(
-                f"--sweep {key}: has no effect, because recipe {recipe.name!r} has its own objective"
+                f"--sweep {key}: the sweep has no effect, because recipe {recipe.name!r} has its own objective"
                 " (reward.objective); give a recipe without an objective"
             )
     each_value = [value._replace(key=key) for value in values]
@@ -158,14 +159,16 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Sam
     """Draw worlds for each level; world k has the same line of vehicles at all levels.
 
     Latencies may differ between levels that differ in ``v2x``. An obstacle may be ahead at some levels only. In a sweep
-    of a key of the vehicles, world k is drawn with the same random numbers at all levels, but the vehicles differ.
+    of a key that changes the vehicles, world k is drawn with the same random numbers at all levels, but its vehicles
+    differ.
 
     Args:
         levels: the levels.
         episodes: number of worlds.
         seed: seed of the worlds.
 
-    Raises ``InvalidInput`` with the level and the quantity if levels differ in another quantity.
+    Raises ``InvalidInput``, which names the level and the quantity, if levels differ in a quantity in which they must
+    not differ.
 
     """
     samples = [level.scenario.sample(episodes, seed) for level in levels]
@@ -241,7 +244,7 @@ class Plan:
         return tuple(algorithm(recipe) for recipe in self.recipes)
 
     def trainings(self) -> Iterator[tuple[Level, str, TrainingJob]]:
-        """Yield all trainings as (level, name of the algorithm, training): all levels with seed 0, then with seed 1 ...
+        """Yield all trainings as (level, name of the algorithm, training): first all of seed 0, then all of seed 1, ...
 
         Levels without learners are left out.
         """
@@ -266,7 +269,7 @@ class Plan:
         return TrainingJob(Training.of(recipe.replace(**changes), level.scenario), folder, noted)
 
     def settings(self) -> dict[str, Any]:
-        """Return all settings that affect the results, as a mapping: levels, recipes, numbers and the shield."""
+        """Return a mapping of all settings that affect the results, such as levels, recipes and shield."""
         numbers = ("seeds", "steps_per_learner", "episodes", "list_seed", "search_episodes", "budget")
         return {
             "levels": [level.scenario.model_dump(mode="json", exclude=set(WORDS)) for level in self.levels],
@@ -289,7 +292,7 @@ class Plan:
 def with_scheme(recipe: TrainingRecipe, scheme: str | None = None) -> TrainingRecipe:
     """Return the recipe with a scheme for several learners.
 
-    The scheme is ``scheme`` if it is not None, else the scheme of the recipe if it has one, else ``shared``.
+    If ``scheme`` is None, the scheme is that of the recipe, or ``shared`` if the recipe has none.
     """
     return recipe.replace(scheme=scheme or recipe.scheme or "shared")
 
@@ -315,7 +318,7 @@ def plan_ablation(
         recipes: names or paths of recipes, separated by commas.
         settings: settings ``KEY=VALUE`` of scenarios and recipes; None: no settings.
         sweep: key of a scenario and its values, ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; None: no sweep.
-        quick: use few seeds, worlds and decisions by default.
+        quick: whether the defaults of seeds, worlds and decisions are small.
         tell: function that receives notes on settings that do not fit together.
         given: other fields of ``Plan``; None means the default.
 
@@ -334,7 +337,7 @@ def plan_ablation(
     elif len(names) == 1:
         compared = sweep_levels(names[0], sweep, changed.scenario, changed_recipes)
     else:
-        raise InvalidInput(f"levels: {len(names)} levels; a sweep needs exactly one level")
+        raise InvalidInput(f"levels: {len(names)} levels given; a sweep needs exactly one level")
     plan = Plan(
         levels=tuple(compared),
         recipes=changed_recipes,
@@ -349,7 +352,7 @@ def plan_ablation(
         raise InvalidInput(f"recipes {', '.join(called)}: two recipes have the same name; give each recipe once")
     if plan.shield not in (None, "step"):
         raise InvalidInput(
-            f"shield {plan.shield!r}: must be step, because the other shields can control one vehicle only"
+            f"shield {plan.shield!r}: the shield must be 'step', because other shields can control only one vehicle"
         )
     if plan.search_episodes > plan.episodes:
         raise InvalidInput(

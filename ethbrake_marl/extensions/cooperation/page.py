@@ -1,4 +1,4 @@
-"""Output files of an ablation: HTML page, tables as Markdown, CSV and JSON."""
+"""Output files of an ablation: an HTML page, and its tables as Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _MOST, _USUAL, _LEAST = 3, 2, 2  # number of example worlds with the largest, a 
 
 
 def choose_worlds(measured: Sequence[Measured]) -> list[Played]:
-    """Choose worlds whose episodes the page shows, by the reduction of total harm from the first to the last level.
+    """Choose worlds for the page by how much total harm decreases from the first to the last level.
 
-    The chosen worlds have the largest, a median or the least reduction with the policies of the first seed. Levels with
-    a worse V2X channel are ignored.
+    With the policies of the first seed, the chosen worlds have the largest, a median, or the least decrease. Levels
+    with a worse V2X channel are ignored.
     """
     ladder = [one for one in measured if one.level.clear is None]
     first, last = ladder[0], ladder[-1]
@@ -89,7 +89,7 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
     """Return CSV text with one row per level, algorithm and seed. Harms are means over the worlds (m2/s2).
 
     The columns ``searched_*`` are means over the first ``searched`` worlds, in which the joint optimum was searched.
-    The columns for the shield are empty if no shield was used.
+    The columns about the shield are empty if no shield was used.
     """
     return csv_text(_seed_row(one, seed, searched) for one in measured for seed in range(len(one.reached.collided)))
 
@@ -136,7 +136,7 @@ def markdown(results: Json, conditions: str) -> str:
 
     Args:
         results: content of ``ablation.json``.
-        conditions: text below the tables, about worlds, seeds and machine.
+        conditions: text below the tables that describes the worlds, the seeds and the machine.
 
     """
     blocks = [f"**{line}**" for line in results["undertrained"]]
@@ -151,8 +151,8 @@ def ablation_page(
 
     Args:
         results: content of ``ablation.json``.
-        conditions: text about worlds, seeds and machine.
-        figures: name of the figure's file -> figure.
+        conditions: text that describes the worlds, the seeds and the machine.
+        figures: dictionary from the name of a figure's file to the figure.
         episodes: sections that show episodes.
 
     """
@@ -269,7 +269,8 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
     Args:
         rows: result of each row, as a nested mapping.
-        columns: heading of each column and path to its value: ``first harm`` means ``row["first"]["harm"]``.
+        columns: pairs of the heading of a column and the path of its value; the path ``first harm`` means
+            ``row["first"]["harm"]``.
 
     """
     if len({row["algorithm"] for row in rows} - {None}) == 1:
@@ -286,7 +287,7 @@ def _sheet(rows: Sequence[Json], columns: _Columns) -> Sheet:
 
 
 def interval_words(seeds: int) -> str:
-    """Return a phrase for captions that says what the 95 % intervals account for, given the number of seeds."""
+    """Return a phrase for captions that says what the 95 % intervals account for; it depends on the number of seeds."""
     if seeds == 1:
         return "95 % intervals for other worlds only: one seed says nothing about others"
     rough = f" (rough: {seeds} seeds)" if seeds < 3 else ""

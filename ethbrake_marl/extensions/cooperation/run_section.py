@@ -1,4 +1,4 @@
-"""Section of a run's report for several learners: harm of each vehicle, benefit of each learner and of messages."""
+"""Section of a run's report for several learners: harm of each vehicle, and benefit of each learner and of messages."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Stopped(Exception):
     """Raised if a training for the comparison was interrupted or failed.
 
     Args:
-        told: message about the training, without a full stop.
+        told: text that says which training stopped and why, without a full stop.
         interrupted: name of the training if Ctrl-C stopped it; empty if it failed.
 
     """
@@ -63,12 +63,12 @@ class Compared(NamedTuple):
 
 
 def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
-    """Compare the trained team of a run with single learners, with a team without messages, and with the joint optimum.
+    """Compare a run's trained team with learners trained alone, a team without messages, and the joint optimum.
 
-    The function trains each learner alone and a team without messages, and searches the joint optimum. A learner makes
-    as many decisions in each training as in the run. The trainings are stored in ``alone/`` and ``without-messages/``
-    in the folder of the run, and all numbers in ``cooperation.json``. If a training is interrupted or fails, the
-    function stops training and searching.
+    The function trains each learner alone and a team without messages, and searches the joint optimum. In each of these
+    trainings, a learner makes as many decisions as in the training of the run. The trainings are stored in ``alone/``
+    and ``without-messages/`` in the folder of the run, and all numbers in ``cooperation.json``. If a training is
+    interrupted or fails, the function omits the remaining trainings and the search.
 
     Args:
         experiment: the finished run, with its folder, policies and evaluation.
@@ -107,9 +107,9 @@ def make_section(experiment: Experiment, tell: OnProgress) -> RunSection | None:
 
 
 def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
-    """Train each learner alone while all other learners brake fully; return one team for each, by name.
+    """Train each learner alone while all other learners brake fully; return dictionary name -> team.
 
-    In such a team, the other learners also brake fully.
+    In each of these teams, the other learners brake fully.
     """
     scenario, policies = experiment.evaluation.scenario, {}
     braking = make_agents(["full_brake"], scenario)["full_brake"]
@@ -124,9 +124,9 @@ def _train_alone(experiment: Experiment, tell: OnProgress) -> dict[str, Team]:
 
 
 def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Compared], str]:
-    """Train a team with sensors instead of messages; return the comparisons with it, and a sentence on how it was made.
+    """Train a team with sensors instead of messages; return comparisons with it, and a sentence on its training.
 
-    The comparisons are empty if this training makes no sense or is impossible. The sentence then says why.
+    If this training makes no sense or is impossible, there are no comparisons, and the sentence says why.
     """
     evaluation, scenario = experiment.evaluation, experiment.evaluation.scenario
     if scenario.members or scenario.v2x.channel.hears == "none":
@@ -161,9 +161,9 @@ def _without_messages(experiment: Experiment, tell: OnProgress) -> tuple[list[Co
 def _joint_optimum(
     experiment: Experiment, outcomes: Mapping[str, Outcome], tell: OnProgress
 ) -> tuple[list[Compared], str]:
-    """Search the joint optimum; return the comparison with it, and a sentence on the search.
+    """Search the joint optimum; return a list of one comparison with it, and a sentence on the search.
 
-    The comparison is missing if the search is impossible. The sentence then says why.
+    If the search is impossible, the list of comparisons is empty, and the sentence says why.
     """
     evaluation = experiment.evaluation
     rows = np.arange(min(SEARCHED, evaluation.worlds.n))
@@ -203,7 +203,7 @@ def _train(experiment: Experiment, scenario: Scenario, folder: str, share: int, 
         experiment: the finished run.
         scenario: scenario of the training.
         folder: folder of the training, below the folder of the run.
-        share: number by which the decisions of the run are divided.
+        share: divisor; the training has the decisions of the run divided by this number.
         tell: function that receives the progress.
 
     """

@@ -29,10 +29,11 @@ class Swept(NamedTuple):
     def parse(cls, text: str) -> list[Swept]:
         """Read a text ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return the values in ascending order.
 
-        A word may precede the numbers, as in ``objective=social:0..90:15``. Ranges and single numbers may be mixed.
+        A word may precede the numbers, as in ``objective=social:0..90:15``. A list may contain ranges and single
+        numbers.
 
-        Raises ``InvalidInput`` for a value that is not a number, a range whose steps do not meet its end, a repeated
-        number, a single number, and too many numbers.
+        Raises ``InvalidInput`` for a value that is not a number, a range whose steps do not meet its end, and a
+        repeated number. Also raises it if there is only one number, or too many.
         """
         key, equals, values = (part.strip() for part in text.partition("="))
         word = match.group(1) or "" if (match := _WORD.match(values)) else ""
@@ -64,7 +65,7 @@ class Swept(NamedTuple):
 
     @property
     def number(self) -> float:
-        """The swept number, which is the x value in figures."""
+        """The number in the swept value, which is the x value in figures."""
         return float(self.text)
 
     @property
@@ -79,15 +80,15 @@ class Swept(NamedTuple):
 
     @property
     def same_lines(self) -> bool:
-        """Whether the worlds have the same lines of vehicles, with the same physics, for all values of the key."""
+        """Whether worlds have the same vehicles and the same physics for all values of the key."""
         return self.key.partition(".")[0] in ("objective", "obstacle_gap_m", "roles", "v2x")
 
     @property
     def label(self) -> str:
-        """Text that the value adds to the name of a level, such as ``social-15`` or ``v2x.lost-0.1``."""
+        """Text that is added to the name of a level for this value, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Entries for tables: swept key, value and number."""
+        """Columns for tables of results: swept key, value and number."""
         return {"swept_key": self.key, "swept_value": f"{self.word}{self.text}", "swept_number": self.number}

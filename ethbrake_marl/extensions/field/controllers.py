@@ -39,11 +39,11 @@ class Parameters:
 
 
 class Seen(NamedTuple):
-    """Motion of one vehicle, and what it knows from sensors or messages about the vehicle ahead, in ``n`` worlds.
+    """Motion of one vehicle in ``n`` worlds, and what it knows from sensors or messages about the vehicle ahead.
 
-    Old information is extrapolated to the present time with the acceleration that was reported. For Vehicle 1, an
-    obstacle counts as the vehicle ahead. If there is no obstacle, or if a vehicle has received no information, the road
-    ahead is free.
+    Old information about the vehicle ahead is extrapolated to the present time with its reported acceleration. For
+    Vehicle 1, an obstacle is treated as the vehicle ahead. If there is no obstacle, or if the vehicle knows nothing
+    about the vehicle ahead, the road ahead is treated as free.
     """
 
     gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
@@ -55,7 +55,7 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
-        """Return what a vehicle knows in these worlds.
+        """Return the motion of a vehicle, and what it knows about the vehicle ahead, in these worlds.
 
         Args:
             worlds: present state of the n worlds.
@@ -88,15 +88,15 @@ class Seen(NamedTuple):
 
     @property
     def headway_s(self) -> Floats:
-        """Gap divided by the speed of the vehicle itself, [n] s; infinite if it does not move forward."""
+        """Gap divided by the speed of the rear vehicle, [n] s; infinite if this vehicle does not move forward."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Limit the rate at which braking builds up; return the command for the next time step, [n] m/s2.
+        """Return the command for the next time step, [n] m/s2, with a limit on how fast the deceleration grows.
 
         Args:
             wanted_mps2: [n] wanted acceleration (m/s2).
-            rate_mps3: largest increase of the deceleration per second (m/s3).
+            rate_mps3: largest growth of the deceleration per second (m/s3).
 
         """
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
@@ -147,7 +147,7 @@ def _human_notices(seen: Seen, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """Return a fuzzy degree of danger [n]: 0 above the safe distance, 1 below the unsafe distance, linear between."""
+    """Return a degree of danger [n]: 0 for gaps above the safe distance, 1 below the unsafe distance, else linear."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
@@ -155,7 +155,7 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n].
 
-    Both range from 0 (no danger) to 1 (full danger).
+    Both criteria range from 0 (no danger) to 1 (full danger).
 
     Args:
         seen: what the vehicle knows about the vehicle ahead.
@@ -254,10 +254,10 @@ class Controller:
     Its memory is the time at which it noticed a danger, [n] s. The memory is infinite before a danger is noticed, and
     NaN before the first decision.
 
-    The reaction time begins at the decision at which the controller notices the danger. A danger that exists at the
-    first decision counts as noticed at the alert; the reaction time then overlaps with the latency. If ``law.stays`` is
-    true (law ``r157_human``), a reaction continues after the danger is over. Otherwise (law ``r157_fsm``) it ends with
-    the danger, and the next danger starts a new reaction.
+    The reaction time begins at the decision at which the controller notices the danger. If a danger exists at the first
+    decision, the reaction time is counted from the alert, so it overlaps with the latency. If ``law.stays`` is true
+    (law ``r157_human``), a reaction continues after the danger is over. Otherwise (law ``r157_fsm``) the reaction ends
+    with the danger, and the next danger starts a new reaction.
 
     Args:
         name: name of the agent, such as ``idm:T=1.0``.
@@ -273,7 +273,7 @@ class Controller:
         self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Return the memory before the first decision: NaN, [n].
+        """Return the memory before the first decision, an array [n] of NaN.
 
         Raises ``InvalidInput`` if the law needs a quantity of the vehicle ahead that neither messages nor sensors
         provide.
@@ -310,9 +310,9 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
     """Return the controller for a text such as ``idm:T=1.0``.
 
     Args:
-        argument: text after the name of the law, with values of parameters: ``T=1.0`` or ``T=1.0:a=2``; None: all
-            parameters have their default values.
-        settings: the whole text, and the time step of the scenario.
+        argument: text after the name of the law with values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``; None:
+            all parameters have their default values.
+        settings: the whole text of the agent, and the time step of the scenario.
 
     Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` for a value that is not a
     number or is out of range, and for a repeated parameter.

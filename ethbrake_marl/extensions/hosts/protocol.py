@@ -1,12 +1,11 @@
 """Let agents drive vehicles that a *host* moves: another simulator or a test bench.
 
-The host moves the vehicles. This package does the rest: it makes the decisions, applies latencies, keeps standing
-vehicles at rest, resolves impacts and records the harm. Every step has three parts:
+The host moves the vehicles. This package makes the decisions, applies latencies, keeps standing vehicles at rest,
+resolves impacts and records the harm. Every step of a host has three parts:
 
 1. *Decide.* Agents whose decision is due act on the state that the host reported. A shield may replace their actions.
-2. *Move.* The host receives a command and moves the vehicles for one step.
-3. *Meet.* Vehicles that overlap and still approach each other exchange velocity. A host that resolves impacts itself
-   reports them instead.
+2. *Move.* The host receives a command and moves the vehicles for one step. 3. *Meet.* Vehicles that overlap and still
+approach each other exchange velocity. If the host resolves impacts itself, it reports them instead.
 
 Latencies are rounded up to whole steps of the host, because decisions are possible only between two steps. Agents know
 the rounded latencies.
@@ -79,7 +78,7 @@ class HostState(NamedTuple):
 
 
 class HostCommand(NamedTuple):
-    """Command to a host (the simulator that moves the vehicles) for one step.
+    """Commands for all vehicles of a host (the simulator that moves the vehicles) in one step.
 
     >>> import ethbrake_marl as eb
 
@@ -100,8 +99,8 @@ class Host(Protocol):
 
     A host has the attribute ``dt`` and the methods ``state`` and ``apply``. It need not inherit from this class.
 
-    ``dt`` is the length of every step (s). With ``dt = math.inf``, a step moves each world to its ``command.until_s``,
-    the time of its next decision. A world whose time is already ``command.until_s`` does not move.
+    ``dt`` is the length of every step (s). If ``dt = math.inf``, a step moves each world to the time of its next
+    decision, which is ``command.until_s``. A world that is already at this time does not move.
 
     >>> import ethbrake_marl as eb
 
@@ -126,7 +125,7 @@ class Host(Protocol):
     dt: float
 
     def state(self) -> HostState:
-        """Return the present time, gaps and speeds, and impacts since the last call if the host resolves them."""
+        """Return the present time, gaps, speeds, and (if the host resolves impacts) the impacts since the last call."""
 
     def apply(self, command: HostCommand) -> None:
         """Move all vehicles by one step with the accelerations of ``command``."""
@@ -176,12 +175,12 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
         host: the host, whose vehicles are at the alert.
         agent: agent or team for the learners, as returned by ``make_agent``, with or without a shield. It is not
             changed.
-        scenario: the scenario. Its scripts drive all other vehicles, and agents know these scripts.
+        scenario: the scenario. Its scripts drive all vehicles that do not learn, and agents know these scripts.
         worlds: the worlds at the alert. The host must have the gaps and speeds of these worlds.
 
-    Returns the outcome, and the worlds in which the motion differed from the prediction of a shield. Raises
-    ``InvalidInput`` for a scenario, agent or worlds that a host does not support. Raises ``HostFailed`` if the host
-    raises an exception or reports an impossible state.
+    Returns the outcome of the episodes, and a mask of the worlds in which the motion differed from the prediction of a
+    shield. Raises ``InvalidInput`` for a scenario, agent or worlds that a host does not support. Raises ``HostFailed``
+    if the host raises an exception or reports an impossible state.
 
     """
     scenario = load_scenario(scenario)
@@ -201,9 +200,9 @@ def drive_host(host: Host, agent: Driver, scenario: str | Path | Scenario, world
 
 
 class _Grid:
-    """Decision times of vehicles that decide at the same times: a first time in each world, then every time step.
+    """Decision times that several vehicles share: in each world a first time, and then one every time step.
 
-    ``made`` [n] is the number of decisions so far, ``all`` [n] the number of decisions until the horizon.
+    ``made`` [n] is the number of decisions already made, ``all`` [n] the number of all decisions before the horizon.
 
     Args:
         first_s: [n] time of the first decision (s).
@@ -228,7 +227,7 @@ class _Grid:
 
 
 class _Run:
-    """Running episodes in a host. The arguments are those of ``drive_host``; ``team`` has the agent of each learner."""
+    """Running episodes in a host. Arguments are as in ``drive_host``; ``team`` has the agent of each learner."""
 
     def __init__(self, host: Host, worlds: Worlds, team: Team, scenario: Scenario) -> None:
         self.host, self.team, self.scenario = host, team, scenario
@@ -275,7 +274,7 @@ class _Run:
 
     # decisions
     def _decide(self) -> None:
-        """Let all vehicles whose decision is due decide, on the same state."""
+        """Let all vehicles whose decision is due decide, all of them on the same state."""
         each = [~self.ended & (grid.made < grid.all) & grid.is_due(self.time_s) for grid in self.grids]
         if not np.any(each):
             return
@@ -294,12 +293,12 @@ class _Run:
             grid.made = grid.made + due
 
     def _ask_guard(self, worlds: Worlds, due: Bools, idle: Ints) -> None:
-        """Let the policies behind the shield propose actions, and use the actions that the shield applies.
+        """Let the policies that the shield wraps propose actions, and use the actions that the shield applies.
 
         Args:
             worlds: the present state.
             due: [n] whether a decision is due in each world.
-            idle: row numbers of all other worlds, whose memories are not changed.
+            idle: row numbers of the worlds in which no decision is due; their memories are not changed.
 
         """
         engine = self.engine
@@ -314,7 +313,7 @@ class _Run:
             self.wanted_mps2[due, i] = action_to_command(ruling.applied[:, c], worlds.vehicles, i)[due]
 
     def _seen(self) -> Worlds:
-        """Return the present state for the agents: very slow vehicles stand, and gaps are at least 0."""
+        """Return the present state as agents get it: very slow vehicles have speed 0, and gaps are at least 0."""
         latency, speeds = self.alert.vehicles.latency_s, self.speeds_mps
         in_force = np.where(has_acted(latency, self.time_s[:, np.newaxis]), self.wanted_mps2, 0.0)
         if not self.exact:
@@ -365,12 +364,12 @@ class _Run:
         self.ledger = self.ledger.add(self._meet(before_m, begin, step_s) if impacts is None else impacts)
 
     def _meet(self, before_m: Floats, begin: Floats, step_s: Floats) -> Impacts:
-        """Resolve the impacts of the step by the paper's eq. (13), from the rear pair to the front pair.
+        """Resolve the impacts of a step by the paper's eq. (13), for one pair after another from rear to front.
 
-        A pair has an impact if its gap is at most 0 and still closes. At the end of the step, let w be the closing
-        speed, g <= 0 the gap, and b the mean closing acceleration of the step. If the pair was apart before the step,
-        its closing speed at the contact was ``sqrt(w^2 + 2 b g)``. This speed determines the harm, and is used in
-        eq. (13). If the pair was in contact before the step, w is used instead.
+        A pair has an impact if its gap is at most 0 and its closing speed is above 0. At the end of the step, let w be
+        the closing speed, g <= 0 the gap, and b the mean closing acceleration of the step. If the pair was apart before
+        the step, its closing speed at the contact was ``sqrt(w^2 + 2 b g)``. The harm and eq. (13) use this speed. If
+        the pair was already in contact before the step, they use w instead.
 
         Args:
             before_m: [n, P] gaps before the step.
@@ -400,8 +399,8 @@ class _Run:
     def _read(self) -> tuple[Floats, Floats, Floats, Impacts | None]:
         """Read and check the state of the host; return copies of its arrays.
 
-        Returns the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: not reported). Raises
-        ``HostFailed`` for an exception, a wrong shape or a number that is not finite.
+        Returns the time since the alert [n], gaps [n, P], speeds [n, N], and impacts (None: the host does not report
+        impacts). Raises ``HostFailed`` for an exception, a wrong shape or a number that is not finite.
         """
         (n, N), read = self.alert.speeds_mps.shape, list[Floats]()
         try:
@@ -432,9 +431,9 @@ class _Run:
         return read[0] - self.origin_s, read[1], read[2], impacts
 
     def _first_state(self) -> tuple[Floats, Floats]:
-        """Return gaps [n, P] and speeds [n, N] of the host at the alert, and set the origin of its clock.
+        """Return the host's gaps [n, P] and speeds [n, N] at the alert, and store the time of its clock at the alert.
 
-        Raises ``HostFailed`` if gaps or speeds differ from the worlds.
+        Raises ``HostFailed`` if these gaps or speeds differ from those of the worlds.
         """
         self.origin_s, gaps, speeds, _ = self._read()
         for name, told, given in (("gaps_m", gaps, self.alert.gaps_m), ("speeds_mps", speeds, self.alert.speeds_mps)):
@@ -477,16 +476,17 @@ class _Step(NamedTuple):
 class _Motion:
     """Checks whether the states that a host reports are possible, given the commands since the alert.
 
-    A state is refused if it breaks one of three rules:
+    ``refusal`` returns an error for a state that breaks one of three rules:
 
-    1. *Speed in a step.* In a step, a speed changes by no more than the commands so far allow.
-    2. *Gaps since the alert.* The gaps agree with the speeds at the start and at the end of each step.
-    3. *Speed since the alert.* A vehicle follows its commands with a delay of at most ``LAG_S``. The error of its
-       acceleration is at most ``OFF_MPS2`` plus ``OFF_SHARE`` of the command.
+    1. *Speed in a step.* In one step, a speed changes by no more than is possible with the commands since the alert. 2.
+    *Gaps since the alert.* The changes of the gaps agree with the speeds at the start and at the end of each step. 3.
+    *Speed since the alert.* A vehicle follows its commands with a delay of at most ``LAG_S``. Its acceleration differs
+    from the command by at most ``OFF_MPS2`` plus ``OFF_SHARE`` times the command.
 
-    If the host does not report impacts, its vehicles pass through one another and do not push. If the host reports
-    impacts, vehicles in contact may push one another. For such vehicles, rule 1 uses the commands of the whole line and
-    the energy of the line after an impact, and rules 2 and 3 start again from the reported state.
+    If the host does not report impacts, the rules assume that its vehicles pass through one another without pushing. If
+    the host reports impacts, vehicles in contact may push one another. For vehicles in contact, rule 1 uses the
+    commands of the whole line and the energy of the line after an impact. Rules 2 and 3 then start again from the
+    reported state, as if it were the alert.
 
     Args:
         alert: the worlds at the alert.
@@ -541,7 +541,7 @@ class _Motion:
     def _reachable(self, step: _Step, met: Bools) -> tuple[Floats, Floats]:
         """Return the least and the greatest possible speed at the end of the step, each [n, N] m/s.
 
-        ``met`` [n, N] marks the vehicles that may have pushed one another.
+        ``met`` [n, N] is True for vehicles that another vehicle may have pushed during the step.
         """
         # a host that handles latencies itself does not round them up to whole steps
         acting = step.until_s[:, np.newaxis] + self.jitter_s > self.vehicles.latency_s
@@ -576,12 +576,13 @@ class _Motion:
         )  # fmt: skip
 
     def _wrong_speed(self, step: _Step, met: Bools, change: Floats) -> tuple[int, str] | None:
-        """Find a reported speed that does not follow the commands since the alert.
+        """Find a reported speed that does not agree with the commands since the alert (rule 3).
 
         Args:
             step: the step.
-            met: [n, N] whether another vehicle may have pushed each vehicle; such vehicles are not checked.
-            change: [n, N] change of speed (m/s) by the command in this step.
+            met: [n, N] whether another vehicle may have pushed each vehicle; vehicles that may have been pushed are not
+                checked.
+            change: [n, N] change of speed (m/s) that the command causes in this step.
 
         Returns the row number of the world and a message; None if all speeds are possible.
 
@@ -603,9 +604,10 @@ class _Motion:
 def _refused(
     values: Floats, low: Floats, high: Floats, describe: Callable[[int, int, str], str]
 ) -> tuple[int, str] | None:
-    """Find the first of ``values`` [n, k] that is outside its range from ``low`` to ``high``.
+    """Find the first entry of ``values`` [n, k] that is outside its range from ``low`` to ``high``.
 
-    Returns its row, and the message ``describe(row, column, range as text)``; None if all values are in range.
+    Returns the row of this entry and a message, ``describe(row, column, range as text)``; None if all values are in
+    range.
     """
     good = (low <= values) & (values <= high)
     if good.all():
@@ -648,7 +650,7 @@ def _check_known(worlds: Worlds, scenario: Scenario, vehicles: tuple[int, ...]) 
 
 
 def _on_steps(worlds: Worlds, dt: float) -> Vehicles:
-    """Return the vehicles of the worlds with all latencies rounded up to multiples of ``dt`` (s)."""
+    """Return the vehicles' parameters with all latencies rounded up to multiples of the step length ``dt`` (s)."""
 
     def up(seconds: Floats) -> Floats:
         return np.ceil(seconds / dt - SNAP) * dt

@@ -39,8 +39,8 @@ class SumoHost:
     """Host that runs worlds as parallel roads of one SUMO simulation. A process can run one simulation at a time.
 
     In each step, vehicles reach the commanded speed. SUMO moves them with its ballistic integration, and lets vehicles
-    pass through one another. SUMO has no negative speeds: a vehicle that would move backwards after an impact stands
-    still. ``close`` ends the simulation.
+    pass through one another. SUMO has no negative speeds, so a vehicle that should move backwards after an impact
+    stands still. The method ``close`` ends the simulation.
 
     Args:
         worlds: the worlds at the alert.
@@ -84,7 +84,7 @@ class SumoHost:
         return HostState(self._sumo.simulation.getTime(), gaps, self._speeds)
 
     def apply(self, command: HostCommand) -> None:
-        """Compute from ``command`` the speed of every vehicle at the end of the step, and let SUMO make the step."""
+        """Compute the speed of every vehicle at the end of the step from ``command``, and let SUMO make the step."""
         vehicle, begin = self._sumo.vehicle, np.maximum(command.speeds_mps, 0.0)
         end = np.maximum(command.speeds_mps + command.acceleration_mps2 * self.dt, 0.0)
         for k, line in enumerate(self._names):
@@ -145,7 +145,7 @@ def _routes(worlds: Worlds, names: Sequence[Sequence[str]]) -> str:
 
 
 class FoundHost(NamedTuple):
-    """A kind of host (a simulator that moves the vehicles), which can evaluate agents."""
+    """Kind of host (a simulator that moves the vehicles), with settings; its method ``evaluate`` evaluates agents."""
 
     name: str  # name and version of the simulator, for tables
     # function that starts a host with worlds at the alert, as a context manager
@@ -168,7 +168,7 @@ class FoundHost(NamedTuple):
             agents: agents or teams by name.
             scenario: scenario of the worlds.
             seed: seed of the worlds, which is stored in the evaluation; None: the worlds have no seed.
-            at_once: number of worlds in one host.
+            at_once: number of worlds that one simulation contains.
             on_progress: function that receives the name of an agent and the number of finished worlds.
 
         Returns the evaluation, and for each agent whether the motion in each world [n] differed from the prediction of
@@ -195,8 +195,8 @@ class FoundHost(NamedTuple):
 def find_host(spec: str) -> FoundHost:
     """Return the kind of host for a text: ``sumo``, or ``sumo:0.05`` with the step length in s.
 
-    Raises ``UnknownName`` for an unknown host, ``InvalidInput`` for a wrong step length, and ``MissingExtra`` without
-    libsumo.
+    Raises ``UnknownName`` for an unknown host, ``InvalidInput`` for an invalid step length, and ``MissingExtra``
+    without libsumo.
     """
     name, colon, text = spec.partition(":")
     if name != "sumo":

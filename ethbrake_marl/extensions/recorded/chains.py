@@ -1,7 +1,7 @@
 """Form chains of vehicles that follow each other, and check recorded gaps and positions against recorded speeds.
 
-A *queue* is a sequence of vehicles, each of which follows the vehicle in front of it, at one moment of a recording. It
-is cut into *chains* of a fixed number of vehicles. Each chain is one row of gaps and speeds.
+A *queue* is a sequence of vehicles, each of which follows the vehicle in front of it, at one moment of a recording. A
+queue is cut into *chains* of a fixed number of vehicles. Each chain is one row of gaps and speeds.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ class Link(NamedTuple):
 
 
 class Chains:
-    """Cuts the queues of vehicles in one file into chains, and checks the whole file.
+    """Cuts the queues of vehicles in one file into chains, and checks the gaps and positions in the file.
 
     Args:
         file: path of the file, for messages.
         entry: format of the file.
         every_s: time between two moments at which chains are formed (s).
         vehicles: number of vehicles in a chain.
-        names: names of vehicles and lanes by their numbers. A number without a name is shown as a number.
+        names: dictionary from the number of a vehicle or lane to its name. Messages show a number that has no name.
 
     """
 
@@ -61,9 +61,10 @@ class Chains:
         self._ways: dict[float, Floats] = defaultdict(lambda: np.zeros(4))
 
     def cut(self, moments: Iterator[tuple[float, list[Any]]]) -> Iterator[tuple[list[float], str]]:
-        """Yield, for each chain, its gaps (m) and speeds (m/s) from front to rear, and its vehicles (``2-3-4``).
+        """Yield each chain: its gaps (m) and speeds (m/s) from front to rear, and the ids of its vehicles (``2-3-4``).
 
-        Queues are cut from the front. At one moment, a vehicle belongs to at most one chain.
+        The first chain of a queue begins with the queue's front vehicle, and each chain begins behind the previous one.
+        At one moment, a vehicle belongs to at most one chain.
 
         Raises ``InvalidInput`` at the end of the file if too many vehicles have a fault, or if gaps or positions do not
         change as the speeds say.
@@ -103,12 +104,12 @@ class Chains:
         return self.names.get(number) or f"{number:.0f}"
 
     def _links(self, there: list[Any], by_id: dict[float, Any], row: bool) -> dict[float, Link]:
-        """Return the follower of each vehicle at one moment, by the id of the vehicle ahead. Count faults.
+        """Return a dictionary from the id of each vehicle to the vehicle that follows it at one moment. Count faults.
 
         Args:
             there: states of all vehicles.
-            by_id: states by the id of the vehicle. If a vehicle is recorded twice, its first state.
-            row: whether chains are formed at this moment. If not, data that are left out are not counted.
+            by_id: dictionary from the id of a vehicle to its state; its first state if the vehicle is recorded twice.
+            row: whether chains are formed at this moment. Only then the function counts the data that it leaves out.
 
         """
         behind, in_lane = dict[float, Link](), dict[float, float]()  # in_lane: vehicle -> vehicle ahead in the lane
@@ -155,13 +156,13 @@ class Chains:
         by_id_before: dict[float, Any],
         passed_s: float,
     ) -> None:
-        """Add changes of gaps and positions, and the changes that follow from the speeds, to the sums for the checks.
+        """Add the changes of gaps and positions since the previous moment to the sums that ``cut`` checks.
 
         Args:
-            behind: followers at this moment, as from ``_links``.
-            before: followers at the previous moment.
-            by_id: states at this moment, by the id of the vehicle.
-            by_id_before: states at the previous moment.
+            behind: followers at this moment, as ``_links`` returns them.
+            before: followers at the previous moment, as ``_links`` returns them.
+            by_id: dictionary from the id of a vehicle to its state at this moment.
+            by_id_before: dictionary from the id of a vehicle to its state at the previous moment.
             passed_s: time between the two moments (s).
 
         """

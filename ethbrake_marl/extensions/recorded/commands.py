@@ -47,9 +47,9 @@ def from_data_command(
     ] = 1.0,
     draw: Annotated[
         Literal["rows", "normal", "lognormal", "quantiles"],
-        typer.Option(help="Draw whole rows, or each quantity from a distribution that is fitted to it."),
+        typer.Option(help="Draw whole recorded rows, or each quantity from a distribution fitted to the rows."),
     ] = "rows",
-    strict: Annotated[bool, typer.Option("--strict", help="Write no scenario if a file is refused.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Write no scenario if some file has errors.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:

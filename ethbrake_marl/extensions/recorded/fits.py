@@ -1,6 +1,7 @@
-"""Distributions that are fitted to recorded rows.
+"""Distributions that are fitted to recorded rows of gaps and speeds.
 
-They are independent distributions of the time gaps, of the mean speed of a row, and of the deviations from the mean.
+The distributions are independent: one of the time gaps, one of the mean speed of a row, and one of the deviations of
+the vehicles' speeds from this mean.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ SLOWEST_MPS, LONGEST_S = 0.5, 60.0  # least speed and longest time gap of rows t
 
 
 def fit_rows(rows: Floats, draw: DataDraw) -> dict[str, Any]:
-    """Return keys of a scenario with distributions of time gaps, of the mean speed of a row, and of deviations from it.
+    """Return keys of a scenario with distributions of time gaps, of mean speeds of rows, and of deviations from them.
 
     Raises ``InvalidInput`` if too few rows have time gaps that can be used.
 

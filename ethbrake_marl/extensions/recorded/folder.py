@@ -1,8 +1,8 @@
 """Read all recordings of a folder, and return rows of gaps and speeds.
 
-Each file is read once, some lines at a time. The states of its vehicles at regular times are stored in a temporary
-database on disk, which returns them in order of time. Memory therefore contains only some lines of a file, the states
-at one time, and the resulting rows.
+Each file is read once, and only some of its lines are in memory at a time. The states of its vehicles at regular times
+are stored in a temporary database on disk, which returns them in order of time. Memory therefore contains only some
+lines of a file, the states at one moment, and the resulting rows.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def read_rows(
 ) -> Rows:
     """Read the chains of vehicles in all recordings of a folder and its subfolders.
 
-    A file with an error is refused: it adds no row, and its error is returned.
+    A file with an error adds no row, and its error is returned.
 
     Args:
         folder: the folder, or one file.
@@ -98,8 +98,9 @@ def _search(folder: Path, entry: Format) -> tuple[dict[str, Path], list[str], li
     """Find the files of a format in a folder and its subfolders by their names.
 
     Returns the files by their printable path below the folder, the errors for subfolders that cannot be read, and the
-    names of further files with the same content. These are links, copies, and text files without a header if there is
-    a CSV file of the same name. Names that begin with a dot are ignored, and links to folders are not followed.
+    names of further files with the same content. The further files are links, copies, and text files without a header
+    that lie beside a CSV file of the same name. Names that begin with a dot are ignored, and links to folders are not
+    followed.
     """
     if folder.is_file():
         return {plain_text(folder.name): folder}, [], []
@@ -131,7 +132,7 @@ def _size(file: Path) -> int:
 
 
 def _content(file: Path) -> object:
-    """Return a value that is equal for files with the same content: a hash, or the real path of an unreadable file."""
+    """Return a value that is equal for files with the same content: a hash; for an unreadable file its real path."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             return hashlib.file_digest(stream, "sha256").digest()

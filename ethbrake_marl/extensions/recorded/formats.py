@@ -43,7 +43,7 @@ class Format(NamedTuple):
 
     @property
     def gaps(self) -> bool:
-        """Whether the files contain gaps instead of positions and lengths. An empty cell then means "not measured"."""
+        """Whether files contain gaps instead of positions and lengths; an empty cell then means "not measured"."""
         return "gap" in self.columns
 
     @property
@@ -107,8 +107,8 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
     Args:
         name: name of the format.
         columns: for the format ``table``: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. Each value
-            except the last is the name of a column. ``time=t/1000`` means that the times are in 1/1000 s. ``units`` is
-            ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
+            except the last is the name of a column. ``time=t/1000`` means that the column ``t`` contains times in
+            1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
 
     Raises ``InvalidInput`` for missing, repeated and unknown keys, and for unknown units.
 
@@ -133,7 +133,7 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
         settings["time"] = column
         if not 0.0 < second < math.inf:
             raise InvalidInput(
-                f"columns: time = .../{divisor}: the number after / must be the number of time units in a second"
+                f"columns: time = .../{divisor}: the number after / must say how many time units a second has"
             )
     return Format(
         "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[key] for key, role in _ROLES.items()},

@@ -1,6 +1,6 @@
 """Read files of recorded traffic (CSV, text with blanks, Parquet), some lines at a time.
 
-Each row of numbers has the number of its line in the file (Parquet: of its row), for error messages.
+The number of the line in the file (for Parquet, of the row) is stored with each row of numbers, for error messages.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Piece(NamedTuple):
         Args:
             bad: [rows] whether the value in each row is wrong. The error names the first such row.
             k: index of the column.
-            right: what a right value would be, for the message.
+            right: text that says what a valid value is, for the message.
             shown: [rows] values for the message; None: the values of the column.
 
         """
@@ -67,7 +67,7 @@ class Piece(NamedTuple):
 
 
 def place_of(file: Path, line: float) -> str:
-    """Return file and number of a line as text for messages (Parquet: file and number of a row)."""
+    """Return a text for messages with the file and the number of a line (for Parquet, of a row)."""
     return f"{file}, {'row' if _is_parquet(file) else 'line'} {line:.0f}"
 
 
@@ -86,7 +86,7 @@ def read_pieces(
         file: path of the file.
         entry: format of the file.
         columns: names of the columns to read, in this order.
-        names: name -> its number, for columns with names instead of numbers; new names are added.
+        names: dictionary from name to number, for columns that contain names instead of numbers; new names are added.
         progress: function that receives how much was read (KiB), and the size of the file (KiB).
 
     Raises ``InvalidInput`` with file, line and column for a missing column or a cell that is not a number. Raises
@@ -191,7 +191,7 @@ def _text(text: TextIOWrapper, file: Path, entry: Format, columns: Sequence[str]
 
 
 def _rows(file: Path, lines: Iterator[tuple[int, str]], separator: str, streets: Sequence[str]) -> Iterator[_Row]:
-    """Yield number and cells of each line that is not blank and does not contain one of the texts ``streets``."""
+    """Yield number and cells of each line, except blank lines and lines that contain one of the texts ``streets``."""
     elsewhere = seen = 0
     for number, line in lines:
         if streets and any(street in line for street in streets):
@@ -235,14 +235,14 @@ def _measured(cell: str) -> float:
 
 
 def _number_of(names: dict[str, float], cell: str) -> float:
-    """Return the number of a name: 1 for the first name, 2 for the next one. Raise ``ValueError`` for an empty name."""
+    """Return the number of a name: new names get the numbers 1, 2, 3, ... Raise ``ValueError`` for an empty name."""
     if not (name := cell.strip()):
         raise ValueError
     return names.setdefault(name, len(names) + 1.0)
 
 
 def _match(file: Path, columns: Sequence[str], shown: Sequence[str]) -> tuple[list[int], list[str]]:
-    """Find columns of a file by name; return the indices of the found columns, and the names of the missing ones.
+    """Find columns of a file by name; return the indices of the columns found, and the names of the missing columns.
 
     Numbered columns (Speed1, Speed2, ...) are in the order of their numbers.
 

@@ -1,4 +1,4 @@
-"""Create a scenario from a folder of recorded traffic: the scenario file, and its rows of gaps and speeds."""
+"""Create a scenario (a scenario file, and a file with rows of gaps and speeds) from a folder of recorded traffic."""
 
 from __future__ import annotations
 
@@ -55,22 +55,22 @@ def scenario_from_data(
 
     At regular times, queues of vehicles are cut from the front into chains. A chain has as many vehicles as the
     scenario ``based_on``. At one time, a vehicle belongs to at most one chain. Each chain is a row of speeds and gaps.
-    If there are more rows than a table may have, every k-th row is used. Files with errors are refused; all others are
-    used.
+    If there are more rows than a table may have, every k-th row is used. Files with errors are left out; all other
+    files are used.
 
     Args:
         name: name of the scenario.
         folder: folder with the files, or one file.
         format: format of the files.
-        columns: for the format ``table``: the columns of the files, in the form that ``format_of`` takes.
+        columns: columns of the files, for the format ``table`` only, in the form that ``format_of`` describes.
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
         every_s: time between two moments of a recording from which rows are taken (s).
         draw: how the scenario draws worlds: whole ``rows``, or each quantity from a distribution fitted to the rows.
-        strict: raise an error if a file is refused.
+        strict: whether to raise an error if some file has errors.
         progress: function that receives the name of a file, how much of it was read (KiB), and its size (KiB).
 
     Raises ``InvalidInput`` with file, line and column if no file can be used. The notes of the exception describe the
-    other refused files.
+    errors of the other files.
 
     """
     entry, base = format_of(format, columns), load_scenario(based_on)
@@ -78,7 +78,7 @@ def scenario_from_data(
     if entry.hertz:
         check_every(every_s, entry, entry.title)
     if not 0.0 < every_s < math.inf:
-        raise InvalidInput(f"every = {every_s:g} s: the time between two rows must be above 0")
+        raise InvalidInput(f"every = {every_s:g} s: the time between two moments must be above 0")
     if base.members or base.table is not None:
         raise InvalidInput(f"based_on = {based_on!r}: must be a scenario without a mixture and without a table")
     vehicles = base.vehicles

@@ -42,9 +42,9 @@ STATE_TABLE = f"CREATE TABLE state({','.join(State._fields)})"
 
 
 def check_every(every_s: float, entry: Format, what: str) -> int:
-    """Return how many ticks (intervals between recorded moments) ``every_s`` has.
+    """Return the number of ticks (intervals between recorded moments) in the time ``every_s``.
 
-    Raises ``InvalidInput`` if this is not a whole number. ``what`` is the name of the data for the message.
+    Raises ``InvalidInput`` if the number is not a whole number. ``what`` is the name of the data for the message.
     """
     stride = every_s * entry.hertz
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
@@ -101,7 +101,7 @@ def keep_states(
 
 
 def moments(store: sqlite3.Connection) -> Iterator[tuple[float, list[Any]]]:
-    """Yield each moment in the table ``state``, in order of time: its tick, and the states in the order of the file."""
+    """Yield each moment in the table ``state``, in order of time: its tick, and its states in the order of the file."""
     for tick, rows in groupby(store.execute("SELECT * FROM state ORDER BY tick, line"), itemgetter(0)):
         yield tick, [State(*row) for row in rows]
 
@@ -114,11 +114,11 @@ def _directions(file: Path, entry: Format) -> Floats:
 
 
 def _with_rate(entry: Format, times: Floats, every_s: float) -> Format:
-    """Return the format with the rate of a file: its tick is the smallest difference between two of ``times`` [rows].
+    """Return the format with the rate of one file; the tick is the smallest difference between the ``times`` [rows].
 
-    If some times are not multiples of the tick, the recorded times are rounded. A rate within 2 % of a whole number is
-    then replaced by this number: times of 0.033 and 0.067 s mean 30 Hz. ``every_s`` is the tick of a file with a single
-    time.
+    If some times are not multiples of the tick, the recorded times are rounded. In this case a rate within 2 % of a
+    whole number is replaced by the whole number; for example, times of 0.033 s and 0.067 s mean 30 Hz. If all times are
+    equal, the tick is ``every_s``.
     """
     seconds = np.unique(np.round(times * entry.ticks, 6))
     steps = np.diff(seconds)
@@ -171,8 +171,8 @@ def _states(piece: Piece, entry: Format, ticks: Floats, turned: Floats) -> Float
 def _of_gaps(piece: Piece, entry: Format, ticks: Floats) -> Floats:
     """Return the fields of ``State`` for OpenACC, [rows, fields].
 
-    Car k follows car k - 1 if both speeds and the gap IVS k - 1 are recorded. The first car of a queue is at position
-    0. The position of another car is minus the sum of the gaps ahead of it.
+    Car k counts as the follower of car k - 1 if both speeds and the gap between them (column IVS k - 1) are recorded.
+    The first car of a queue is at position 0. The position of another car is minus the sum of the gaps ahead of it.
     """
     at = {name.lower(): k for k, name in enumerate(piece.columns)}
     cars = sorted(int(name.removeprefix("speed")) for name in at if name.startswith("speed"))

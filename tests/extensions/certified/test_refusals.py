@@ -233,7 +233,7 @@ AGENTS: dict[str, Callable[[], object]] = {
     ":estimated: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and the result": lambda: evaluated(
         make_agent("full_brake+step:estimated", scenario=SLOW), SLOW
     ),
-    ":estimated: a vehicle of world 0 brakes in pieces (profile), and the result would not be exact": lambda: evaluated(
+    ":estimated: a vehicle of world 0 follows a braking profile, and the result would not be exact": lambda: evaluated(
         make_agent("full_brake+step:estimated", scenario=PIECES), PIECES
     ),
     "shield: robust interior: vehicle_1 follows 'profile:0=3,1=5'; must be full_brake": lambda: evaluated(

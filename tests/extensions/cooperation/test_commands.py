@@ -15,7 +15,7 @@ REFUSED = [
         "study ablate --output new --levels cooperation-3-pair,cooperation-3-pair",
         "levels: 'cooperation-3-pair' is given twice",
     ),
-    ("study ablate --output new --levels cooperation-3-pair", "levels: only 1 level; give at least two levels"),
+    ("study ablate --output new --levels cooperation-3-pair", "levels: 1 level given; give at least two levels"),
     (
         "study ablate --output new --levels cooperation-0-sensors,paper-distance",
         "level 'paper-distance': speeds_mps is 20, 18, 20, but",
@@ -34,7 +34,7 @@ REFUSED = [
     ),
     (
         "study ablate --output new --shield robust",
-        "shield 'robust': must be step, because the other shields can control one vehicle only",
+        "shield 'robust': the shield must be 'step', because other shields can control only one vehicle",
     ),
     ("study ablate --output new --recipes ppo,ppo", "recipes ppo, ppo: two recipes have the same name"),
 ]

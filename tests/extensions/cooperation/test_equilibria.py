@@ -195,7 +195,11 @@ def test_price__is_the_ratio_of_the_means_over_worlds_where_something_converged(
 @pytest.mark.parametrize(
     ("level", "options", "message"),
     [
-        ("cooperation-0-sensors", {}, "scenario 'cooperation-0-sensors': has no learner; give at least one vehicle"),
+        (
+            "cooperation-0-sensors",
+            {},
+            "scenario 'cooperation-0-sensors': the scenario has no learner; give at least one vehicle",
+        ),
         ("cooperation-3-pair", {"tolerance": float("nan")}, "tolerance = nan: the tolerance must be a finite"),
         ("cooperation-3-pair", {"rounds": 0}, "rounds = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"budget": 0}, "budget = 0: must be a whole number, at least 1"),

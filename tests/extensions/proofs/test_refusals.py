@@ -71,7 +71,7 @@ PROOFS: dict[str, Callable[[], object]] = {
     "avoidability: brakes of world 0 build up (brake_rate_mps3, release_rate_mps3), and the result": lambda: (
         avoidability(PAPER.replace(brake_rate_mps3=9).sample(2, 7).worlds)
     ),
-    "avoidability: a vehicle of world 0 brakes in pieces (profile), and the result would not be exact": lambda: (
+    "avoidability: a vehicle of world 0 follows a braking profile, and the result would not be exact": lambda: (
         avoidability(PAPER.replace(roles={"vehicle_1": "profile:0=3,1=5", "vehicle_2": "learner"}).sample(2, 7).worlds)
     ),
 }
@@ -97,7 +97,7 @@ SEARCHES: dict[str, Callable[[], object]] = {
     "profiles: command -7.1 m/s2 is beyond a vehicle's capacity": lambda: problem().follow(
         problem().constant(np.array([[[-7.1]]]))
     ),
-    "profiles: phases must end in order, and the last phase must end at the last step": lambda: problem().follow(
+    "profiles: phases must end one after the other, the last one at the last step": lambda: problem().follow(
         Profiles(np.array([[9, 5, 75]]), np.zeros((1, 3, 1)))
     ),
     "t.npz: there is no such file": lambda: BestHarmTable.load(Path("t.npz")),
