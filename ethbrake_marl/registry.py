@@ -37,8 +37,9 @@ T = TypeVar("T")
 class Part:
     """Value of an entry point: the arguments of a ``register_...`` function, except the name.
 
-    The name is the name of the entry point. For example, an entry point in the group ``ethbrake_marl.measures`` with
-    the value ``part`` below has the same effect as ``register_measure(name, closing, unit="m/s")``.
+    The part is registered under the name of the entry point. For example, an entry point in the group
+    ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as
+    ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(episodes):

@@ -43,8 +43,8 @@ class ShieldOptions:
         intervention_penalty: amount subtracted from the reward of a step in which the proposed action was replaced.
         logging: whether ``shield.log`` collects the replaced actions; not allowed in mode ``episode``.
         shares: whether ``infos`` contains the harm that each vehicle bears under the current plan and under the
-            constant actions of least harm; with a ``cap`` it always contains this harm. The computation slows a step by
-            a few percent. Not allowed in mode ``episode``.
+            constant actions of least harm; with a ``cap`` it always contains this harm. Computing this harm slows a
+            step by a few percent. This setting is not allowed in mode ``episode``.
         where: name of the function or class that the user called, with which error messages begin.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
@@ -184,7 +184,7 @@ def one_learner(scenario: Scenario) -> int | None:
 
 
 def _class_with(mode: str, settings: Mapping[str, Any]) -> type[ShieldOptions]:
-    """Return the settings class of ``mode`` if it has all ``settings``, otherwise that of the first mode that has them.
+    """Return the settings class of ``mode`` if it has all ``settings``, otherwise the first class that has them.
 
     Raises ``UnknownName`` for a setting that no mode has.
     """

@@ -377,7 +377,7 @@ SPOILED: dict[str, tuple[Spoil, str]] = {
         _edit(format_version=3, network__networks=2, network__value_hidden=[]),
         r"manifest.json: network: gate_hidden = \[\]: must have a layer if networks is above 1",
     ),
-    "gate_of_one_network": (_edit(network__gate_hidden=[4]), r"manifest.json: network: gate_hidden = \[4\]: must be"),
+    "gate_of_one_network": (_edit(network__gate_hidden=[4]), r"manifest.json: network: gate_hidden = \[4\]: must have"),
     "critic_beside_several_networks": (
         _edit(format_version=3, network__networks=2, network__gate_hidden=[4]),
         r"manifest.json: network: value_hidden = \[5\]: must be empty if networks is above 1",

@@ -56,7 +56,7 @@ def stopping_distance(speed: float, deceleration: float) -> float:
 def contact_while_coasting(gap: float, v_l: float, a_l: float, v_f: float, tau: float) -> float:
     """Return the squared closing speed if the pair meets while the follower coasts, else -1. [m2/s2]
 
-    These are the regimes A (the leader still moves) and A' (the leader stands) of
+    These are the regimes A (the leader still moves) and A' (the leader is at rest) of
     docs/internals/proofs/constant-deceleration.md.
 
     Args:

@@ -107,7 +107,7 @@ def _minimise(
     Args:
         worlds: n worlds.
         told: the same worlds for the closed form, in which the braking capacity of each other vehicle is replaced by
-            the deceleration that it commands.
+            the deceleration that this vehicle commands.
         command: commands of all vehicles, [n, N] m/s2; the controlled vehicle's command is ignored.
         vehicle: index of the controlled vehicle, from 0.
         rows: indices of the worlds to search, [m].
