@@ -541,8 +541,8 @@ def _supports_of(scenario: ScenarioFields) -> Callable[[str], Floats]:
     return lambda key: np.array(scenario.supports(key)).T
 
 
-def undeclared_by_type(key: str, kind: str) -> str:
-    """Return the error message for a quantity ``key`` that the vehicle type ``kind`` does not declare."""
+def undeclared_by_type(key: str, kind: object) -> str:
+    """Return the error message for a quantity ``key`` that the vehicle type named ``kind`` does not declare."""
     return (
         f"vehicle type {kind} does not declare {key}; declare {key} in this type, or outside vehicle_types for all"
         " types without it"
