@@ -33,7 +33,7 @@ def advance_table(
         restitution: coefficient of restitution of every impact.
         duration: length of the segment, s.
         start_s: absolute time at the start of the segment, s, for ``rows``.
-        world: number of the world, for ``rows``.
+        world: index of the world; selects the entries of ``rows``.
         rows: array of impacts, [capacity, LISTED.WIDTH]; impacts beyond its capacity are only counted.
         recorded: number of impacts before this segment.
 

@@ -43,7 +43,7 @@ class Running(NamedTuple):
 
     @property
     def finished(self) -> Bools:
-        """Whether the episode of each world is over in all possible worlds of this world, [n]."""
+        """For each world: whether the episode is over in all its members (possible worlds), [n]."""
         return np.asarray(self.ended.reshape(self.n, -1).all(axis=1), np.bool_)
 
     @property

@@ -255,7 +255,7 @@ def least_harm(
     kind: int, at: Floats, first: float, last: float, floor: float, best: float, enough: float, plan: Floats,
     other: Floats, heap: Floats,
 ) -> float:  # fmt: skip
-    """Return a lower bound (m2/s2) on the harm of all first contacts between two times; at most ``best``.
+    """Return a lower bound (m2/s2) on the harm of every first contact between two times, or ``best`` if it is smaller.
 
     Args:
         kind: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST`` (with brake build-up ``RAMPED_FRONT`` or

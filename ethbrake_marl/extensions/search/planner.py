@@ -183,7 +183,7 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Search from ``plan`` and constant commands. Return the best plan of each world, and its harm, [n] m2/s2."""
+        """Search for the commands with the least harm, starting from ``plan`` and from constant commands. Return the best plan of each world, and its harm, [n] m2/s2."""
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)

@@ -91,7 +91,9 @@ def sweep_command(
 def tune_command(
     file: Annotated[
         Path,
-        typer.Argument(metavar="TUNING.yaml", help="File with a training and the ranges of the settings to search."),
+        typer.Argument(
+            metavar="TUNING.yaml", help="File that describes a training and, for each setting to search, its range."
+        ),
     ],
     output: FolderOption,
     trials: Annotated[

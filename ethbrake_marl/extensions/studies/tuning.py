@@ -63,7 +63,7 @@ def _check_number(value: Any) -> int | float:
     An ``int`` is returned as an ``int``, not as a ``float``.
     """
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        raise ValueError("the end of a range must be a finite number")
+        raise ValueError("each end of a range must be a finite number")
     return value
 
 
