@@ -19,7 +19,7 @@ from ethbrake_marl.shields.paper_hybrid import HybridAgent
 
 
 class Odometer(NamedTuple):
-    """Distance that a vehicle has travelled since the alert, computed from its speeds and commands."""
+    """Distance of a vehicle from its position at the alert, computed from its speed and command at each decision."""
 
     way_m: Floats  # [n] distance since the alert, m
     time_s: Floats  # [n] time of the last decision, s

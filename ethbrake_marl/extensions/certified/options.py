@@ -159,6 +159,10 @@ def mode_uncertainty(mode: str, given: object, where: str) -> Uncertainty | None
     uncertainty = checked_uncertainty(given)
     if (mode == "robust") != (uncertainty is not None):
         needed = f"needs an uncertainty, for instance {UNCERTAINTY_EXAMPLE}"
-        what = needed if uncertainty is None else "takes no uncertainty; must be mode robust"
+        what = (
+            needed
+            if uncertainty is None
+            else "does not use an uncertainty; use mode robust, or leave the uncertainty out"
+        )
         raise InvalidInput(f"{where}: mode {mode} {what}")
     return uncertainty

@@ -60,7 +60,9 @@ class RobustShield(StepShield):
         super().__init__(scenario, vehicle, harm_count=harm_count, others=others, **settings)
         if uncertainty is not None and (len(self.vehicles) > 1 or self.cap is not None):
             what = "several vehicles" if self.cap is None else "a cap"
-            raise InvalidInput(f"shield: uncertainty: not possible with {what}; must be one vehicle without a cap")
+            raise InvalidInput(
+                f"shield: an uncertainty cannot be combined with {what}; shield one vehicle without a cap"
+            )
         self.uncertainty, self.robust = uncertainty, checked_robust(robust, "shield")
         Boxes.check_possible(self.robust, scenario, harm_count, self._others)
 

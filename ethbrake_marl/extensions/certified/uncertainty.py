@@ -234,7 +234,8 @@ def parse_uncertainty(text: str) -> Uncertainty:
         name, width = match["name"], float(match["width"])
         if name in QUANTITIES and match["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
             raise InvalidInput(
-                f"uncertainty: {entry!r}: only gaps_m takes a pair, as in gaps_m.pair_1; the others take a vehicle"
+                f"uncertainty: {entry!r}: only gaps_m may name a pair, as in gaps_m.pair_1; other"
+                " quantities may name a vehicle, as in mass_t.vehicle_2"
             )
         place = None if match["number"] is None else int(match["number"]) - 1
         intervals.append(Interval(name, width / 100.0 if match["share"] else width, bool(match["share"]), place))

@@ -437,12 +437,13 @@ def check_covered(worlds: Worlds, vehicle: int, scripts: Mapping[int, str] | Non
     )
     if vehicle == 0 and np.isfinite(worlds.obstacle_gap_m).any():
         raise InvalidInput(
-            "avoidability: vehicle_1 is controlled with an obstacle ahead (obstacle_gap_m); must be without obstacle"
+            "avoidability: vehicle_1 is controlled and has an obstacle ahead (obstacle_gap_m); give worlds without"
+            " an obstacle"
         )
     if (worlds.N, vehicle) not in ((3, 1), (2, 0), (2, 1)):
         raise InvalidInput(
-            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles is controlled; must be vehicle_2 of 3 vehicles"
-            " or either one of 2 vehicles"
+            f"avoidability: vehicle_{vehicle + 1} of {worlds.N} vehicles is controlled; the controlled vehicle"
+            " must be vehicle_2 of 3 vehicles, or any of 2 vehicles"
         )
     for index, script in (scripts or {}).items():
         if index != vehicle and script != "full_brake":

@@ -46,7 +46,8 @@ def gained(near: float, time: float, since: float, power: float) -> float:
         near: smallest distance by which the rear vehicle is farther ahead than if it braked fully, m.
         time: time of the comparison, s.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest acceleration that it can gain over full braking, m/s2; infinite if other vehicles push it.
+        power: largest difference between the rear vehicle's acceleration and full braking, m/s2; infinite if other
+            vehicles may push it.
 
     """
     if near <= 0.0 or time <= since:
@@ -85,10 +86,11 @@ def soft_behind(at: Floats, early: float, late: float, near: float, far: float, 
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle over its own full braking, m.
-        far: largest such lead, m.
+        near: smallest lead of the rear vehicle, m.
+        far: largest lead of the rear vehicle, m.
         since: time from which on the rear vehicle may brake less than fully, s.
-        power: largest acceleration that it can gain over full braking, m/s2; infinite if other vehicles push it.
+        power: largest difference between the rear vehicle's acceleration and full braking, m/s2; infinite if other
+            vehicles may push it.
 
     """
     faster = gained(near, late, since, power)
@@ -112,8 +114,8 @@ def after_behind(
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle over its own full braking, m.
-        far: largest such lead, m.
+        near: smallest lead of the rear vehicle, m.
+        far: largest lead of the rear vehicle, m.
         hard: largest closing speed of the first contact, m/s.
         faster: smallest difference between the rear vehicle's speed and its speed under full braking, m/s.
         moved: working memory for a second world, [LINE.WIDTH].
@@ -156,8 +158,8 @@ def put_behind(
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
-        near: smallest lead of the rear vehicle over its own full braking, m.
-        far: largest such lead, m.
+        near: smallest lead of the rear vehicle, m.
+        far: largest lead of the rear vehicle, m.
         soft: smallest closing speed of the first contact, m/s.
         hard: largest closing speed of the first contact, m/s.
         search: [SEARCH] settings of the search: ``SINCE`` (s) and ``POWER`` (m/s2) as in ``gained``, ``FLOOR`` (bound

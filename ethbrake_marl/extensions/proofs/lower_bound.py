@@ -167,7 +167,8 @@ def front_first(
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         floor: known lower bound on the harm of the other pair, m2/s2.
         best: smallest harm of a first contact found so far, m2/s2.
-        enough: harm (m2/s2) that is proven in another way; the function returns 0 if some contact does no more harm.
+        enough: lower bound (m2/s2) that is proven in another way; the function returns 0 if the bound of some contact
+            is not above it.
         plan: working memory for the motion of one vehicle, from ``empty_plan``.
         other: second working memory of the same kind.
         heap: working memory for the cells of the search, [CELLS, NEAR].
@@ -241,7 +242,8 @@ def rear_first(
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.
         floor: known lower bound on the harm of the other pair, m2/s2.
         best: smallest harm of a first contact found so far, m2/s2.
-        enough: harm (m2/s2) that is proven in another way; the function returns 0 if some contact does no more harm.
+        enough: lower bound (m2/s2) that is proven in another way; the function returns 0 if the bound of some contact
+            is not above it.
         plan: working memory for the motion of one vehicle, from ``empty_plan``.
         other: second working memory of the same kind.
         heap: working memory for the cells of the search, [CELLS, NEAR].
@@ -278,9 +280,9 @@ def rear_first(
 def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
-    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. If the rear
-    vehicle brakes harder than the controlled one, by b (m/s2), it was faster than the controlled one by at least ``b
-    t`` at every time t before the contact. Here t counts only while the rear vehicle brakes, from its onset on.
+    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled one. Let the rear
+    vehicle brake harder than the controlled one, by b (m/s2). Then t seconds before the contact it was faster than the
+    controlled one by at least ``b t``, if it already braked at that time.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

@@ -82,7 +82,7 @@ def least_beyond(
         late: time at which the vehicles have ``place`` and ``speed``, s.
         place: smallest position of the centre of mass of all three vehicles at ``late``, m.
         speed: speed of this centre of mass at ``late``, m/s.
-        least: bound that is known already, m2/s2; the result is at least this.
+        least: lower bound that is known already, m2/s2; the result is at least ``least``.
         plan: working memory for the motion of one vehicle, from ``empty_plan``.
         other: second working memory of the same kind.
 
@@ -331,7 +331,7 @@ def beyond_rear(
         early: earliest time of the first contact, s after the controlled vehicle may act.
         late: latest time of the first contact, s.
         closing: largest closing speed of the first contact, m/s.
-        least: bound that is known already, m2/s2; the result is at least this.
+        least: lower bound that is known already, m2/s2; the result is at least ``least``.
         plan: working memory for the motion of one vehicle, from ``empty_plan``.
         other: second working memory of the same kind.
 

@@ -97,7 +97,8 @@ def switch_for(
     ``time``.
 
     The *switch* is the time at which ``sign`` times the vehicle's force stops rising and begins to fall; a *force* is
-    an acceleration. Two switches can satisfy the condition; the third result is the speed (m/s) at ``time`` with the earlier one.
+    an acceleration. Two switches can satisfy the condition; the third result is the speed (m/s) at ``time`` with the
+    earlier one.
 
     Args:
         at: state of one world, [LINE.WIDTH]; ``line.LINE`` names the columns.

@@ -24,7 +24,7 @@ from ethbrake_marl.scenario.schema import Scenario
 class Searched(AgentAround):
     """Agent that searches around the commands of another agent at the alert, and then drives the best commands found.
 
-    The search uses the model of the line and the scripts of the other vehicles. The agent does not react to unexpected
+    The search simulates the line, with the scripts of the other vehicles. The agent does not react to unexpected
     motion. ``predicted_harm`` [n] (m2/s2) is never above the harm of the other agent. It equals the simulated harm
     exactly if the other vehicles follow their scripts. Raises ``InvalidInput`` if ``policy`` is not an agent, or if
     ``candidates`` is outside 1 to 1,000,000. ``begin`` raises ``InvalidInput`` if the command of another vehicle's
@@ -33,7 +33,7 @@ class Searched(AgentAround):
     Args:
         policy: agent whose commands the search starts from.
         scenario: scenario of the worlds; the search minimises its objective.
-        candidates: number of candidates in each world.
+        candidates: number of command sequences that the search simulates in each world.
         harm_count: harm count to minimise, ``first`` or ``total``.
 
     >>> import ethbrake_marl as eb
@@ -58,7 +58,8 @@ class Searched(AgentAround):
         self._outlook = Outlook(harm_count, scenario.horizon_s, scenario.time_step_s, scenario.objective)
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
-        """Simulate the policy's episode from the alert, search around its commands, and return the best ones as memory.
+        """Simulate the policy's episode from the alert, search around its commands, and return the best commands as
+        memory.
 
         Args:
             alert: the worlds at the alert, [n].

@@ -1,7 +1,7 @@
 """Compute the best known harm of each world by a search over command profiles.
 
-A *profile* holds the commands of the controlled vehicles over a whole episode. It consists of *phases*, intervals of
-time with constant commands.
+A *profile* consists of the commands of the controlled vehicles over a whole episode. A profile is a sequence of
+*phases*: time intervals of constant commands.
 """
 
 from __future__ import annotations
@@ -58,23 +58,25 @@ def best_harm(
 ) -> BestHarmTable:
     """Search for the profile with the least harm in each world and under each count. Return the profiles as a table.
 
-    With two counts, there are two searches, and each count gets the better of the two profiles. The harm is never above
-    the harm of ``known``. It is never above the harm of the best constant deceleration of one controlled vehicle, or of
-    the same search for one controlled vehicle alone, while the other vehicles brake fully. The result for a world does
-    not depend on ``threads`` or on the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if
-    the command of a script is not fixed at the alert, or if ``budget`` is below 1.
+    With two counts, there are two searches, one for each count; for each count the table then gets whichever of the two
+    profiles has less harm. The harm in the table is never above the harm in ``known``. With one controlled vehicle it
+    is never above the harm of the best constant deceleration. With several it is never above the result of the same
+    search for any single one of them while the others brake fully. The result for a world does not depend on
+    ``threads`` or on the other worlds. Raises ``InvalidInput`` if ``vehicles`` or ``counts`` is empty, if the command
+    of a script is not fixed at the alert, or if ``budget`` is below 1.
 
     Args:
         scenario: scenario of the worlds.
         worlds: worlds at t = 0, [n].
         counts: harm counts to minimise: ``first``, ``total``, or both.
-        vehicles: indices of the controlled vehicles; None: the scenario's learners. All other vehicles follow scripts.
-        budget: number of candidates per world and count.
+        vehicles: indices of the controlled vehicles; None: the learners of the scenario. All other
+            vehicles follow scripts.
+        budget: number of candidate profiles that are simulated per world and count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
         known: table of the same vehicles, whose profiles the search starts with; None: no table.
-        objective: objective to minimise, as a scenario declares it. With any objective but ``total``, the table holds
-            the amounts of this objective instead of the harm of the line, and its header names the objective.
+        objective: objective to minimise, as a scenario declares it. With any objective but ``total``, the table
+            contains the values of this objective instead of the harm of the line, and its header names the objective.
 
     """
     if not counts or not set(counts) <= set(HARM_COUNTS) or len(set(counts)) != len(counts):
@@ -132,21 +134,22 @@ def search_list(
 ) -> BestHarmTable:
     """Run ``best_harm`` on a long list of worlds, ``CHUNK`` worlds at a time. An interrupted run can be continued.
 
-    The table does not contain worlds that the physics cannot advance because of a defect. Its header names them under
-    the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as ``best_harm``, and if ``known`` contains no world
-    of the list. Raises ``PhysicsError`` if the physics can advance no world of the list.
+    The table does not contain worlds that the physics cannot advance because of a defect. The header of the table names
+    these worlds under the key ``LEFT_OUT``. Raises ``InvalidInput`` in the same cases as ``best_harm``, and if
+    ``known`` contains no world of the list. Raises ``PhysicsError`` if the physics can advance no world of the list.
 
     Args:
         scenario: scenario of the worlds.
         sample: worlds of the list, with their numbers.
         counts: harm counts to minimise: ``first``, ``total``, or both.
-        vehicles: indices of the controlled vehicles; None: the scenario's learners.
-        budget: number of candidates per world and count.
+        vehicles: indices of the controlled vehicles; None: the learners of the scenario.
+        budget: number of candidate profiles that are simulated per world and count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
         known: table whose profiles the search starts with; None: no table.
-        chunks: folder in which the table of each finished chunk is stored as a file. A later call with the same
-            arguments reads these files. It replaces files that were made with other arguments. None: nothing is stored.
+        chunks: folder in which the table of each finished chunk (``CHUNK`` worlds of the list) is stored as a file. A
+            later call with the same arguments reads these files; a call with other arguments overwrites them. None:
+            nothing is stored.
         on_progress: function that is called with the number of finished worlds and the number of all worlds.
         objective: objective to minimise, see ``best_harm``.
 
@@ -185,7 +188,8 @@ def search_list(
 def _kept_or_searched(
     task: Task, every: Worlds, file: Path | None, options: dict[str, Any], rows: Ints
 ) -> BestHarmTable:
-    """Return the table of a chunk. Read ``file`` if it was made with the same options; otherwise search and write it.
+    """Return the table of a chunk (``CHUNK`` worlds of the list). If ``file`` was made with the same options, it is
+    read; otherwise the worlds are searched and ``file`` is written.
 
     Args:
         task: scenario and controlled vehicles.
@@ -213,12 +217,12 @@ def _kept_or_searched(
 
 
 def chunks_left(scenario: Scenario, sample: Sample, *, budget: int, chunks: Path) -> tuple[int, list[Path]]:
-    """Return the number of worlds that ``search_list`` has not searched yet under both counts, and the damaged files.
+    """Return the number of worlds that ``search_list`` still has to search, and the paths of damaged files.
 
     Args:
         scenario: scenario of the worlds.
         sample: worlds of the list.
-        budget: number of candidates per world and count.
+        budget: number of candidate profiles that are simulated per world and count.
         chunks: folder of the chunk files.
 
     """
@@ -249,7 +253,7 @@ def kept_chunk(file: Path, identity: UInt64s, question: Mapping[str, object]) ->
     Args:
         file: file that stores the table of the chunk.
         identity: hash of each world of the chunk.
-        question: options of the search (counts, budget, seed). The header of the file must contain the same values.
+        question: options of the search (counts, budget, seed). The header of the file must contain the same options.
 
     """
     if not file.is_file():
@@ -348,7 +352,8 @@ def starting_profiles(
 def startable(profiles: Profiles) -> Profiles:
     """Return the profiles with at most ``MOST_PHASES`` phases, so that a search can start from them.
 
-    A profile with more phases (intervals of constant command) is replaced by its first command, held to the end.
+    A profile with more phases (intervals of constant command) is replaced by a constant profile: its first command for
+    the whole episode.
     """
     ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
     last = ends[:, -1:]
@@ -396,11 +401,11 @@ def driven_profiles(agent: Driver, worlds: Worlds, task: Task, last_step: Ints) 
 def fold_episodes(
     table: BestHarmTable, scenario: Scenario, worlds: Worlds, name: str, agents: Mapping[HarmCount, Agent]
 ) -> BestHarmTable:
-    """Drive the worlds with agents, and return the table with every harm that an agent undercuts replaced.
+    """Let agents drive the worlds; return the table in which a harm is replaced wherever an agent does less harm.
 
-    The recorded commands are simulated again, and the table stores the harm of this simulation. The header counts the
-    worlds with a replaced harm. A world that an agent cannot drive to the end keeps its harm. Raises ``InvalidInput``
-    unless the scenario has exactly one learner.
+    The recorded commands are simulated again, and the table stores the harm of this simulation. The header of the table
+    says in how many worlds the harm was replaced. If the simulation with an agent fails in a world, the harm of this
+    world is not replaced. Raises ``InvalidInput`` unless the scenario has exactly one learner.
 
     Args:
         table: table to improve.

@@ -1,4 +1,4 @@
-"""Starting profiles for a search, made of full drive and full braking.
+"""Starting profiles for a search; they consist of full drive and full braking.
 
 The proof of the lower bound shows that profiles with the least harm have one of two forms. Either the vehicle drives
 fully for a while, brakes fully until it meets the vehicle ahead, and drives fully again. Or it brakes fully, drives
@@ -44,7 +44,7 @@ def extreme_profiles(problem: ProfileProblem, states: Floats, has_front: Bools, 
 
     The profiles of world 0 come first, then the profiles of world 1, and so on. An *extreme* profile changes between
     full drive and full braking. The times at which two vehicles meet are computed from ``states``, as if the neighbours
-    braked fully. If they brake less, the profiles are valid but do more harm.
+    braked fully. If the neighbours brake less, the profiles are valid but not the best of their form.
 
     Args:
         problem: worlds, with the commands of the other vehicles and the harm to minimise.
@@ -147,7 +147,7 @@ def fill_extreme(
         change: time of the first change, s.
         meeting: time of the second change, s.
         early: number of steps by which the second change comes before ``meeting``.
-        share: weight of the first command in the step of the second change, 0 to 1.
+        share: weight of the first command in the mean command of the step of the second change, 0 to 1.
         ends: output: number of the step at which each phase ends, [5].
         commands: output: command of each phase, [5, 1] m/s2.
 

@@ -22,10 +22,10 @@ KNOWN, BELOW = "known", "below_best_known"
 
 
 class LimitMeasures(MeasureSet):
-    """Measures of unavoidable contact, of the best known harm, and of each agent's harm above it.
+    """Measures of unavoidable contact, of the best known harm, and of each agent's regret.
 
-    The functions of the measures receive the outcome of an agent and a ``Regrets`` object, which holds the best known
-    harm of every world.
+    The functions of the measures receive the outcome of an agent and a ``Regrets`` object with the best known harm of
+    every world.
     """
 
     measures = (
@@ -174,7 +174,7 @@ class LimitMeasures(MeasureSet):
 def best_known_words(row: SummaryRow) -> str:
     """Return the label of the best known harm in ``row``: "best known", or "best of these agents".
 
-    The second label is used if some worlds were not searched before the evaluation.
+    The label is "best of these agents" if some worlds were not searched before the evaluation.
     """
     share = row.more[NAME]["known_best_share"]
     return "best known" if share is None or share == 1.0 else "best of these agents"

@@ -28,7 +28,7 @@ class IncompleteTable(UserWarning):
 
 @dataclass(frozen=True, slots=True)
 class Unproven:
-    """Returned instead of a proof if the proofs do not cover a task in some worlds."""
+    """Result of ``prove`` and ``known_limits`` if the proofs do not cover a task in some worlds."""
 
     because: str  # the reason, such as "brakes build up; the proofs assume instant brakes"
 
@@ -118,7 +118,8 @@ def prove(worlds: Worlds, task: Task) -> Proof | Unproven:
 
 
 def unproven_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why the proofs do not cover the task in these worlds, as a clause. Return None if they do.
+    """Return the reason why the proofs do not cover the task in these worlds, as a clause. Return None if they cover
+    the task.
 
     ``task`` names the scenario and the controlled vehicles.
     """
@@ -130,7 +131,7 @@ def unproven_because(worlds: Worlds, task: Task) -> str | None:
 
 
 def undecided_because(worlds: Worlds, task: Task) -> str | None:
-    """Return the reason why it is unknown whether contact is avoidable, as a clause. Return None if it is known.
+    """Return the reason why it is unknown whether contact is avoidable, as a clause. Return None if this is known.
 
     ``worlds`` are at the alert. ``task`` names the scenario and the controlled vehicles.
     """

@@ -27,7 +27,9 @@ MOST_CANDIDATES = 1_000_000  # most candidates per world and decision
 
 
 class Outlook(NamedTuple):
-    """Settings of an agent that searches, and methods that find the worlds to search and the present command."""
+    """Settings of an agent that searches, with methods that say which worlds need a new plan and which command applies
+    now.
+    """
 
     harm_count: HarmCount  # harm count to minimise: ``first`` or ``total``
     horizon_s: float  # end of the simulated episode, s
@@ -74,7 +76,9 @@ class Outlook(NamedTuple):
 
 
 def budget_of(argument: str) -> int | None:
-    """Return ``argument`` as a number of candidates; None if it is no whole number from 1 to ``MOST_CANDIDATES``."""
+    """Return ``argument`` as a number of candidates, or None if ``argument`` is no whole number from 1 to
+    ``MOST_CANDIDATES``.
+    """
     number = int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     return number if 1 <= number <= MOST_CANDIDATES else None
 
@@ -98,7 +102,7 @@ class Planner:
         horizon_s: end of the simulated episode, s.
         most_candidates: upper limit of the number of candidates in ``argument``; None: no limit.
         time_step_s: time between two decisions, s.
-        objective: objective to minimise; ``predicted_harm`` is the amount of this objective.
+        objective: objective to minimise; ``predicted_harm`` is the value of this objective.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -183,7 +187,9 @@ class Planner:
         return Profiles(ends, plan.commands_mps2)
 
     def _search(self, problem: ProfileProblem, plan: Profiles) -> tuple[Profiles, Floats]:
-        """Search for the commands with the least harm, starting from ``plan`` and from constant commands. Return the best plan of each world, and its harm, [n] m2/s2."""
+        """Search for the best profiles; the search starts from ``plan`` and constant commands. Return the best plan of
+        each world, and its harm, [n] m2/s2.
+        """
         constants = problem.constant(problem.even_grid(15))
         n, K = plan.ends.shape  # [n * Q]: for each world its plan, then constants
         ends = np.concatenate([plan.ends[:, np.newaxis], constants.ends.reshape(n, -1, K)], axis=1)

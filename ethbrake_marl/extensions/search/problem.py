@@ -59,8 +59,9 @@ def search_profiles(problem: ProfileProblem, given: Profiles, *, budget: int, se
     """Search each world, and return the best profiles found and their harm [n] (m2/s2) under each count.
 
     A profile has at most ``MOST_PHASES`` phases of constant command. The result is never worse than any profile of
-    ``given``. The harm is the amount that the problem minimises. Raises ``InvalidInput`` for ``budget`` or ``threads``
-    below 1 or a negative seed, and ``PhysicsError`` with the worlds in which the physics could simulate no profile.
+    ``given``. The harm is the quantity that the problem minimises. Raises ``InvalidInput`` for ``budget`` or
+    ``threads`` below 1 or a negative seed, and ``PhysicsError`` with the worlds in which the physics could simulate no
+    profile.
 
     Args:
         problem: n worlds, with the commands of the other vehicles and the harm to minimise.

@@ -2,7 +2,7 @@
 
 A *profile* has at most K phases of constant command: ``ends`` [K] are the steps at which the phases end, ``commands``
 [K, C] the commands of the C controlled vehicles (m/s2). ``bounds`` [C, 2] are the least and the largest command of each
-vehicle (m/s2). S is the length of a state array.
+vehicle (m/s2). S is the length of the array with the state of one world.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ def allowed(command: float, low: float, high: float) -> float:
 def draw_command(random: UInt64s, low: float, high: float) -> float:
     """Return a random command, m/s2.
 
-    It is ``low`` with probability 0.35, ``high`` with 0.15, 0 with 0.1, and otherwise uniform between ``low`` and
-    ``high``. ``random`` [1] is the state of the random stream.
+    The command is ``low`` with probability 0.35, ``high`` with probability 0.15 and 0 with probability 0.1; otherwise
+    it is uniform between ``low`` and ``high``. ``random`` [1] is the state of the random stream.
     """
     u = draw(random)
     if u < 0.35:
@@ -115,7 +115,8 @@ def apply_change(change: Floats, bounds: Floats, ends: Ints, commands: Floats) -
 
 @compiled
 def compact(ends: Ints, commands: Floats, phases: int) -> int:
-    """Remove the empty phases of a profile, join neighbouring phases with equal commands, and return the number left.
+    """Remove the empty phases of a profile, join neighbouring phases with equal commands, and return the number of
+    phases that remain.
 
     Args:
         ends: steps at which the phases end, [K]; changed in place.
@@ -226,7 +227,7 @@ def search_world(
 
 @compiled
 def copy_profile(ends: Ints, commands: Floats, to_ends: Ints, to_commands: Floats) -> None:
-    """Copy the phases of one profile over the first phases of a second profile, ``to_ends`` and ``to_commands``."""
+    """Copy the phases of one profile into the first phases of a second profile (``to_ends``, ``to_commands``)."""
     for k in range(ends.shape[0]):
         to_ends[k] = ends[k]
     copy_rows(commands, to_commands, commands.shape[0])
@@ -295,7 +296,8 @@ def improve(world: SearchWorld, ends: Ints, commands: Floats, states: Floats, bu
 def gather(
     world: SearchWorld, seed_ends: Ints, seed_commands: Floats, states: Floats, drawn: int, field: Population
 ) -> None:
-    """Fill the field with the best profiles among the starting profiles and ``drawn`` random profiles.
+    """Fill the field (profiles that are improved together) with the best of the starting profiles and ``drawn`` random
+    profiles.
 
     No two profiles of the field have the same harm.
 
@@ -413,7 +415,8 @@ def select_stepwise(
     """Switch to stepwise simulation, and write the best profile to the first place of the field.
 
     The candidates are the profiles of the field and the starting profiles. Stepwise simulation goes from decision to
-    decision and rounds as the engine does. Where harm jumps, rounding may decide how much harm a profile does.
+    decision and rounds as the engine does. This matters where a tiny change of the commands changes harm by a jump:
+    rounding then decides how much harm a profile causes.
 
     Args:
         world: world to simulate, with its bounds and random stream.

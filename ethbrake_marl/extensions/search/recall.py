@@ -35,11 +35,11 @@ class BestHarm:
     """Agent that drives the command profile with the least known harm.
 
     In a world without a stored profile, the agent searches at the alert. If the scenario has no other learner, a second
-    search with the same number of candidates follows. It starts from the better one of two profiles: the result of the
-    first search, and the commands of ``universal``, a trained policy of the package. The harm is therefore never above
-    the harm of ``universal``. ``predicted_harm`` [n] (m2/s2) equals the harm in the engine exactly if the engine has
-    the same time step. Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is unknown. ``begin`` raises
-    ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
+    search with the same number of candidates follows. The second search starts from the better one of two profiles: the
+    result of the first search, and the commands of ``universal``, a trained policy of the package. The harm is
+    therefore never above the harm of ``universal``. ``predicted_harm`` [n] (m2/s2) equals the harm in the engine
+    exactly if the engine has the same time step. Raises ``InvalidInput`` if ``budget`` is below 1 or ``harm_count`` is
+    unknown. ``begin`` raises ``InvalidInput`` if the command of another vehicle's script is not fixed at the alert.
 
     Args:
         recall: function that returns the stored profile of each world, and a mask of the worlds that have one.

@@ -1,9 +1,9 @@
 """Compiled random search around the commands of an episode.
 
-The search improves two episodes by random changes of a few neighbouring steps. The first one has the given commands.
-The second one is the best of some random templates, because changes of the given commands may miss the best episode. A
-*template* is one command, another command for a short while, then full braking. The simulation goes from decision to
-decision as the engine does, and therefore gives exactly the harm of the engine.
+The search improves two episodes by random changes of a few neighbouring steps. The first episode has the given
+commands. The second episode is the best of some random templates, because changes of the given commands may miss the
+best commands. A *template* is one command, another command for a short while, then full braking. The simulation goes
+from decision to decision as the engine does, and therefore gives exactly the harm of the engine.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ class Plan(NamedTuple):
 def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
     """Search around given commands, and return the best commands, [n, T] m/s2, and their harm, [n] m2/s2.
 
-    The result is never worse than the given commands. The harm is the amount that the problem minimises, computed as in
-    the engine. The result for a world does not depend on the other worlds. Raises ``InvalidInput`` if several vehicles
-    are controlled, if the commands have a wrong shape or exceed a capacity, or if ``budget`` is below 1. Raises
-    ``PhysicsError`` with the worlds in which the physics cannot simulate the given commands.
+    The result is never worse than the given commands. The harm is the quantity that the problem minimises, computed as
+    in the engine. The result for a world does not depend on the other worlds. Raises ``InvalidInput`` if several
+    vehicles are controlled, if the commands have a wrong shape or exceed a capacity, or if ``budget`` is below 1.
+    Raises ``PhysicsError`` with the worlds in which the physics cannot simulate the given commands.
 
     Args:
         problem: n worlds with one controlled vehicle, the commands of the other vehicles, and the harm to minimise.
@@ -72,7 +72,7 @@ def refine(problem: ProfileProblem, commands_mps2: Floats, *, budget: int, seed:
     if len(problem.vehicles) != 1 or commands_mps2.shape != (n, steps):
         raise InvalidInput(
             f"refine: {count_of(len(problem.vehicles), 'controlled vehicle')}, and commands of shape"
-            f" {commands_mps2.shape}: give one vehicle and commands of shape ({n}, {steps})"
+            f" {commands_mps2.shape}: give one controlled vehicle and commands of shape ({n}, {steps})"
         )
     if not ((commands_mps2 >= low) & (commands_mps2 <= high)).all():
         raise InvalidInput(
@@ -119,7 +119,7 @@ def _refine_worlds(
 
 @compiled(apart=True)
 def _refine_world(world: SearchWorld, mine: Plan, other: Plan, room: Plan, budget: int) -> bool:
-    """Improve the commands ``mine`` of one world in place. Return False if the physics cannot simulate them.
+    """Improve the commands ``mine`` of one world in place. Return False if the physics cannot simulate these commands.
 
     ``other`` and ``room`` are working memory. ``budget`` is the number of candidates.
     """
@@ -173,7 +173,8 @@ def follow_steps(world: Episode, plan: Plan, begin: int, bound: float) -> tuple[
 def climb(world: SearchWorld, plan: Plan, room: Plan, value: float, reached: int, budget: int) -> tuple[float, int]:
     """Improve ``plan`` in place by random changes, and return its harm (m2/s2) and its number of steps.
 
-    If adding an amount to the commands of some steps lowers the harm, the next candidate adds twice the amount.
+    A change adds an amount to the commands of some steps. If this lowers the harm, the next candidate adds twice the
+    amount to the commands of the same steps.
 
     Args:
         world: world to simulate, with its bounds and random stream.
@@ -261,6 +262,6 @@ def steps_in(world: Episode, duration_s: float) -> int:
 
 @compiled
 def copy_steps(commands: Floats, to: Floats, first: int) -> None:
-    """Copy the commands of one array to another, ``to``, from step ``first`` on."""
+    """Copy commands into the array ``to``, from step ``first`` on."""
     for t in range(first, commands.shape[0]):
         to[t] = commands[t]

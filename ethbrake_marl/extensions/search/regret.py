@@ -26,7 +26,7 @@ TOLERANCE = 1e-6  # m2/s2; a harm below the best known by less than this is roun
 
 @dataclass(frozen=True)
 class Regrets:
-    """Best known harm of each world after all agents of an evaluation have driven it, as arrays [n]."""
+    """Best known harm of each world, as arrays [n], after all agents of an evaluation have driven the worlds."""
 
     limits: Limits  # proofs and best known harm before any agent drove
     first_impact_harm: Floats  # best known first-impact harm, including the agents of this evaluation, m2/s2
@@ -78,7 +78,9 @@ class Between:
 
     @property
     def text(self) -> str:
-        """Sentence with the share of these worlds and their best known harm; empty if there are no such worlds."""
+        """Sentence about the worlds with proven contact but no proven impact: their share and best known harm. Empty if
+        there are none.
+        """
         if self.rate == 0.0:
             return ""
         text = f" In {100 * self.rate:.1f} % of the worlds, contact is proven unavoidable but an impact is not."
@@ -141,7 +143,9 @@ def _limits(evaluation: Evaluation) -> Limits | Unproven:
 
 
 def regrets_of(evaluation: Evaluation) -> Regrets | None:
-    """Return the best known harm of every world, agents of this evaluation included; None if nothing is proven."""
+    """Return the best known harm of every world, where the agents of this evaluation count too; None if nothing is
+    proven.
+    """
     return evaluation.once(_regrets)
 
 

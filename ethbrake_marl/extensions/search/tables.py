@@ -1,4 +1,4 @@
-"""Tables of best known harm: small files in which a world is found by a hash of its content."""
+"""Tables of best known harm: small files in which a world is found by a hash of everything that affects its harm."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class BestHarmTable:
     def profiles(self, identity: UInt64s, harm_count: HarmCount, last_step: Ints) -> tuple[Profiles, Bools]:
         """Return the stored profile of each world, [m], and a mask [m] of the worlds that have one.
 
-        The returned profile of a world without a stored one is coasting.
+        For a world without a stored profile the result is coasting.
 
         Args:
             identity: hash of each world, [m].
@@ -151,7 +151,8 @@ class BestHarmTable:
     def improved(
         self, identity: UInt64s, harm_count: HarmCount, harm: Floats, profiles: Profiles | None = None
     ) -> tuple[BestHarmTable, Bools]:
-        """Return the table with ``harm`` where it is smaller, and a mask [m] of the worlds with a new value.
+        """Return the table with each harm replaced by the value in ``harm`` if this is smaller, and a mask [m] of the
+        worlds with a new value.
 
         A value is replaced if ``harm`` is smaller by more than ``TOLERANCE``. Worlds that are not in the table are
         ignored. Raises ``InvalidInput`` if the table does not contain the count, or if the shapes do not match.
@@ -188,8 +189,8 @@ class BestHarmTable:
 def table_bytes(table: BestHarmTable) -> bytes:
     """Return the content of a table file: a compressed .npz without pickles.
 
-    The file contains only the phases in use. The bytes of the commands are grouped by significance, because the file
-    is then smaller.
+    The file contains only those phases of a profile that are in use. The bytes of the commands are grouped by
+    significance, because the file is then smaller.
     """
     arrays: dict[str, NDArray[Any]] = {
         "header": np.frombuffer(json.dumps({"format": TABLE_FORMAT, **table.header}).encode(), np.uint8),
@@ -243,7 +244,7 @@ class _Header(BaseModel):
 def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> BestKnown:
     """Return the harm and the profiles of one count from the arrays of a table file.
 
-    Raises ``ValueError`` if the numbers are impossible.
+    Raises ``ValueError`` for numbers that no harm and no profile can have.
     """
     harm = arrays[f"{harm_count}_harm"].astype(np.float64)
     used = arrays[f"{harm_count}_phases"].astype(np.int64)
@@ -256,12 +257,14 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
     if not np.isfinite(flat).all():
         raise ValueError(f"{harm_count}_commands: a command must be a finite number")
     if used.sum() != len(flat):
-        raise ValueError(f"{harm_count}_phases: {used.sum()} phases in all, but there are {len(flat)} commands")
+        raise ValueError(
+            f"{harm_count}_phases: the worlds have {used.sum()} phases in all, but the file has {len(flat)} commands"
+        )
     width, controlled = max(int(used.max()), 1), flat.shape[1]
     if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
         raise ValueError(
-            f"{len(used)} worlds with {width} phases of {controlled} vehicles: a table may have 64 vehicles and"
-            f" {DECODED_LIMIT:,} numbers"
+            f"{len(used)} worlds with {width} phases of {controlled} vehicles: a table may have at most 64 vehicles"
+            f" and {DECODED_LIMIT:,} numbers"
         )
     inside = np.arange(width) < used[:, np.newaxis]
     ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
@@ -272,7 +275,9 @@ def _read_best(arrays: Mapping[str, NDArray[Any]], harm_count: HarmCount) -> Bes
     ends = np.where(inside, ends, ends[rows, last][:, np.newaxis])
     commands = np.where(inside[..., np.newaxis], commands, commands[rows, last][:, np.newaxis])
     if not ((np.diff(ends, axis=1) >= 0).all() and ((ends[:, -1] > 0) == (used > 0)).all()):
-        raise ValueError(f"{harm_count}_ends: the phases of a world must end in order, the last one after step 0")
+        raise ValueError(
+            f"{harm_count}_ends: the ends of a world's phases must not fall, and the last one must be above 0"
+        )
     return BestKnown(harm, Profiles(ends, commands))
 
 

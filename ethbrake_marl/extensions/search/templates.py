@@ -1,8 +1,8 @@
 """Draw random templates of commands, and return the best template of each world.
 
-A *template* is one command, another command for a short while, then full braking. Templates show a policy different
-ways to drive a world. The best template is not improved further: a random template with little harm tolerates small
-errors, so a policy can imitate it.
+A *template* is one command, another command for a short while, then full braking. A policy can learn from templates
+different ways to drive in a world. The best template is not improved further: a random template with little harm
+tolerates small errors, so a policy can imitate it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def best_templates(problem: ProfileProblem, bound: Floats, *, number: int, seed:
     """
     check_whole_number("templates", number, 1)
     if len(problem.vehicles) != 1:
-        raise InvalidInput(f"templates: {len(problem.vehicles)} controlled vehicles; give a problem with one")
+        raise InvalidInput(
+            f"templates: {len(problem.vehicles)} controlled vehicles; give a problem with one controlled vehicle"
+        )
     commands = np.zeros((problem.n, int(problem.last_step.max(initial=0))))
     steps = np.zeros(problem.n, np.int64)
     _best_templates(problem, seeded(problem.identity, seed), bound, number, commands, steps)

@@ -92,7 +92,7 @@ def tune_command(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="TUNING.yaml", help="File that describes a training and, for each setting to search, its range."
+            metavar="TUNING.yaml", help="File that describes a training and the range of each setting to search."
         ),
     ],
     output: FolderOption,

@@ -46,7 +46,7 @@ UNCERTAINTIES: dict[str, Callable[[], object]] = {
     "uncertainty: 'latency_s.vehicle_0=0.1': must be quantity=half-width": lambda: parse_uncertainty(
         "latency_s.vehicle_0=0.1"
     ),
-    "uncertainty: 'latency_s.pair_1=0.1': only gaps_m takes a pair, as in gaps_m.pair_1": lambda: parse_uncertainty(
+    "uncertainty: 'latency_s.pair_1=0.1': only gaps_m may name a pair, as in gaps_m.pair_1": lambda: parse_uncertainty(
         "latency_s.pair_1=0.1"
     ),
     "uncertainty: latency_s=0.1 and latency_s=0.2 are intervals of the same quantity": lambda: parse_uncertainty(
@@ -104,7 +104,7 @@ SHIELDS: dict[str, Callable[[], object]] = {
     "shield: robust interior: 5 vehicles: cannot be certified; use robust corners, or first-impact harm of": lambda: (
         RobustShield(line(5), 2, uncertainty=parse_uncertainty("gaps_m=0.1"), robust="interior")
     ),
-    "shield: mode step takes no uncertainty; must be mode robust": lambda: ShieldOptions(
+    "shield: mode step does not use an uncertainty; use mode robust": lambda: ShieldOptions(
         mode="step", uncertainty="gaps_m=1"
     ),
     "shield: robust = 'interior': not a setting of mode step; use mode robust": lambda: ShieldOptions(

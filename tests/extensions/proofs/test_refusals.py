@@ -33,7 +33,7 @@ def problem() -> ProfileProblem:
 
 
 PROOFS: dict[str, Callable[[], object]] = {
-    "avoidability: vehicle_1 of 3 vehicles is controlled; must be vehicle_2 of 3 vehicles or either one of 2": lambda: (
+    "avoidability: vehicle_1 of 3 vehicles is controlled; the controlled vehicle must be vehicle_2": lambda: (
         avoidability(wide_worlds(2, 3, seed=1), 0)
     ),
     "avoidability: vehicle = -1: must be a whole number in 0..2": lambda: avoidability(wide_worlds(2, 3, seed=1), -1),

@@ -40,7 +40,7 @@ REFUSED: dict[str, Callable[[], object]] = {
         "best_harm", most_candidates=0
     ),
     "search: candidates = 0: must be a whole number in 1..1000000": lambda: Searched(BRAKE, PAPER, candidates=0),
-    "commands of shape (3, 75): give one vehicle and commands of shape (12, 75)": lambda: refine(
+    "commands of shape (3, 75): give one controlled vehicle and commands of shape": lambda: refine(
         problem(1), np.zeros((3, 75)), budget=5
     ),
     "refine: a command exceeds the capacity of the vehicle": lambda: refine(
