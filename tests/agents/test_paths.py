@@ -99,7 +99,7 @@ def test_python_file__of_any_name_makes_agents(name, tmp_path):
 @pytest.mark.parametrize("name", ["constant:b.py", "policy@b.py"])
 def test_scenario__cannot_name_a_python_file_however_it_is_called(name, tmp_path):
     (tmp_path / name).write_text("raise SystemExit('was run')", "utf-8")
-    with pytest.raises(eb.EthBrakeError, match=r"is a function in a Python file; a scenario cannot use one"):
+    with pytest.raises(eb.EthBrakeError, match=r"is a function in a Python file, which a scenario cannot use"):
         eb.load_scenario("paper-random").replace(
             roles={"vehicle_1": f"{name}:make", "vehicle_2": "learner", "vehicle_3": "full_brake"}
         )

@@ -229,7 +229,7 @@ def starts(state: Any) -> Callable[[Interface], Any]:
 
 
 REFUSED: list[tuple[Callable[[Interface], Any], str]] = [
-    *((acts(value), r"(nan|1\.001|-inf); must be from -1 \(full braking\) to 1") for value in (np.nan, 1.001, -np.inf)),
+    *((acts(value), r"(nan|1\.001|-inf): must be from -1 \(full braking\) to 1") for value in (np.nan, 1.001, -np.inf)),
     (acts("full"), r"'full'.* is not a number"),
     (acts(0.5, (2,)), "shape"),
     *((lambda given, seed=seed: given.reset(seed), "seed = .*must be None or a") for seed in (-1, 1.5, True, "1")),

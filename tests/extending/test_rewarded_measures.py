@@ -367,7 +367,7 @@ def test_measure_of_impacts__that_is_wrong_is_named_and_the_step_is_not_made(lat
 
 
 def test_by__is_step_or_impacts() -> None:
-    with refused("measure 'mine': by = 'episode': must be step or impacts"):
+    with refused("measure 'mine': by = 'episode': must be 'step' or 'impacts'"):
         eb.register_measure("mine", lambda given: given, by="episode")  # type: ignore[arg-type]
 
 

@@ -78,7 +78,7 @@ RECIPES: dict[str, Callable[[], object]] = {
     ),
     "n_envs x n_steps = 3200000000 decisions per update": lambda: recipe("n_envs: 16", "n_envs: 100000000"),
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: recipe("policy: [8]", "policy: []"),
-    "mine.yaml, line 16: reward = {harm: 0}: all weights are 0, so there is nothing to learn; set at least": lambda: (
+    "mine.yaml, line 16: reward = {harm: 0}: all weights are 0, so there is nothing to learn; give at least": lambda: (
         recipe("harm: 1", "harm: 0")
     ),
     "mine.yaml, line 17: evaluation.every_updates = 0: must be greater than or equal to 1": lambda: recipe(
@@ -204,8 +204,8 @@ def test_algorithm__has_a_name_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"n_stepz": 3}, "mine.yaml, line 23: n_stepz: unknown key; did you mean n_steps?"),
-        ({"n_steps": 2.5}, "mine.yaml, line 22: n_steps = 2.5: must be a whole number"),
+        ({"n_stepz": 3}, "mine.yaml, line 22: n_stepz: unknown key; did you mean n_steps?"),
+        ({"n_steps": 2.5}, "mine.yaml, line 21: n_steps = 2.5: must be a whole number"),
         ({"algorithm": "a3c"}, "mine.yaml, line 1: algorithm = a3c: must be one of "),
         (
             {"scheme": "independent"},

@@ -1,4 +1,4 @@
-"""Which of several points are nondominated, and the volume of the region that the points dominate."""
+"""Nondominated points of a set, and the volume of the region that the points dominate."""
 
 from __future__ import annotations
 

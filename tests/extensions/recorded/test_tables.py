@@ -166,7 +166,7 @@ def test_wrong_table__is_refused_with_what_would_be_right(what: str, tmp_path: P
         (COLUMNS + ",colour=c", "with each key once"),
         (COLUMNS.replace("x", ""), "with each key once"),
         (COLUMNS.replace("=m", "=mph"), "columns: units = 'mph': must be one of m, ft, km/h"),
-        (COLUMNS.replace("=t,", "=t/0,"), "columns: time = .../0: the number after / must be"),
+        (COLUMNS.replace("=t,", "=t/0,"), "columns: time = .../0: the number after / must say"),
         (COLUMNS.replace("=who", "=id"), "a.csv: lacks columns that files of the table have: id"),
     ],
 )
