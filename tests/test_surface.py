@@ -16,7 +16,7 @@ import ethbrake_marl as eb
 ROOT = Path(__file__).resolve().parents[1]
 PUBLIC = {name: getattr(eb, name) for name in eb.__all__ if name != "__version__"}
 CLASSES = {name: value for name, value in PUBLIC.items() if inspect.isclass(value)}
-MOST_WORDS = 120
+MOST_WORDS = 100
 
 
 def own_docstring(value: Any) -> str:

@@ -88,7 +88,7 @@ class EthBrakeEnv(OneWorld, Specified, gymnasium.Env[Observations, NDArray[Any]]
     - Observation: the features of ``ObservationSpec``, float32 [F].
     - Action: an array [1] in [-1, 1]. -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
     - End: an episode is *terminated* when all vehicles are at rest and no command would move one, *truncated* at the
-    horizon.
+      horizon.
     - Infos and options of ``reset``: docs/environments.md.
 
     Args:

@@ -126,12 +126,11 @@ WhoIsAgent = Literal["all", "learners"]
 class EthBrakeParallelEnv(OneWorld, ParallelEnv[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Environment in which the vehicles of a line, ``vehicle_1`` (front) to ``vehicle_N``, are agents.
 
-    - Action: each learner needs an action in each step, an array [1] in [-1, 1]. -1 brakes with full capacity, 0
-      coasts, +1 drives with full capacity. Actions of vehicles with scripts are ignored; ``infos[agent]`` contains the
+    - Action: in each step, each learner needs an array [1] in [-1, 1]. -1 brakes with full capacity, 0
+      coasts, +1 drives with full capacity. Other actions are ignored; ``infos[agent]`` contains the
       commands of their scripts.
-    - End: the episodes of all agents end together. They are *terminated* when all vehicles are at rest and no command
-    would move one,
-      *truncated* at the horizon.
+    - End: the episodes of all agents end together, *terminated* when all vehicles are at rest and no command would move
+      one, or *truncated* at the horizon.
     - ``state()`` returns the full state of the line, for central critics.
 
     Observations, rewards, infos and ``reset`` are as in ``EthBrakeEnv``.

@@ -481,15 +481,15 @@ def register_feature(
 ) -> None:
     """Register a feature, so that an ``observation:`` list can contain it.
 
-    The docstring of ``function`` becomes the meaning of the feature.
+    The docstring of ``function`` is shown as its meaning.
 
     An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``. The entry
     point names a ``Part``, which contains all arguments but ``name``.
 
-    The channel does not restrict a feature with ``of="own"``: the function can read data of other vehicles that no
-    message contained. Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is in
-    use. Raises ``InvalidInput`` for invalid arguments, and if the function, called for a few test worlds, fails or
-    returns a wrong shape or a number that is not finite.
+    The channel does not restrict a feature with ``of="own"``: the function can read data that no message contained.
+    Registering the same feature again changes nothing. Raises ``AlreadyExists`` if the name is in use, and
+    ``InvalidInput`` for invalid arguments, or if the function, called for test worlds, fails or returns a wrong shape
+    or number.
 
     Args:
         name: name of the feature, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. An

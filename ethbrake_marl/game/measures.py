@@ -135,11 +135,11 @@ def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", b
 
     An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``. The entry
     point names the function, a ``Part`` that contains it, or a mapping from names to functions or parts. Evaluations
-    show a measure of a package only on request.
+    show it only on request.
 
-    Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure.
-    Raises ``InvalidInput`` for invalid arguments, and if the function, called for two test worlds, fails or returns a
-    wrong shape or a number that is not finite.
+    Registering the same measure again changes nothing. Raises ``AlreadyExists`` if the name belongs to another measure,
+    and ``InvalidInput`` for invalid arguments, or if the function, called for two test worlds, fails or returns a wrong
+    shape or a number that is not finite.
 
     Args:
         name: name of the measure, 1 to 64 characters ``a-z``, ``0-9`` and ``_``, beginning with a letter. It must not

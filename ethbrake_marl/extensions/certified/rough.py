@@ -7,9 +7,9 @@ closing speed w and restitution e changes the speed of each vehicle by (1 + e) w
 vehicle and M the sum of both masses. Let u be the largest speed of any vehicle, and assume that no vehicle moves
 backwards yet. An impact slows the rear vehicle, but not below -e times its previous speed. It gives a front vehicle at
 rest at most (1 + e) times the rear vehicle's speed. So, in a line of three, the speed of the middle vehicle stays
-between -e u and (1 + e) u until both its pairs have had contact. (Three vehicles in contact at once leave with P + e (P
-- v) each, where v is the vehicle's speed before and P a weighted mean of the speeds. These speeds lie between the same
-bounds.)
+between -e u and (1 + e) u until both its pairs have had contact. (Three vehicles in contact at once leave with
+(1 + e) P - e v each, where v is the vehicle's speed before and P a weighted mean of the speeds. These speeds lie between
+the same bounds.)
 """
 
 from __future__ import annotations
