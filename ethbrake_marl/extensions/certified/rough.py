@@ -8,8 +8,8 @@ vehicle and M the sum of both masses. Let u be the largest speed of any vehicle,
 backwards yet. An impact slows the rear vehicle, but not below -e times its previous speed. It gives a front vehicle at
 rest at most (1 + e) times the rear vehicle's speed. So, in a line of three, the speed of the middle vehicle stays
 between -e u and (1 + e) u until both its pairs have had contact. (Three vehicles in contact at once leave with
-(1 + e) P - e v each, where v is the vehicle's speed before and P a weighted mean of the speeds. These speeds lie between
-the same bounds.)
+(1 + e) P - e v each, where v is the vehicle's speed before and P a weighted mean of the speeds. These speeds lie
+between the same bounds.)
 """
 
 from __future__ import annotations
