@@ -235,7 +235,7 @@ def test_compare__sees_that_an_agents_file_was_edited(tmp_path: Path, capsys: py
     assert compare_results(after, after).other_versions == {}
     assert run_command(["compare", str(tmp_path / "before.json"), str(tmp_path / "after.json")]) == 0
     told = capsys.readouterr().err
-    assert "note: mine.py changed between the two\n" in told and "SHA-256" not in told
+    assert "note: mine.py differs between the results\n" in told and "SHA-256" not in told
 
 
 def test_versions__tell_a_file_behind_the_at_by_its_hash(ethbrake: Command, tmp_path: Path) -> None:

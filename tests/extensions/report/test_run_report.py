@@ -86,7 +86,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
         ctrl_c_when(patch, lambda shown: shown["done"] == 128)
         answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder, "--json")
     assert (answer.status, [row["agent"] for row in json.loads(answer.out)]) == (130, AGENTS)
-    assert "interrupted after 128 steps: evaluating the policy so far" in answer.err
+    assert "interrupted after 128 steps; now evaluating the policy so far" in answer.err
     last = answer.err.splitlines()[-1]
     assert last.startswith("interrupted after 128 training steps") and str(folder) in last
     assert status_of(folder, "status", "steps", "stage") == ("interrupted", 128, "report")

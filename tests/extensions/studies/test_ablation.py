@@ -163,7 +163,7 @@ def test_ablate__an_interruption_ends_the_trainings_of_other_processes(tmp_path:
     options = ["--levels", "cooperation-0-sensors,cooperation-2-paper", "--steps", "1000000", "--jobs", "2"]
     command = [*PROGRAM, "study", "ablate", "--output", folder, "--recipes", tiny_total, *ABLATE, *options]
     status, told = end_when(command, lambda _: len([*folder.glob("trainings/*/checkpoints")]) == 2, signal.SIGINT)
-    assert status == 130 and "interrupted; the same command goes on" in told
+    assert status == 130 and "interrupted; the same command continues" in told
     runs = [*folder.glob("trainings/*")]
     before = [(run / "progress.csv").read_bytes() for run in runs]
     time.sleep(2.0)
