@@ -224,24 +224,6 @@ def standard_objectives() -> tuple[str, ...]:
     return (*STANDARD, *(name for name, kind in OBJECTIVES.loaded.items() if kind.function is not None))
 
 
-def declared_objectives(texts: Sequence[str], vehicles: int) -> list[str]:
-    """Return ``texts`` with each ``standard`` replaced by all names from ``standard_objectives``.
-
-    Raises ``InvalidInput`` if an objective is unknown, listed twice, or has weights for another number of vehicles.
-
-    Args:
-        texts: names of objectives; ``standard`` means all standard objectives.
-        vehicles: number of vehicles in the line.
-
-    """
-    names = [name for text in texts for name in (standard_objectives() if text == "standard" else (text,))]
-    for k, name in enumerate(names):
-        objectives_of(name, vehicles)
-        if name in names[:k]:
-            raise InvalidInput(f"objective {name!r} is listed twice; list it once")
-    return names
-
-
 def register_objective(name: str, function: ObjectiveFunction) -> None:
     """Register an objective, so that scenarios, rewards and ``--objective`` can use it under ``name``.
 

@@ -12,7 +12,7 @@ from ethbrake_marl.envs.pettingzoo import parallel_env
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.game.actions import checked_action
 from ethbrake_marl.game.harm import empty_ledger, injury_probability
-from ethbrake_marl.game.objectives import declared_objectives, scored
+from ethbrake_marl.game.objectives import objectives_of, scored
 from ethbrake_marl.game.observations import ObservationSpec, choose_observation, observe
 from ethbrake_marl.game.rewards import reward_params
 from ethbrake_marl.physics.advance import advance
@@ -148,12 +148,11 @@ OBJECTIVES: dict[str, Callable[[], object]] = {
     "scored: 'own': must be a list of objectives, for instance ['own']": lambda: scored(
         empty_ledger(line([5.0], [9.0, 9.0])), "first", "own"
     ),
-    "objective 'own' is listed twice; list it once": lambda: declared_objectives(["own", "own"], 2),
-    "objective 'social:91': social needs an angle from 0 to 90 degrees, as in social:45": lambda: declared_objectives(
-        ["social:91"], 2
+    "objective 'social:91': social needs an angle from 0 to 90 degrees, as in social:45": lambda: objectives_of(
+        "social:91", 2
     ),
-    "objective 'weighted:1,2,3': has 3 weights; must have 2, one per vehicle": lambda: declared_objectives(
-        ["weighted:1,2,3"], 2
+    "objective 'weighted:1,2,3': has 3 weights; must have 2, one per vehicle": lambda: objectives_of(
+        "weighted:1,2,3", 2
     ),
 }
 
@@ -189,7 +188,7 @@ NAMES: dict[str, Callable[[], object]] = {
     "unknown reward 'papr'; did you mean 'paper'?": lambda: reward_params("papr"),
     "unknown setting of a reward 'hram'; did you mean 'harm'?": lambda: reward_params({"hram": 1.0}),
     "unknown side 'Front'; did you mean 'front'?": lambda: injury_probability(5.0, "Front"),
-    "unknown objective 'ownn'; did you mean 'own'?": lambda: declared_objectives(["ownn"], 2),
+    "unknown objective 'ownn'; did you mean 'own'?": lambda: objectives_of("ownn", 2),
 }
 
 

@@ -23,7 +23,7 @@ from ethbrake_marl.evaluation.rollout import evaluate
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.game.harm import HARM_COUNTS, injury_probability
-from ethbrake_marl.game.objectives import STANDARD, declared_objectives, parse_objective, scored
+from ethbrake_marl.game.objectives import STANDARD, parse_objective, scored
 from ethbrake_marl.scenario.catalogue import load_scenario
 from ethbrake_marl.scenario.schema import Scenario
 from ethbrake_marl.scenario.tables import worlds_from_table
@@ -419,16 +419,7 @@ def injuries(agent, scenario):
     return {n: round(float(np.ravel(v)[0]), 6) for n, v in told.items() if "lr4s" in n}
 
 
-def test_objectives__several_by_one_name_and_one_of_an_angle() -> None:
-    assert declared_objectives(["standard", "weighted:1,2"], 2) == [
-        "total",
-        "own",
-        "social:45",
-        "maximin",
-        "mass-weighted",
-        "weighted:1,2",
-    ]
-    assert declared_objectives([], 2) == []
+def test_objective__of_an_angle() -> None:
     assert parse_objective("social:45").angle_deg == 45.0
 
 

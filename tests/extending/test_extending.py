@@ -16,7 +16,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.game.measures import BUILT_IN, REPORTED
-from ethbrake_marl.game.objectives import declared_objectives
+from ethbrake_marl.game.objectives import standard_objectives
 from ethbrake_marl.game.observations import observe
 from ethbrake_marl.game.step_outcome import StepOutcome
 from ethbrake_marl.scenario.catalogue import new_scenario_text
@@ -251,7 +251,7 @@ def test_objective__is_paid_by_hand_and_stands_in_tables() -> None:
     (row,) = (row for row in found.rescore() if (row.objective, row.harm_count) == ("front-first", "total"))
     borne = found.outcome("coast").ledger.vehicle_harm("total").mean(axis=0)
     assert [each.value for each in row.each] == near(borne + borne[0])
-    assert declared_objectives(["standard"], 3)[-1] == "front-first"
+    assert standard_objectives()[-1] == "front-first"
     engine = engine_of(reward={"harm": 1.0, "objective": "front-first"})
     total = np.zeros((3, 3))
     while not engine.ended.all():
