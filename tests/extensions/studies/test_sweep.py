@@ -369,7 +369,7 @@ def test_dry_run__tells_how_many_trials_of_what_and_a_command_that_trains_the_fi
     head, *_, last = capsys.readouterr().out.splitlines()
     assert head == (
         f"7 trials ({TRIALS} of them begun): recipe {recipe} in scenario paper-random;"
-        " 512 decisions each unless it is pruned"
+        " 512 decisions per trial that is not pruned"
     )
     assert last.startswith(f"the first: ethbrake train --scenario paper-random --recipe {recipe} --seed 0 --set ")
     settings = [word for word in shlex.split(last) if "=" in word]
