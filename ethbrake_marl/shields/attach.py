@@ -43,7 +43,7 @@ def proposing_agents(
         vehicles: indices of the shielded vehicles.
         where: name of the function or class that the user called, with which error messages begin.
 
-    Raises ``InvalidInput`` if ``policy`` is something else, and if a team or mapping does not contain exactly the
+    Raises ``InvalidInput`` for any other type of ``policy``, and if a team or mapping does not contain exactly the
     shielded vehicles.
 
     """
@@ -69,13 +69,13 @@ def guard_of(engine: Engine, policy: Proposing | None, options: ShieldOptions) -
     """Return the guard that shields all learners of an engine.
 
     Args:
-        engine: the engine, which is not changed.
-        policy: policy that proposes the actions that the caller leaves out. It may be None, except in mode
+        engine: the engine whose learners are shielded; this function does not change the engine.
+        policy: policy that proposes the actions that the caller leaves out. ``policy`` may be None, except in mode
             ``episode``.
         options: settings of the shield.
 
     Raises ``InvalidInput`` if no vehicle learns, if several vehicles learn and the mode is not ``step``, and if
-    ``policy`` is not a policy.
+    ``policy`` is of the wrong type.
 
     """
     where, mode, scenario, vehicles = options.where, options.mode, engine.scenario, engine.learners
@@ -104,9 +104,9 @@ class Attached:
     Args:
         env: the environment to shield.
         interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
-        maker: code with which the user makes an environment of this class, for error messages.
+        maker: code that makes such an environment, such as ``eb.parallel_env``; error messages name this code.
         policy: policy that proposes the actions that the caller leaves out; None: no policy.
-        where: name of the wrapper, with which error messages begin.
+        where: name of the shield wrapper, with which error messages begin.
         options: keywords of ``ShieldOptions``.
 
     An ``Attached`` object has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env``
@@ -143,7 +143,7 @@ class Attached:
 
     @property
     def memory(self) -> Guarded:
-        """Current memory of the guard; after ``close``, its memory when the shield was closed."""
+        """Present memory of the guard; after ``close``, the memory that the guard had when the shield was closed."""
         memory: Guarded | None = self.engine.guarded if self.engine.guard is self.guard else self._left
         return Guarded(None, {}) if memory is None else memory
 
@@ -151,8 +151,8 @@ class Attached:
     def shield(self) -> Any:
         """Current state of the shield, for reading only; None before the first reset.
 
-        In mode ``step`` it is a ``StepShield``, in mode ``episode`` the memory of the ``HybridAgent``. In the mode of
-        an extension its type belongs to the extension.
+        In mode ``step`` the state is a ``StepShield``, in mode ``episode`` it is the memory of the ``HybridAgent``. For
+        the mode of an extension, the extension defines the type of the state.
         """
         return self.memory.shield
 
@@ -171,7 +171,7 @@ class Attached:
             raise InvalidInput(f"{self.options.where}: this shield was closed; put a new shield around the environment")
 
     def close(self) -> None:
-        """Remove this shield from the environment. ``memory`` and ``shield`` keep their last values."""
+        """Remove this shield from the environment. After the call, ``memory`` and ``shield`` keep their last values."""
         if self.engine.guard is self.guard:
             self._left = self.memory
             self.engine.protect(None)

@@ -1,12 +1,12 @@
-"""``certify``: apply the proposed action if some plan after it stays within the budget, else the backup plan's action.
+"""Certify proposed actions: apply them if some plan after them stays within the budget; if not, follow the backup plan.
 
 A *plan* is a sequence of actions, one for each decision up to the horizon. The *backup* is the present plan of the
 shield. The *budget* is the largest harm that the shield accepts for the whole episode. The shield may consider several
-*possible worlds* (members) for each world; each plan is simulated in all of them, with the compiled functions of the
-module ``members``.
+*possible worlds* (members) for each world. Each plan is simulated in all possible worlds, with the compiled functions
+of the module ``members``.
 
-After a proposal, two plans are simulated: the rest of the backup, and the best constant action. The module ``step``
-proves that the harm of the episode never exceeds the bound at the alert.
+Two plans that begin with the proposed action are simulated: one continues with the rest of the backup, the other with
+the best constant action. The module ``step`` proves that the harm of the episode never exceeds the bound at the alert.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ NEARLY = 1e-9
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Return the index of the constant action of least harm, and its harm, m2/s2.
+    """Return the index (in ``constants``) of the constant action of least harm, and its harm, m2/s2.
 
-    The harm of an action is its largest harm over the possible worlds. Each action is held from now to the horizon and
-    simulated in one segment, not decision by decision.
+    The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
+    horizon. The time until the horizon is simulated at once, not decision by decision.
 
     Args:
         world: parameters of the M possible worlds of one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
+        constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
 
     """
     best, least, critical = 0, math.inf, 0
@@ -92,13 +92,13 @@ def better_plan(
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision; actions from this decision on are replaced.
-        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
-        value: largest harm of the plan over the possible worlds, m2/s2.
-        most: largest harm that is accepted, m2/s2.
-        plan: actions of each decision, [L, K]; changed in place.
-        trial: workspace, [L, K].
+        constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
+        value: harm of the present ``plan``, the largest over the possible worlds, m2/s2.
+        most: largest harm that the new plan may have, m2/s2.
+        plan: the present plan, with the actions of each decision, [L, K]; changed in place.
+        trial: workspace for a plan to try, [L, K].
 
-    Returns the harm of the resulting plan, and the least harm found, which may belong to a plan that was not accepted.
+    Returns the harm of the resulting plan, and the least harm of any plan tried, accepted or not (both m2/s2).
 
     """
     so_far = worst_so_far(world, states)
@@ -140,26 +140,26 @@ def try_action(
 ) -> tuple[float, float, int]:  # fmt: skip
     """Simulate one step with an action, then search for a plan from the next state on that stays within the budget.
 
-    The rest of the present plan is simulated first, then the constant actions. An action for which the physics fails is
-    not certified.
+    After the action, the rest of the present plan is tried first, then the constant actions. An action for which the
+    physics fails is not certified.
 
     Args:
         world: parameters of the M possible worlds of one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
-        action: action of each shielded vehicle to try, [K].
+        action: the actions to try, one per shielded vehicle, [K].
         budget: largest harm of the episode that is accepted, m2/s2.
-        certified: harm of ``plan``, m2/s2.
-        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
-        plan: present plan, [L, K]; if the search succeeds, it is replaced by the action and the plan found for the
-            later decisions.
-        room: workspace, [2, L, K].
+        certified: harm of the present ``plan``, m2/s2.
+        constants: C constant actions to try, each with one number per shielded vehicle, [C, K].
+        plan: present plan, [L, K]; if the search succeeds, ``plan`` is changed to the tried action followed by the
+            actions found for the later decisions.
+        room: workspace for two plans, [2, L, K].
         after: receives the state of each possible world after the step, [M, S].
         over: receives whether the episode has ended after the step in each possible world, [M].
 
-    Returns the harm of the plan found, the least harm of any plan tried (both m2/s2), and the reason (a code of
-    ``ShieldReason``). The search succeeded if the harm of the plan is at most ``budget``.
+    Returns the harm of the resulting plan, the least harm of any plan tried (both m2/s2), and the reason (a code of
+    ``ShieldReason``). The search succeeded if the first of these harms is at most ``budget``.
 
     """
     going = take_steps(world, states, ended, step, action, after, over)
@@ -189,7 +189,7 @@ def tell_action(out: Floats, action: Floats, bound: float, margin: float) -> Non
 
     Args:
         out: columns ``APPLIED``, ``REASON``, ``BOUND`` and ``MARGIN`` for each vehicle, [K, 4]; changed in place. The
-            column ``REASON`` must be filled in already.
+            caller must have filled in the column ``REASON``.
         action: applied actions, [K].
         bound: harm that the episode will not exceed, m2/s2.
         margin: budget minus the harm of the plan, m2/s2.
@@ -208,9 +208,9 @@ def decide_world(
 ) -> bool:  # fmt: skip
     """Decide in one world: accept the proposed actions, or replace them by the actions of the plan.
 
-    First, all proposals are tried together. If no plan after these actions stays within the budget, the proposals are
-    tried one by one, front to rear, while the other vehicles act as planned. An accepted proposal becomes part of the
-    plan with which the next vehicle's proposal is tried.
+    The proposals of all vehicles are first tried together. If no plan after these actions stays within the budget, the
+    proposals are tried one by one, front to rear, while the other vehicles act as planned. An accepted proposal becomes
+    part of the plan before the next vehicle's proposal is tried.
 
     Args:
         world: the M possible worlds of this world (``Members``).
@@ -219,11 +219,12 @@ def decide_world(
         step: number of the present decision.
         proposed: proposed actions, [K]; NaN for a vehicle without a proposal.
         budget: largest harm of the episode that is accepted, m2/s2.
-        certified: harm of ``plan``, m2/s2.
+        certified: harm of the present ``plan``, m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
-        plan: actions of each decision, [L, K]; changed in place to the plan whose harm is the bound in ``out``.
-        room: workspace, [2, L, K].
-        tried: workspace, [2, K].
+        plan: the present plan, with the actions of each decision, [L, K]; replaced in place by the new plan, whose harm
+            is the bound in ``out``.
+        room: workspace for two plans, [2, L, K].
+        tried: workspace for the actions to try, [2, K].
         after: receives the state of each possible world after the step, [M, S].
         over: receives whether the episode has ended after the step in each possible world, [M].
         out: receives applied action, reason, bound and margin of each vehicle, [K, 4].
@@ -273,13 +274,13 @@ def certify_worlds(
     running: Running, proposed: Floats, budget: Floats, certified: Floats, constants: Floats, plans: Floats,
     after: Floats, out: Floats, over: Bools, failed: Bools,
 ) -> None:  # fmt: skip
-    """Call ``decide_world`` in each of n worlds whose episode has not ended.
+    """Call ``decide_world`` for each world whose episode has not ended.
 
     A world whose episode has ended keeps its state and its plan.
 
     Args:
         running: the episodes at this decision, n worlds with M possible worlds each.
-        proposed: proposed actions, [n, K]; NaN where nothing is proposed.
+        proposed: proposed actions, [n, K]; NaN for a vehicle without a proposal.
         budget: largest harm that is accepted in each episode, [n] m2/s2.
         certified: harm of each plan, [n] m2/s2.
         constants: constant actions that may replace the rest of a plan, [C, K].
@@ -313,11 +314,11 @@ def certify_worlds(
 
 @compiled
 def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Floats) -> None:
-    """Write to ``value`` [n] the harm of the whole episode if each plan is executed from now on, m2/s2.
+    """Compute the harm of each whole episode if its plan is executed from now on; write it to ``value`` [n] m2/s2.
 
     The harm of a plan is its largest harm over the possible worlds; it is infinite if the physics fails. If one of the
-    ``constants`` [C, K], held to the horizon, causes less harm than the rest of a plan, it replaces this rest in
-    ``plans`` [n, L, K], and ``value`` is the harm of the new plan.
+    ``constants`` [C, K], held to the horizon, causes less harm than the rest of a plan, this constant action replaces
+    the rest of the plan in ``plans`` [n, L, K]. ``value`` then contains the harm of the changed plan.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))
@@ -336,9 +337,9 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) -> None:
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
-    ``running`` has n worlds with M possible worlds each. ``rests`` [n] receives whether, in every possible world, all
-    vehicles come to rest before the horizon and stay at rest. ``borne`` [n * M, N] receives the harm that each vehicle
-    bears in the whole episode, m2/s2; it is 0 for an obstacle ahead.
+    ``running`` contains n worlds, each with M possible worlds. The results are written into two arrays. ``rests`` [n]:
+    whether all vehicles come to rest before the horizon and stay at rest, in every possible world of the world.
+    ``borne`` [n * M, N]: the harm that each vehicle bears in the whole episode, m2/s2 (0 for an obstacle ahead).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)
@@ -355,8 +356,9 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
 def descend_constants(running: Running, grid: Floats, rounds: int, action: Floats) -> None:
     """Improve constant actions by coordinate descent over the vehicles.
 
-    For one vehicle after the other, the action is replaced by the entry of ``grid`` with the least harm. Each candidate
-    is held to the horizon and simulated in one segment.
+    For one vehicle after the other, the vehicle's action is replaced by the action in ``grid`` that does the least harm
+    while the other vehicles keep their actions. Each tried action is held to the horizon, and the time until the
+    horizon is simulated at once, not decision by decision.
 
     Args:
         running: the episodes, n worlds with exactly one possible world each.
@@ -383,7 +385,7 @@ CONSTANTS = tuple(-k / 10 for k in range(11))  # constant actions that are tried
 
 
 class Backup(NamedTuple):
-    """The plans that the shield executes in n worlds wherever no proposal is accepted."""
+    """The shield's present plans in n worlds; a plan is executed where no proposal is accepted."""
 
     plan: Floats  # [n, L], or [n, L, K] for K shielded vehicles: actions of each decision; entry j is for decision j
     harm: Floats  # [n] harm of the episode in the worst possible world if the plan is executed from now on (m2/s2)
@@ -408,7 +410,7 @@ class Decision(NamedTuple):
         return np.array(texts).reshape(self.reason.shape)
 
     def put(self, rows: Ints, other: Decision, taken: Ints) -> Decision:
-        """Return a copy with world ``rows[j]`` of this decision replaced by world ``taken[j]`` of ``other``."""
+        """Return a copy of this decision in which world ``rows[j]`` is replaced by world ``taken[j]`` of ``other``."""
         columns: dict[str, Any] = {
             name: put(getattr(self, name), rows, getattr(other, name)[taken]) for name in self._fields[:5]
         }
@@ -423,25 +425,25 @@ class Decision(NamedTuple):
 
 
 def plan_harm(running: Running, plan: Floats) -> Floats:
-    """Return the harm of the whole episodes if the plans are executed from now on, [n] m2/s2.
+    """Return the harm of each whole episode if its plan is executed from now on, [n] m2/s2.
 
-    ``plan`` has the actions of each decision, [n, L], or [n, L, K] for K vehicles. Each harm is the largest over the
-    possible worlds, and equals the harm that the engine would count, to the bit. Caps on the harm of single vehicles
-    are ignored.
+    ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K vehicles. Each harm is the largest harm
+    over the possible worlds, and equals, to the bit, the harm that the engine would count. Caps on the harm of single
+    vehicles are ignored.
     """
     return bettered_plan(running, plan, np.zeros(0))[1]
 
 
 def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Floats, Floats]:
-    """Return the plans, improved by the best constant action where it causes less harm, and the harm of each plan.
+    """Replace the rest of each plan by the best constant action where this causes less harm; return plans and harms.
 
     Args:
-        running: n episodes at a decision.
+        running: the n episodes at a decision.
         plan: actions of each decision, [n, L] or [n, L, K].
         constants: constant actions that may replace the rest of a plan, [C] or [C, K].
 
-    Returns the plans, in the shape of ``plan``, and the largest harm of the whole episode over the possible worlds, [n]
-    m2/s2.
+    Returns the resulting plans, in the shape of ``plan``, and the harm of each whole episode under its plan (the
+    largest harm over the possible worlds), [n] m2/s2.
 
     """
     value = np.empty(running.n)
@@ -455,7 +457,7 @@ def bettered_plan(running: Running, plan: Floats, constants: Floats) -> tuple[Fl
 
 
 def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
-    """Return plans that consist of ``past`` before decision ``steps`` [n], and of ``later`` from this decision on.
+    """Return plans with the actions of ``past`` before decision ``steps`` [n], and of ``later`` from this decision on.
 
     ``past`` and the result are plans, [n, L] or [n, L, K]; ``later`` is a plan of the same shape, or a single action.
     """
@@ -466,17 +468,17 @@ def from_now(past: Floats, later: Floats | float, steps: Ints) -> Floats:
 def certify(running: Running, proposed: Floats, backup: Backup, budget: Floats) -> Decision:
     """Decide in every world: apply the proposed action if it can be certified, else the action of the backup plan.
 
-    A proposal is certified if a plan that begins with it keeps the harm of the episode within the budget. The arguments
-    are not changed.
+    A proposal is certified if a plan that begins with it keeps the harm of the episode within the budget. This function
+    does not change its arguments.
 
     Args:
         running: the episodes at this decision.
         proposed: proposed actions, [n] or [n, K]; clipped to [-1, 1]. NaN is replaced by the planned action.
-        backup: the plan to follow where a proposal cannot be certified, with its harm.
+        backup: the present plan, which is followed where a proposal cannot be certified, and its harm.
         budget: largest harm that is accepted in each episode, [n] m2/s2; at least the harm of ``backup``.
 
-    Raises ``InvalidInput`` for shapes that do not fit or a budget below the backup's harm, and ``PhysicsError`` naming
-    the worlds in which the physics fails with the applied action.
+    Raises ``InvalidInput`` if the shapes of the arrays do not fit, or if a budget is below the harm of ``backup``.
+    Raises ``PhysicsError``, which names the worlds, if the physics fails with the applied action.
 
     """
     n, problem, vehicles = running.n, running.problem, len(running.problem.vehicles)

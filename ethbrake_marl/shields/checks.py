@@ -18,13 +18,13 @@ def is_amount(value: object, below: float = np.inf) -> bool:
 def check_amount(name: str, value: object, where: str, unit: str = "") -> None:
     """Raise ``InvalidInput`` unless ``value``, the value of the setting ``name``, is a finite number of at least 0.
 
-    The message begins with ``where`` and ends with ``unit``, such as " m2/s2".
+    The error message begins with ``where`` and ends with ``unit``, such as " m2/s2".
     """
     if not is_amount(value):
         raise InvalidInput(f"{where}: {name} = {value!r}: must be a number of at least 0{unit}")
 
 
 def check_scenario(scenario: object, where: str) -> None:
-    """Raise ``InvalidInput`` unless ``scenario`` is a ``Scenario`` (not a name). The message begins with ``where``."""
+    """Raise ``InvalidInput`` unless ``scenario`` is a ``Scenario`` (not a name). The error begins with ``where``."""
     if not isinstance(scenario, Scenario):
         raise InvalidInput(f"{where}: scenario = {scenario!r}: must be a Scenario; eb.load_scenario(name) loads one")

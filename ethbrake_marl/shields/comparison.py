@@ -20,8 +20,9 @@ GROUPS = (("gap", " m"), ("hit flag", ""), ("first-impact harm", " m2/s2"), ("to
 def seen_columns(packed: Packed) -> Floats:
     """Return the running worlds of an engine as rows [n, S] in the layout of ``Running.states``.
 
-    A row consists of speeds, gaps, hit flags, first-impact harms and total harms. If any world has an obstacle ahead,
-    each of these five groups begins with a column for the obstacle.
+    Each row consists of five groups of columns: speeds, gaps, hit flags (1 after an impact of the pair), first-impact
+    harms and total harms. If any world has an obstacle ahead, each group of columns begins with a column for the
+    obstacle.
     """
     state, column = packed.state, packed.column
     speeds, first, pairs, at = state[:, column.speed : column.command], column.gap, column.vehicles - 1, column.obstacle
@@ -33,9 +34,10 @@ def seen_columns(packed: Packed) -> Floats:
 
 
 def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
-    """Return ``worlds`` with the speeds, gaps and hit flags of ``states``.
+    """Return a copy of ``worlds`` with the speeds, gaps and hit flags in ``states``.
 
-    ``states`` [n, S] has the layout of ``Running.states``. Gap and hit flag of an obstacle ahead are replaced as well.
+    ``states`` [n, S] has the layout of ``Running.states``. The gap to an obstacle ahead and its hit flag also come from
+    ``states``.
     """
     added = (states.shape[1] + 4) // 6 - worlds.N  # 1 if each group starts with the column of an obstacle, else 0
     N = worlds.N + added
@@ -53,7 +55,7 @@ def worlds_at(worlds: Worlds, states: Floats) -> Worlds:
 def difference(predicted: Floats, seen: Floats) -> str:
     """Describe the first number in which an observed world differs from its prediction; "nothing" if they are equal.
 
-    ``predicted`` and ``seen`` are rows [S] as in ``Running.states``; ``seen`` may be shorter.
+    ``predicted`` and ``seen`` are rows [S] in the layout of ``Running.states``; ``seen`` may lack the last columns.
     """
     vehicles = (len(predicted) + 4) // 6
     for column in np.flatnonzero(~(seen == predicted[: len(seen)])).tolist():
@@ -69,12 +71,13 @@ def difference(predicted: Floats, seen: Floats) -> str:
 def ends_under(running: Running, plan: Floats) -> tuple[Bools, Floats]:
     """Return how the episodes end if the plans are executed from now on.
 
-    ``plan`` has the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` has n worlds
-    with M possible worlds each.
+    ``plan`` contains the actions of each decision, [n, L], or [n, L, K] for K shielded vehicles. ``running`` contains n
+    worlds, each with M possible worlds.
 
     The first result is whether all vehicles are at rest at the horizon in every possible world, [n]. The second result
-    is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. This harm equals the harm in the
-    engine's ledger to the bit. With an obstacle ahead, the first column belongs to the obstacle and is 0.
+    is the harm of the whole episode that each vehicle bears, [n * M, N] m2/s2. The harm of each vehicle equals, to the
+    bit, its harm in the engine's ledger. With an obstacle ahead, the first of the N columns belongs to the obstacle and
+    is 0.
     """
     rests, borne = np.empty(running.n, np.bool_), np.empty(running.problem.mass.shape)
     plans = np.ascontiguousarray(plan).reshape(*plan.shape[:2], len(running.problem.vehicles))

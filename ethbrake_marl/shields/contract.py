@@ -5,12 +5,12 @@ A *guard* is the object in an engine that decides which actions are applied. The
 
     decide(state, memory, proposed) -> (applied, memory, info)
 
-``state``     the engine with its running episodes. The guard reads it and does not change it. ``memory``    the guard's
-memory of these episodes. It is never changed in place: ``decide`` returns a new memory. ``proposed``  proposed actions
-[n, L] in [-1, 1]. A single NaN in a column is an invalid action. A column of NaN means that the caller
-              gave that learner no action.
-``applied``   actions [n, L] that the engine applies in this step.
-``info``      details of the decision, which environments report in their infos as ``shield_...``.
+- ``state``: the engine with its running episodes. The guard reads the engine and does not change it.
+- ``memory``: the guard's memory of these episodes. It is never changed in place: ``decide`` returns a new memory.
+- ``proposed``: proposed actions, [n, L] in [-1, 1]. A column of NaN means that the caller gave that learner no action.
+  A single NaN is an invalid action.
+- ``applied``: actions that the engine applies in this step, [n, L].
+- ``info``: details of the decision, which environments report in their infos as ``shield_...``.
 
 ``decide`` returns ``applied``, ``memory`` and ``info`` in one ``Ruling`` (``engine.engine``). After the step, ``check``
 compares the new state with the prediction. If ``check`` raises ``UncertifiedStep``, the engine undoes the step and
@@ -43,7 +43,7 @@ from ethbrake_marl.shields.rollouts import Proposer, proposed_actions
 
 
 class ShieldMode(IntEnum):
-    """Mode of a shield. The infos report its number as ``shield_mode``; an extension chooses other numbers.
+    """Mode of a shield. The infos report the mode's number as ``shield_mode``. Extensions use other numbers.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldMode(1).name
@@ -62,16 +62,18 @@ class Guarded(NamedTuple):
     policies: dict[int, Memory]  # index of a shielded vehicle -> memory of its policy; empty without policies
 
     def take(self, rows: Ints) -> Guarded:
-        """Return the memory of the episodes with the row indices ``rows``; an index may occur several times."""
+        """Return the memory of the episodes in the rows ``rows`` (indices); an index may occur several times."""
         is_tree = isinstance(self.shield, Mapping)
         shield = take_memory(self.shield, rows) if is_tree else self.shield.take(rows)
         return Guarded(shield, take_memory(self.policies, rows))
 
     @property
     def told(self) -> dict[str, Any]:
-        """The shield's ``predicted_harm`` and ``chosen_policy`` by name, each [n]; None where the shield has no value.
+        """Name -> value [n] of ``predicted_harm`` and ``chosen_policy``; None for a value that the shield does not
+        have.
 
-        ``predicted_harm`` is the harm predicted at the alert (m2/s2), ``chosen_policy`` whether the policy drives.
+        ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` says in which worlds the policy
+        drives.
         """
         return {what: getattr(self.shield, what, None) for what in ("predicted_harm", "chosen_policy")}
 
@@ -80,12 +82,13 @@ class ShieldGuard(ABC):
     """Base class of the guards of all modes: the part of an engine that certifies or replaces the learners' actions.
 
     A subclass implements ``decide`` (choose the applied actions), ``_started`` (start episodes) and ``tell`` (compute
-    the infos). It may override ``check``, which compares a step with the prediction, and ``intervened``.
+    the infos). A subclass may also override ``check`` (compare the world after the step with the prediction) and
+    ``intervened`` (say which proposals were replaced).
 
     Args:
         engine: the engine that gets this guard. All learners of the engine are shielded.
         policies: vehicle index -> policy that proposes if the caller gives no action. A policy with a memory is called
-            at every decision, to update its memory.
+            at every decision, even if its proposal is not needed, to update its memory.
         shield: initial state of the shield, before any episode; its type depends on the mode.
         mode: mode of the shield; the infos report the number of the mode.
         where: name of the function or class that the user called, with which error messages begin.
@@ -108,8 +111,8 @@ class ShieldGuard(ABC):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; its
-                policy then proposes. A single NaN is an invalid action and is never applied.
+            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; the
+                policy of this learner then proposes. A single NaN is an invalid action and is never applied.
 
         """
 
@@ -117,8 +120,8 @@ class ShieldGuard(ABC):
     def _started(self, shield: Any, alert: Worlds, rows: Ints) -> Any:
         """Start episodes in the rows with the indices ``rows``; return the shield's new state.
 
-        ``alert`` contains the worlds of these rows only, at t = 0. ``shield`` is a copy of the shield's old state,
-        which may be changed.
+        ``alert`` contains the new worlds at the alert (t = 0), one for each of ``rows``. ``shield`` is a copy of the
+        shield's old state; this method may change the copy.
         """
 
     @abstractmethod
@@ -129,16 +132,16 @@ class ShieldGuard(ABC):
 
         Args:
             memory: memory of the guard.
-            ruling: the decision; None before the first decision. Before the first decision the infos have the same
-                names as later.
+            ruling: the decision; None before the first decision. The infos must have the same names before the first
+                decision as after it.
 
         """
 
     def begin(self, memory: Guarded | None, alert: Worlds, rows: Ints) -> Guarded:
         """Start episodes in the rows with the indices ``rows``; return the guard's new memory.
 
-        ``alert`` contains the worlds of these rows only, at t = 0. ``memory`` is the guard's old memory, None before
-        the first episode.
+        ``alert`` contains the new worlds at the alert (t = 0), one for each of ``rows``. ``memory`` is the guard's old
+        memory, None before the first episode.
         """
         shield, policies = memory or Guarded(self._fresh, {})
         memories = {i: begin_script(policy, alert, i, self.scripts) for i, policy in self._policies.items()}
@@ -148,8 +151,8 @@ class ShieldGuard(ABC):
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """Return the guard's memory after the step.
 
-        ``ruling`` is the decision that was applied, ``after`` the engine after the step. This base class accepts every
-        step and returns the memory in ``ruling``.
+        ``ruling`` is the decision that was applied. ``after`` is the engine after the step. This base class accepts
+        every step and returns the memory in ``ruling``.
         """
         memory: Guarded = ruling.memory
         return memory
@@ -162,8 +165,8 @@ class ShieldGuard(ABC):
     def report(self, running: Engine) -> dict[str, NDArray[Any]]:
         """Return the infos of every vehicle: name (without ``shield_``) -> values [n, N].
 
-        The infos describe the last step of the engine ``running``. Where a new episode has just started, they describe
-        its alert instead.
+        The infos describe the last step of the engine ``running``. In a row where a new episode has just started, the
+        infos describe the alert of this episode instead.
         """
         memory: Any = running.guarded
         ruling, first = running.ruling, running.steps == 0
@@ -178,8 +181,8 @@ class ShieldGuard(ABC):
     def _of_vehicles(self, infos: Mapping[str, Any], running: Engine) -> dict[str, NDArray[Any]]:
         """Return the ``infos`` (name -> value) with every value expanded to all vehicles, [n, N].
 
-        ``running`` is the engine. If a value has one column per learner, every other vehicle gets 0, or ``NO_DECISION``
-        as its reason.
+        ``running`` is the engine. If a value has one column per learner, the vehicles that do not learn get 0 (for the
+        value ``reason``: ``NO_DECISION``).
         """
         shape, spread = running.wanted_mps2.shape, dict[str, NDArray[Any]]()
         for name, value in infos.items():
@@ -192,7 +195,8 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of every mode: mode, proposed action, applied action, and whether the proposal was replaced.
+        """Return the infos that all modes report: mode, proposed and applied action, and whether the proposal was
+        replaced.
 
         ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None; the proposed and the
         applied action are then 0.
@@ -206,13 +210,14 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """Let the policies propose the missing actions; return all proposals [n, L] and the policies' new memories.
+        """Let policies propose for learners without an action; return all proposals [n, L] and the policies' new
+        memories.
 
         Args:
             worlds: the n worlds that the policies observe; may be None if no policy is called.
-            memories: vehicle index -> memory of its policy.
-            proposed: the caller's actions, [n, L]. A column of NaN is replaced by the actions that this learner's
-                policy proposes.
+            memories: vehicle index -> memory of this vehicle's policy.
+            proposed: actions that the caller proposes, [n, L]. A column of NaN is replaced by the actions that this
+                learner's policy proposes.
 
         """
         left_out = np.isnan(proposed).all(axis=0)
@@ -231,7 +236,7 @@ class ShieldGuard(ABC):
     def _proposer(self, memories: dict[int, Memory], worlds: Worlds | None) -> Proposer | None:
         """Return the policies with their ``memories`` and the current ``worlds``, as a rollout needs them.
 
-        Returns None if there are no policies or no worlds.
+        Returns None if the guard has no policies, or if ``worlds`` is None.
         """
         return Proposer(self._policies, memories, worlds) if self._policies and worlds is not None else None
 
@@ -240,8 +245,8 @@ def why(ruling: Ruling | None) -> dict[str, Any]:
     """Return the infos ``reason`` and ``margin`` of a decision of mode ``step``, each [n, L].
 
     ``reason`` is a code of ``ShieldReason``. ``margin`` is the budget (the largest harm that is accepted) minus the
-    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None; the results
-    are then ``NO_DECISION`` and 0.
+    least harm of any plan tried after the proposal, m2/s2. Before the first decision ``ruling`` is None; then the
+    reason is ``NO_DECISION`` and the margin is 0.
     """
     if ruling is None:
         return {"reason": ShieldReason.NO_DECISION, "margin": 0.0}

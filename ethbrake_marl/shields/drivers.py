@@ -27,9 +27,9 @@ class ShieldedDriver(ByPolicy):
     Args:
         policy: the agent or team that proposes.
         scenario: the scenario in which actions are certified.
-        later_rollouts: whether a rollout of the policy may certify an action.
-        told: the worlds at the alert, as the shield assumes them; None: the shield knows the true worlds. The policy
-            always observes the true worlds.
+        later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
+        told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
+            worlds. The policy always observes the true worlds.
         options: keywords of ``ShieldOptions``.
 
     Raises ``InvalidInput`` if ``policy`` is not an agent or team, for invalid options, and if a team does not drive
@@ -73,12 +73,12 @@ class ShieldedDriver(ByPolicy):
 
     @property
     def adds(self) -> Source:
-        """Knowledge (``Source``) that the shield uses to certify actions, in addition to what the policy knows."""
+        """Knowledge (``Source``) that the shield uses to certify actions, in addition to the policy's own knowledge."""
         return self.options.adds
 
     @property
     def knows(self) -> Knowledge:
-        """Combined knowledge of the policy and the shield."""
+        """Everything that the policy or the shield knows."""
         return Knowledge.of(self.policy, also=self.adds)
 
     @classmethod
@@ -94,7 +94,7 @@ class ShieldedDriver(ByPolicy):
         return cls(driver, task.scenario, harm_count=task.harm_count, **settings).on(task.vehicles)
 
     def on(self, vehicles: Collection[int]) -> Team:
-        """Return a team behind one shield, in which a copy of the policy drives each of ``vehicles`` (0 = front)."""
+        """Return a team behind one shield, in which a copy of the policy drives each of ``vehicles`` (indices)."""
         return Team(Team.of(self.policy, vehicles).drivers, self.name, shield=self)
 
     def guard(self, engine: Engine, policies: Mapping[int, Agent]) -> Guard:

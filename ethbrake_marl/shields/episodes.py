@@ -21,8 +21,8 @@ CHUNK = 500  # number of worlds simulated together; limits memory, and does not 
 class Shielded(NamedTuple):
     """Results of whole episodes behind a step shield: n worlds, N vehicles, K of them shielded.
 
-    The field comments give the shapes for one driver. ``stack`` adds a first axis for several drivers, so ``harm`` is
-    then [drivers, n].
+    The comments beside the fields state the shapes of the arrays for one driver. ``stack`` adds a first axis for
+    several drivers: for instance, ``harm`` has the shape [drivers, n] after ``stack``.
     """
 
     harm: Floats  # [n] harm of the episode, first-impact or total harm, whichever the shield bounds (m2/s2)
@@ -35,7 +35,7 @@ class Shielded(NamedTuple):
 
     @staticmethod
     def of(episodes: Episodes, task: Task) -> Shielded:
-        """Return the results of finished ``episodes`` behind a step shield; ``task`` chooses the harm count."""
+        """Return the results of finished ``episodes`` behind a step shield; ``task`` states the harm count."""
         shield: StepShield = episodes.guarded.shield
         assert shield.memory.running is not None
         return Shielded(

@@ -36,7 +36,7 @@ class Review(NamedTuple):
     trusted: Bools  # [m] whether the world behaved as the shield predicted
 
     def share(self, verdict: str) -> float:
-        """Return the fraction of interventions with ``verdict`` (``needed``, ``costly``, ``harmless``); 0 if none."""
+        """Return the fraction of interventions with this ``verdict`` (one of ``VERDICTS``); 0 if there are none."""
         return float((self.verdict == verdict).mean()) if self.verdict.size else 0.0
 
 
@@ -44,16 +44,17 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
     """Compare each intervention with the same episode in which ``policy`` drives unshielded from that decision on.
 
     An intervention is *needed* if the harm without it is higher than the harm with it, *costly* if the harm without it
-    is lower, and *harmless* if the harm is the same. The episode with the interventions is simulated again as well, so
-    both harms are computed in the same worlds, even if the shield assumed other worlds.
+    is lower, and *harmless* if the harm is the same. The episode with the interventions is also simulated again, so
+    that both harms are computed in ``worlds``, even if the shield assumed other worlds.
 
     Args:
-        shield: a shield with ``logging``, after its episodes in ``worlds``. Log entries of earlier episodes are
-            ignored.
+        shield: a shield made with ``logging=True``, after it has run the episodes in ``worlds``. Log entries of earlier
+            episodes are ignored.
         policy: the agent, or the team of all shielded vehicles, that proposed the actions in these episodes.
         worlds: the worlds of these episodes at the alert.
 
-    Raises ``InvalidInput`` if the shield has no log, or if its batch has another number of worlds.
+    Raises ``InvalidInput`` if the shield has no log, or if ``worlds`` and the shield's batch differ in the number of
+    worlds.
 
     """
     if shield.log is None or shield.memory.running is None:
@@ -82,13 +83,13 @@ def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
 def _released_harm(shield: StepShield, policy: Driver, worlds: Worlds, world: Ints, step: Ints) -> Floats:
     """Return the harm of m episodes in which ``policy`` drives unshielded from a given decision on, [m] m2/s2.
 
-    Until that decision, the actions that the shield applied are repeated.
+    Before the given decision, the vehicles repeat the actions that the shield applied.
 
     Args:
         shield: the shield after the episodes; its plans contain the applied actions.
-        policy: the agent or team.
-        worlds: the worlds at the alert.
-        world: row of each world to simulate, [m].
+        policy: the agent or team that drives from the given decision on.
+        worlds: the n worlds of the batch at the alert.
+        world: index (in ``worlds``) of the world of each of the m episodes, [m].
         step: number of the first decision at which the policy drives, [m].
 
     """
@@ -106,9 +107,9 @@ class _Released(AgentAround):
     """Agent that repeats recorded actions until a given decision, and follows a policy from that decision on.
 
     Args:
-        policy: the policy.
-        actions: recorded action of each decision, [m, L].
-        release: number of the first decision of the policy, [m].
+        policy: the policy that drives from decision ``release`` on.
+        actions: recorded actions of m episodes, one for each of L decisions, [m, L].
+        release: number of the first decision at which the policy drives, in each of the m episodes, [m].
         deciding: indices of all shielded vehicles, which decide at the same times.
         time_step_s: time between two decisions, s.
 

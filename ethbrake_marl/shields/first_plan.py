@@ -1,11 +1,12 @@
 """The first plan of a step shield at the alert: the constant actions of least harm.
 
 For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled optimum). For several vehicles the plan is
-the best of these candidates:
+the one of the following plans that does the least harm:
 
 - All vehicles brake fully.
-- One vehicle brakes with its coupled optimum while the others brake fully.
-- The result of a coordinate descent over the vehicles, which starts from the best of the other candidates.
+- One vehicle repeats its action of E-V2X-BM while the others brake fully.
+- All vehicles repeat the actions that a coordinate descent over the vehicles finds; it starts from the best of the
+  other plans.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ def best_constants(
 
     Args:
         worlds: n worlds at the alert.
-        running: the episodes of these worlds, with the possible worlds of each world.
+        running: the episodes of these worlds, with all possible worlds of each world.
         vehicle: index of the shielded vehicle (0 = front), or indices of several.
         width: number of decisions of a plan.
         scenario: the scenario of these worlds.
-        harm_count: impacts whose harm is minimised: ``first`` (each pair's first) or ``total`` (all).
+        harm_count: which harm is minimised: ``first`` (first impact of each pair) or ``total`` (every impact).
 
     """
     vehicles = [vehicle] if isinstance(vehicle, int) else list(vehicle)
@@ -67,11 +68,11 @@ def best_constants(
 
 
 def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Floats:
-    """Return the best constant actions of K vehicles, [n, K] in [-1, 1].
+    """Return the constant actions of K vehicles that together do the least harm in each world, [n, K] in [-1, 1].
 
     Args:
         running: n episodes at the alert.
-        optima: best action of each of the K vehicles while the other vehicles brake fully, K arrays [n].
+        optima: for each of the K vehicles, its best constant action while the other vehicles brake fully; K arrays [n].
         width: number of decisions of a plan.
 
     """
@@ -90,10 +91,10 @@ def _best_joint_action(running: Running, optima: list[Floats], width: int) -> Fl
 
 
 def joint_constants(vehicles: int) -> Floats:
-    """Return C joint constant actions of K vehicles to try, [C, K] in [-1, 0], front to rear.
+    """Return C combinations of constant actions of K vehicles to try, [C, K] in [-1, 0], front to rear.
 
-    ``vehicles`` is the number K. In each row the actions of all vehicles are equal, or they change linearly from the
-    first to the last vehicle.
+    ``vehicles`` is the number K. In each combination the actions of all vehicles are equal, or they change linearly
+    from the first to the last vehicle.
     """
     alike = np.repeat(np.array(CONSTANTS)[:, np.newaxis], vehicles, axis=1)
     share = np.linspace(0.0, 1.0, vehicles)

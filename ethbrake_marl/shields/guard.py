@@ -1,4 +1,4 @@
-"""The guard of mode ``step``: a ``StepShield`` decides, and each step is compared with its prediction."""
+"""The guard of mode ``step``: a ``StepShield`` decides, and each step is compared with the shield's prediction."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ class StepGuard(ShieldGuard):
         shield: the shield of the engine's learners, before any episode.
         mode: mode of the shield; the infos report the number of the mode.
         where: name of the function or class that the user called, with which error messages begin.
-        shares: whether the infos contain the harm that each vehicle bears; with a cap they always contain it.
+        shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, they always contain
+            this harm.
         later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
-        told: the worlds at the alert, as the shield assumes them; None: the shield knows the true worlds. Policies
-            always observe the true worlds.
+        told: the worlds at the alert, as the shield assumes them. If ``told`` is None, the shield knows the true
+            worlds. Policies always observe the true worlds.
         warns: whether to warn with ``MovingAtHorizon``, once, if a vehicle still moves at the horizon under the first
             plan.
 
@@ -85,8 +86,8 @@ class StepGuard(ShieldGuard):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; its
-                policy then proposes. A single NaN is an invalid action and is never applied.
+            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; the
+                policy of this learner then proposes. A single NaN is an invalid action and is never applied.
 
         """
         shield: StepShield = memory.shield
@@ -108,9 +109,9 @@ class StepGuard(ShieldGuard):
     def check(self, ruling: Ruling, after: Engine) -> Guarded:
         """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
-        ``ruling`` is the decision that was applied, ``after`` the engine after the step. Raises ``UncertifiedStep`` if
-        a world differs from the prediction. If the shield assumes other worlds than the true ones (``told``), a world
-        that differs from the prediction becomes distrusted instead. Worlds in which the physics failed are not
+        ``ruling`` is the decision that was applied. ``after`` is the engine after the step. Raises ``UncertifiedStep``
+        if a world differs from the prediction. If the shield may assume wrong worlds (``told``), a world that differs
+        from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed are not
         compared.
         """
         memory: Guarded = ruling.memory
@@ -139,10 +140,10 @@ class StepGuard(ShieldGuard):
         return memory._replace(shield=shield)
 
     def tell(self, memory: Guarded, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos of a step by name: actions, reason, margin, bound, whether worlds are trusted, shares.
+        """Return the infos of a step by name: actions, reason, margin, bound, whether each world is trusted, shares.
 
         ``memory`` is the guard's memory. ``ruling`` is the decision in the step, None before the first decision. Each
-        value is a number, or an array [n], [n, L] or [n, N].
+        value is a number, or an array with one number per world [n], learner [n, L] or vehicle [n, N].
         """
         shield: StepShield = memory.shield
         infos = self._of_step(ruling) | why(ruling)

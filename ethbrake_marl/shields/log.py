@@ -40,7 +40,7 @@ def interventions(
         vehicles: indices of the K shielded vehicles.
         proposed: proposed actions, [n] or [n, K].
         decision: the decision on ``proposed``.
-        held: the shield's plan before the decision.
+        held: the shield's plans before the decision.
 
     """
     times, states, shape = now.time_s, now.nominal().states, (now.n, len(vehicles))

@@ -1,8 +1,8 @@
 """Simulate the possible worlds of a world, decision by decision, with exactly the operations of the engine's step.
 
 The shield's bound must hold in each of the M possible worlds (*members*) of a world. Usually M is 1: the world itself
-is its only member. K of the N vehicles are shielded. An action is a row [K], a plan has one such row for each of L
-decisions, [L, K].
+is its only member. K of the N vehicles are shielded. An action of the shield is an array [K] with one number per
+shielded vehicle. A plan contains one such array for each of L decisions, [L, K].
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ OF_COMMAND, OF_LATENCY, OF_MASS, OF_LIMIT, OF_BRAKE_RATE, OF_RELEASE_RATE, OF_CA
 class Members(NamedTuple):
     """Parameters of M possible worlds, and workspace, as input for the compiled functions of this package.
 
-    The shield's bound must hold in every possible world of a world. ``all_members`` returns the possible worlds of a
-    whole batch, ``members_from`` the possible worlds of one world.
+    ``all_members`` returns the possible worlds of a whole batch. ``members_from`` returns the possible worlds of one
+    world.
     """
 
     table: Floats  # workspace in which one possible world is simulated, see ``physics.rows``
@@ -64,14 +64,14 @@ def all_members(running: Running) -> Members:
 
 @compiled
 def members_from(every: Members, a: int, b: int) -> Members:
-    """Return rows ``a`` to ``b - 1`` of ``every``, usually the possible worlds of one world, as views."""
+    """Return the possible worlds in the rows ``a`` to ``b - 1`` of ``every``, as views (without a copy)."""
     clock, bounds, lines, pieces = every.clock[a:b], every.bounds[a:b], every.lines[a:b], every.pieces[a:b]
     return Members(every.table, clock, bounds, lines, pieces, every.vehicles, every.critical)
 
 
 @compiled
 def enter(world: Members, m: int, state: Floats) -> None:
-    """Load possible world ``m`` (index) of ``world``, with the saved ``state`` [S], into ``world.table``."""
+    """Write possible world ``m`` (index) with its saved ``state`` [S] into the workspace ``world.table``."""
     table, lines = world.table, world.lines
     for i in range(table.shape[1]):
         table[ROW.COMMAND, i], table[ROW.LATENCY, i] = lines[m, OF_COMMAND, i], lines[m, OF_LATENCY, i]
@@ -92,7 +92,8 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
         action: actions of the shielded vehicles, [K].
         after: receives the new state, [S].
 
-    Returns ``GOES_ON``, a code that says how the episode ended, or a negative code if the physics failed.
+    Returns ``GOES_ON`` (0) if the episode continues, a positive code if the episode ended, or a negative code if the
+    physics failed.
 
     """
     enter(world, m, state)
@@ -145,9 +146,10 @@ def take_steps(
 def borne_by(table: Floats, total: float, i: int) -> float:
     """Return the harm that vehicle ``i`` has borne since the episode began, m2/s2.
 
-    ``table`` is the table of one world (``physics.rows``). ``total`` is 1 for total harm, 0 for first-impact harm. The
-    result equals the value in the engine's ledger to the bit. An obstacle ahead (vehicle 0, infinite mass) bears no
-    harm; the vehicle that hits the obstacle bears all harm of the impact.
+    ``table`` contains the state of one simulated world, in the layout of ``physics.rows``. ``total`` is 1 for total
+    harm, 0 for first-impact harm. The result equals, to the bit, the harm of this vehicle in the engine's ledger. An
+    obstacle ahead (vehicle 0, infinite mass) bears no harm; the vehicle that hits the obstacle bears all harm of the
+    impact.
     """
     row, value = ROW.SUM_TOTAL_HARM if total == 1.0 else ROW.SUM_FIRST_HARM, 0.0
     if table[ROW.MASS, i] == math.inf:
@@ -164,7 +166,7 @@ def borne_by(table: Floats, total: float, i: int) -> float:
 def within_caps(world: Members, m: int) -> bool:
     """Return whether every vehicle bears at most its cap in possible world ``m``; True without caps.
 
-    A cap is the largest harm that a vehicle may bear. ``world.table`` must contain this possible world.
+    A cap is the largest harm that a vehicle may bear. ``world.table`` must contain the state of possible world ``m``.
     """
     if world.lines.shape[1] > OF_CAP:
         for i in range(world.lines.shape[2]):
@@ -192,7 +194,7 @@ def worst_so_far(world: Members, states: Floats) -> float:
 def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, plan: Floats, most: float) -> float:
     """Return the harm of the whole episode if a plan is executed in one possible world from now on, m2/s2.
 
-    The harm equals the engine's harm to the bit, because it is computed with the same operations.
+    The harm equals the engine's harm to the bit, because both are computed with the same operations.
 
     Args:
         world: parameters of the M possible worlds of one world (``Members``).
@@ -201,8 +203,8 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
         ended: whether the episode has ended in this possible world.
         step: number of the present decision.
         plan: actions of each decision, [L, K].
-        most: limit of the harm, m2/s2. The simulation stops when the harm exceeds this limit, because harm never falls
-            during an episode.
+        most: largest harm of interest, m2/s2. The simulation stops when the harm exceeds ``most``, because harm never
+            falls during an episode.
 
     Returns infinity if the harm exceeds ``most``, if a vehicle bears more than its cap, or if the physics fails.
 
@@ -234,7 +236,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
         plan: actions of each decision, [L, K]; executed from the present decision on.
-        most: largest harm that is of interest, m2/s2.
+        most: largest harm of interest, m2/s2.
 
     Returns infinity if the harm exceeds ``most`` in a possible world, if a vehicle bears more than its cap, or if the
     physics fails.
@@ -254,8 +256,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
     """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
 
-    The time until the horizon is simulated in one segment, not decision by decision. Returns infinity if the physics
-    fails.
+    The time until the horizon is simulated at once, not decision by decision. Returns infinity if the physics fails.
 
     Args:
         world: parameters of the M possible worlds of one world (``Members``).
@@ -263,8 +264,8 @@ def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int,
         state: present state of this possible world, [S].
         ended: whether the episode has ended in this possible world.
         step: number of the present decision.
-        constants: C candidates for a constant action of the K shielded vehicles, [C, K].
-        c: index of the row of ``constants`` to hold.
+        constants: C constant actions, each with one number per shielded vehicle, [C, K].
+        c: index (in ``constants``) of the action to hold.
 
     """
     table, clock, vehicles, bounds = world.table, world.clock[m], world.vehicles, world.bounds

@@ -1,8 +1,9 @@
-"""Settings of a shield: the keywords that every interface takes, their checks, and the guard that is made from them.
+"""Settings of a shield: the keywords of every shield interface, their checks, and the guard that is made from them.
 
-A mode is a registered name of a shield (entry-point group ``ethbrake_marl.shields``). The registry entry of a mode
-contains its class of settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with further settings
-has a subclass of ``ShieldOptions``, which adds and checks the further fields and makes the guard of the mode.
+A *mode* is the registered name of a kind of shield (entry-point group ``ethbrake_marl.shields``). The registry entry of
+a mode contains the class of the mode's settings. The modes ``step`` and ``episode`` use ``ShieldOptions``. A mode with
+further settings has a subclass of ``ShieldOptions``, which adds and checks the further fields and makes the guard of
+the mode.
 """
 
 from __future__ import annotations
@@ -32,19 +33,20 @@ class ShieldOptions:
     Args:
         mode: ``step`` certifies or replaces each action; an action is certified if some plan after it keeps the harm
             within the bound. ``episode`` is the paper's Algorithm 1: the policy or E-V2X-BM drives the whole episode.
-            None means ``step``; but if only the mode of an extension has the other settings, None means this mode.
+            None means ``step``; but if ``step`` lacks one of the other settings, None means the first mode that has
+            them all.
         bound: method to compute ``H*``, the harm of E-V2X-BM, in mode ``episode``: ``coupled`` (the engine's physics)
             or ``pairwise`` (the paper's closed form).
-        harm_count: impacts whose harm is bounded: ``first`` (each pair's first) or ``total`` (all).
+        harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened, for fewer replaced actions, m2/s2; not allowed in mode
             ``episode``.
         cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; only allowed
-            in mode ``step``. None: only the sum over the vehicles is bounded.
+            in mode ``step``. None: only the harm summed over all vehicles is bounded.
         intervention_penalty: amount subtracted from the reward of a step in which the proposed action was replaced.
         logging: whether ``shield.log`` collects the replaced actions; not allowed in mode ``episode``.
         shares: whether ``infos`` contains the harm that each vehicle bears under the current plan and under the
-            constant actions of least harm; with a ``cap`` it always contains this harm. Computing this harm slows a
-            step by a few percent. This setting is not allowed in mode ``episode``.
+            constant actions of least harm; with a ``cap`` the infos always contain this harm. ``shares=True`` slows a
+            step by a few percent, and is not allowed in mode ``episode``.
         where: name of the function or class that the user called, with which error messages begin.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
@@ -67,7 +69,8 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the settings class of ``mode``, or of another mode's class that has these settings.
+        """Create an instance of the settings class of ``mode``; if it lacks a setting, of the first class with all
+        settings.
 
         ``ShieldOptions(mode, setting=...)`` thus accepts the settings of every installed mode.
         """
@@ -104,18 +107,18 @@ class ShieldOptions:
 
     @property
     def adds(self) -> Source:
-        """Knowledge that the shield uses in addition to what a policy knows."""
+        """Knowledge that the shield uses, in addition to the policy's own knowledge."""
         return Source.MODEL
 
     def shield(
         self, scenario: Scenario, vehicle: int | tuple[int, ...], others: Mapping[int, Script] | None = None
     ) -> Any:
-        """Return a shield with these settings, before any episode, for every mode except ``episode``.
+        """Return a new shield with these settings, for every mode except ``episode``.
 
         Args:
             scenario: the scenario of all episodes.
             vehicle: index of the shielded vehicle (0 = front), or indices of several.
-            others: index of each other vehicle -> its script; None: the scenario's scripts.
+            others: scripts of the unshielded vehicles (vehicle index -> script); None: the scenario's scripts.
 
         """
         return StepShield(
@@ -126,8 +129,8 @@ class ShieldOptions:
     def check_in(self, scenario: Scenario, *, several: bool) -> None:
         """Raise ``InvalidInput`` if a shield with these settings cannot be used in the scenario.
 
-        If ``several`` is true (a team is shielded), this method checks nothing, because making the guard checks the
-        same.
+        If ``several`` is true (a team is shielded), this method checks nothing, because ``guard`` makes the same
+        checks.
         """
         if not several:
             self.shield(scenario, one_learner(scenario) or 0)
@@ -139,8 +142,8 @@ class ShieldOptions:
             engine: the engine that gets the guard.
             policies: vehicle index -> policy that proposes the vehicle's actions; may be empty except in mode
                 ``episode``.
-            several: whether a single learner is treated as a team of one vehicle.
-            how: further keywords of ``StepGuard``.
+            several: whether to treat a single learner as a team of one vehicle.
+            how: further keywords, passed to ``StepGuard``.
 
         """
         if self.mode == "episode":
@@ -164,7 +167,7 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
     Args:
         name: name of the setting.
         value: value of the setting.
-        mode: the mode.
+        mode: the mode that does not accept the setting.
         takers: modes that accept the setting.
         where: name of the function or class that the user called, with which the message begins.
 
@@ -173,7 +176,7 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
 
 
 def shielded_vehicle(engine: Engine, several: bool) -> int | tuple[int, ...]:
-    """Return the index of an engine's learner; for several learners, or if ``several``, a tuple of indices."""
+    """Return the index of the engine's only learner, or a tuple of indices for several learners or if ``several``."""
     vehicles = tuple(engine.learners)
     return vehicles if several or len(vehicles) > 1 else vehicles[0]
 

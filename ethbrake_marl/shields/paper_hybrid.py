@@ -1,13 +1,13 @@
-"""The paper's hybrid (Algorithm 1): at the alert, choose policy or baseline for the whole episode.
+"""The paper's hybrid (Algorithm 1): at the alert, choose the policy or the baseline for the whole episode.
 
-The policy is rolled out (simulated) in the engine from the alert on. Its harm is compared with ``H*``, the harm of the
-baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole episode.
+The policy is rolled out (simulated) in the engine from the alert on. The harm of this rollout is compared with ``H*``,
+the harm of the baseline E-V2X-BM. The policy or the baseline, whichever does less harm, drives the whole episode.
 
-The coupled ``H*`` is computed in the same engine. With the coupled ``H*``, the hybrid does at most the harm of the
-baseline in every world, provided that the policy repeats its rollout. A policy with random actions does not repeat its
-rollout; use the step shield for such a policy. With the paper's pairwise ``H*`` there is no guarantee: the pairwise
-``H*`` treats the two pairs as independent, and is only about half of the harm that the same deceleration causes in the
-engine.
+The coupled ``H*`` is computed in the same engine as the policy's harm. With the coupled ``H*``, the hybrid does at most
+the harm of the baseline in every world, provided that the policy drives exactly as in its rollout. A policy with random
+actions does not repeat its rollout; use the step shield for such a policy. With the paper's pairwise ``H*`` there is no
+guarantee, because the pairwise ``H*`` treats the two pairs as independent. The pairwise ``H*`` is only about half of
+the harm that the same deceleration causes in the engine.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class HybridAgent(AgentAround):
         scenario: the scenario in which ``policy`` and E-V2X-BM are compared.
         bound: method to compute ``H*`` and the deceleration: ``coupled`` (the engine's physics) or ``pairwise`` (the
             paper's closed form).
-        harm_count: harm that is compared: ``first`` (each pair's first impact) or ``total`` (all impacts).
+        harm_count: which harm is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
 
     The memory contains ``chosen_policy`` [n], true where the policy drives; the compared harms ``policy_harm`` [n] and
     ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of the two. Raises ``InvalidInput`` for an unknown
@@ -90,8 +90,8 @@ class HybridAgent(AgentAround):
         """Return the command of the driver that ``begin`` chose at the alert, [n] m/s2, and the new memory.
 
         Args:
-            worlds: the n worlds now.
-            memory: memory that ``begin`` or the last call returned.
+            worlds: the n worlds at this decision.
+            memory: the agent's memory, as returned by ``begin`` or by the last call of ``act``.
             vehicle: index of the controlled vehicle (0 = front).
 
         """
@@ -122,12 +122,12 @@ ROUNDING = 1e-6  # rounding error of an action in 32 bits
 class EpisodeGuard(ShieldGuard):
     """Guard of mode ``episode``: at each alert the agent ``hybrid`` chooses the driver of the whole episode.
 
-    The driver is the policy inside ``hybrid`` or E-V2X-BM, whatever actions are proposed. A proposal counts as replaced
-    if it differs from the applied action by more than the rounding error of a 32-bit number.
+    The driver is either the policy inside ``hybrid`` or E-V2X-BM, whatever actions the caller proposes. A proposal
+    counts as replaced if it differs from the applied action by more than the rounding error of a 32-bit number.
 
     Args:
         engine: the engine that gets this guard.
-        hybrid: the agent that chooses and drives.
+        hybrid: the agent that chooses the driver at the alert, and then returns the driver's commands.
         where: name of the function or class that the user called, with which error messages begin.
 
     """

@@ -6,9 +6,10 @@ from enum import IntEnum
 
 
 class ShieldReason(IntEnum):
-    """Reason why a shield accepted or replaced an action. The infos report its number as ``shield_reason``.
+    """Reason why a shield accepted or replaced an action. The infos report the reason's number as ``shield_reason``.
 
-    The shield's plan contains one action for each later decision. The budget is the largest harm that is accepted.
+    *Plan* means the shield's plan: one action for each decision up to the horizon. *Budget* means the largest harm that
+    the shield accepts for the whole episode.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldReason(3).name, eb.ShieldReason.NO_CERTIFICATE.text

@@ -31,7 +31,7 @@ from ethbrake_marl.shields.running import Running
 
 
 class Proposer(NamedTuple):
-    """The proposing policies, with everything that a rollout needs."""
+    """The proposing policies, with the memories and the worlds from which a rollout starts."""
 
     policies: Mapping[int, Agent]  # index of each shielded vehicle -> its policy, front to rear
     memories: Mapping[int, Memory]  # index of each shielded vehicle -> memory of its policy after this decision
@@ -48,7 +48,7 @@ def rolled_out(
         policies: index of each shielded vehicle -> its policy.
         scenario: the scenario whose scripts drive the other vehicles.
         vehicle: index of the only shielded vehicle, or a tuple of K indices.
-        width: number of decisions to return.
+        width: number of decisions for which to return actions.
 
     Returns actions, [n, width] if ``vehicle`` is an index, [n, width, K] if it is a tuple. After the end of an episode
     the actions are full braking.
@@ -67,11 +67,11 @@ def certify_by_policy(
     """Return ``decision``, changed to accept each rejected proposal that a rollout of the policy can certify.
 
     Args:
-        decision: the decision without rollouts.
+        decision: the decision of ``certify``, which tries no rollouts.
         running: the n episodes at this decision.
         proposed: proposed actions, [n] or [n, K].
         budget: largest harm that is accepted in each episode, [n] m2/s2.
-        held: plans of the shield before this decision, [n, L] or [n, L, K].
+        held: the shield's plans before this decision, [n, L] or [n, L, K].
         proposer: the proposing policies, with their memories and the worlds at this decision.
 
     """
@@ -92,16 +92,17 @@ def certify_rollouts(
 ) -> Decision:
     """Decide again in worlds whose proposals were rejected, with rollouts of the policy as plans.
 
-    The plan consists of the clipped proposal, followed by the actions of the policy in a simulation from the next state
-    on. If this plan stays within the budget, it becomes the backup and the proposal is accepted. Otherwise the reason
-    stays ``NO_CERTIFICATE``. With several vehicles, a vehicle whose proposal is NaN takes its planned action.
+    In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
+    from the next state on. If this plan stays within the budget and the caps, it becomes the backup, and the proposal
+    is accepted. If not, the reason stays ``NO_CERTIFICATE``. A vehicle whose proposal is NaN executes its planned
+    action.
 
     Args:
         running: the n episodes of the whole batch.
         proposed: proposed actions of the whole batch, [n] or [n, K].
         rows: indices of the worlds in which to decide again, [m].
         budget: largest harm that is accepted in each episode, [n] m2/s2.
-        held: present plans of the shield in the whole batch, [n, L] or [n, L, K].
+        held: the shield's present plans of the whole batch, [n, L] or [n, L, K].
         proposer: the proposing policies, with their memories and the worlds at this decision.
 
     Returns a decision for the m worlds in ``rows`` only.
@@ -132,12 +133,12 @@ def _later_plan(
     A rollout stops as soon as its harm exceeds the budget.
 
     Args:
-        running: the n episodes, with one possible world each.
+        running: the n episodes of the whole batch, with one possible world each.
         first: actions of the present decision, [m] or [m, K].
-        rows: indices of the m worlds, [m].
+        rows: indices of the worlds for which to make a plan, [m].
         budget: largest harm that is accepted in each episode, [n] m2/s2.
-        held: present plans, which contain the past actions, [n, L] or [n, L, K].
-        proposer: the proposing policies.
+        held: the shield's present plans; their entries before this decision are the past actions, [n, L] or [n, L, K].
+        proposer: the proposing policies, with their memories and the worlds at this decision.
 
     """
     policies, memories, worlds = proposer
@@ -178,7 +179,7 @@ def _later_plan(
 
 
 def no_constants(plan: Floats) -> Floats:
-    """Return an empty array of constant actions for ``Backup``, with the axis K of ``plan`` if it has one."""
+    """Return an empty array of constant actions for ``Backup``, with an axis K if ``plan`` has one."""
     return np.zeros((0, *plan.shape[2:]))
 
 
@@ -187,8 +188,8 @@ def proposed_actions(
 ) -> tuple[Floats, dict[int, Memory]]:
     """Return the actions that the policies propose, [n, K] in [-1, 1], and the new memory of each vehicle's policy.
 
-    ``policies`` and ``memories`` map the index of each of K vehicles to its policy and to the policy's memory.
-    ``worlds`` are n worlds at a decision.
+    ``policies`` maps the index of each of K vehicles to its policy. ``memories`` maps the same index to the policy's
+    memory. ``worlds`` are n worlds at a decision.
     """
     asked = {i: proposed_action(policy, worlds, memories[i], i) for i, policy in policies.items()}
     after = {i: memory for i, (_, memory) in asked.items()}
@@ -205,7 +206,10 @@ def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int)
 
 
 class _Rounded(AgentAround):
-    """Policy whose commands are converted to actions and back, as in a plan. Its memory contains ``action``."""
+    """Policy whose commands are converted to actions and back, as in a plan.
+
+    ``memory["action"]`` contains its last actions.
+    """
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:
         return {"policy": begin_script(self.policy, alert, vehicle, scripts), "action": np.zeros(alert.n)}

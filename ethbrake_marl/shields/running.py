@@ -15,9 +15,9 @@ from ethbrake_marl.physics.state import Bools, Floats, Ints
 class Running(NamedTuple):
     """Running episodes at a decision: n worlds with M possible worlds (*members*) each. Usually M is 1.
 
-    The possible worlds of world k are in rows k * M to k * M + M - 1. The first of these rows is the world itself, the
-    *nominal* world. For K shielded vehicles, actions have the shape [n, K] and plans (one action for each of L
-    decisions) the shape [n, L, K]. For one vehicle, the axis K may be left out.
+    The possible worlds of world k are in rows k * M to k * M + M - 1. Row k * M contains world k itself, the *nominal*
+    world. For K shielded vehicles, actions have the shape [n, K] and plans (one action for each of L decisions) the
+    shape [n, L, K]. For a single shielded vehicle, the axis K may be left out.
     """
 
     problem: ProfileProblem  # parameters, commands of unshielded vehicles and times of the decisions, in n * M rows
@@ -28,7 +28,7 @@ class Running(NamedTuple):
 
     @property
     def uncapped(self) -> Running:
-        """The same episodes without ``caps``, the limits on the harm of single vehicles."""
+        """The same episodes without ``caps`` (the limits of each vehicle's harm)."""
         return self._replace(caps=np.zeros((0, 0)))
 
     @property
@@ -53,15 +53,15 @@ class Running(NamedTuple):
         return Decisions(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP]).at(self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
-        """Return the row indices of all possible worlds of ``worlds`` (indices), [len(worlds) * M]."""
+        """Return the row indices of all possible worlds of the worlds ``worlds`` (indices), [len(worlds) * M]."""
         return np.asarray((worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel(), np.int64)
 
     def take(self, worlds: Ints) -> Running:
-        """Return the episodes of ``worlds`` (indices), with all possible worlds of each."""
+        """Return the episodes of only the worlds ``worlds`` (indices), with all their possible worlds."""
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:
-        """Return the same episodes with the world itself as the only possible world."""
+        """Return the same episodes with a single possible world each: the world itself."""
         if self.members == 1:
             return self
         return self._select(np.arange(self.n) * self.members, np.arange(self.n))
@@ -75,7 +75,8 @@ def begin_running(problem: ProfileProblem, members: int = 1) -> Running:
     """Return the episodes of ``problem`` at their first decision.
 
     ``problem`` contains the states of the worlds at the first decision, and the commands of the unshielded vehicles.
-    ``members`` is the number M of possible worlds of each world; M consecutive rows of ``problem`` belong to one world.
+    ``members`` is the number M of possible worlds of each world. M consecutive rows of ``problem`` belong to the same
+    world.
     """
     steps, ended = np.zeros(problem.n // members, np.int64), np.zeros(problem.n, np.bool_)
     return Running(problem, problem.start, steps, ended)

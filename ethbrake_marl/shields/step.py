@@ -1,38 +1,40 @@
-"""Step mode of the shield: a bound on the harm of the episode that holds at every step, whatever is proposed.
+"""Mode ``step`` of the shield: keep the harm of the episode within a bound, whatever actions are proposed.
 
-**Claim.** Let ``B`` be the bound at the first decision, which is the harm of the first plan. If every step applies the
-action that ``certify`` returns, then the harm at the end of the episode is at most ``B`` for any proposals, and the
-bound never rises during the episode. An episode ends at rest or at the scenario's horizon. The claim does not cover
-anything that happens after the horizon.
+**Claim.** The *bound* is the harm that the episode will not exceed. Let ``B`` be the bound at the first decision: the
+harm of the first plan. If every step applies the action that ``certify`` returns, then the harm at the end of the
+episode is at most ``B``, whatever actions are proposed. The bound never rises during the episode. An episode ends at
+rest or at the scenario's horizon. The claim does not cover anything that happens after the horizon.
 
 **Induction.** Between two decisions the shield has a *plan* with an action for every decision up to the horizon. Let
 ``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. ``c``
-includes the harm so far, and takes into account which pairs were already hit. The function ``members.follow_plan``
-computes ``c``. This function advances decision by decision with the same operations as the engine's step, in the same
-order, and adds harm in the same order. Hence:
+includes the harm so far. In the first-impact count, ``c`` leaves out further impacts of pairs that already had an
+impact. The function ``members.follow_plan`` computes ``c``. ``follow_plan`` simulates the plan decision by decision,
+with the same floating-point operations as the engine's step, in the same order. It adds up the harm in the same order,
+too. Hence:
 
-1. *Start.* ``c = B``.
-2. *A proposal is applied* only if there is a plan from the next state on whose harm is at most the budget. The function
-   ``follow_plan`` computes this harm from exactly the next state. This plan becomes the shield's plan, and its harm
-   becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because the same
-   operations act on the same numbers.
-3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, it passed through the state after
-   this action, so the harm of the rest of the plan is ``c`` to the last bit. A plan with less harm may replace this
-   rest.
+1. *Start.* At the first decision ``c = B``.
+2. *A proposal is applied* only if the harm of some plan from the next state on is at most the budget. ``follow_plan``
+   computes the harm of this new plan from exactly the next state. The new plan becomes the shield's plan, and its harm
+   becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because a new simulation
+   would repeat the same operations.
+3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, its simulation passed through the
+   state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last
+   bit. A plan with less harm may replace the rest of the plan.
 4. *End.* When the episode ends, no action is left to execute, and ``c`` is the harm of the episode.
 
-The *budget* is the largest harm that a new plan may have: ``c``, or any value between ``c`` and ``B``. Hence
-``c <= B`` always. ∎ The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode
-and the last bound are the same floating-point number.
+The *budget* is the largest harm that a new plan may have: ``c``, or any value from ``c`` to ``B``. Hence ``c <= B`` at
+every decision. ∎ The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode and
+the last bound are the same floating-point number.
 
-**Several vehicles.** With several shielded vehicles, each action in the proof is a row of actions, one per vehicle.
-First, all proposals are tried together. If they cannot be certified together, they are tried one by one, front to rear:
-the proposal of one vehicle replaces its action in the plan. The proposal is accepted if a plan after it stays within
-the budget; otherwise the vehicle's planned action remains. Each attempt begins and ends with a certified plan.
+**Several vehicles.** With several shielded vehicles, each action in the proof is an array with one action per shielded
+vehicle. The shield first tries all proposals together. If no plan after all proposals stays within the budget, the
+shield tries the proposals one by one, front to rear: one vehicle's proposal replaces that vehicle's action in the plan.
+This single proposal is accepted if some plan after it stays within the budget; if not, the vehicle's planned action
+remains. Before and after each attempt the shield has a plan whose harm is at most the budget.
 
-**Several members.** The shield may consider several possible worlds, the *members* of a world. Each harm in the proof
-is then the largest over the members, and the same actions advance all members. So the harm of *every* member is at
-most ``B``.
+**Several members.** The shield may consider several possible worlds, the *members* of a world. With several members,
+each harm in the proof is the largest harm over the members, and the same actions are executed in all members. So the
+harm of the episode is at most ``B`` in *every* member.
 """
 
 from __future__ import annotations
@@ -67,38 +69,39 @@ Cap = Literal["baseline"]  # plan that sets the caps: a vehicle may bear at most
 
 
 class StepShield:
-    """Bound the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` in every step.
+    """Bound the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` before every step.
 
-    Both methods replace ``memory`` as a whole and change no array in place. If a method raises an error, the old memory
-    remains. A ``copy.copy`` of the shield is independent of the shield.
+    ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If one of them raises an error,
+    the old memory remains. A copy of the shield by ``copy.copy`` is independent of the original.
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. If
-    ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises. It
-    covers the time up to the scenario's horizon. ``memory.settles`` [n] is true where all vehicles are at rest at the
-    horizon under the first plan.
+    ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises, and
+    covers the time up to the scenario's horizon. ``memory.settles`` [n] says for each world whether all vehicles are at
+    rest at the horizon under the first plan.
 
-    At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs (a vehicle
-    brakes beyond its capacity, a number is NaN, a message is missing), ``memory.distrusted`` [n] is set, and the bound
-    no longer holds. The shield then ignores proposals for the rest of the episode. It applies the rest of the plan or
-    the best constant action, whichever does less harm, and chooses again whenever the world differs from the
-    prediction. If a world goes on after the predicted end of its episode, the shielded vehicles brake fully.
+    At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs from its
+    prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked in
+    ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for the
+    rest of the episode. It applies the rest of the plan or the best constant action, whichever does less harm, and
+    chooses between the two again whenever the world differs from the prediction. If an episode goes on after its
+    predicted end, the shielded vehicles brake fully.
 
-    With several ``possible`` worlds, each harm is the largest harm over these worlds, and every number in the observed
-    world must lie within the range of the numbers predicted for them.
+    If ``begin`` gets several ``possible`` worlds for each world, each harm is the largest harm over these possible
+    worlds. Each observed number must then lie within the range of its predictions in the possible worlds.
 
     Args:
         scenario: the scenario of all worlds.
         vehicle: index of the shielded vehicle (0 = front), or indices of several, front to rear.
-        harm_count: impacts whose harm is bounded: ``first`` (each pair's first) or ``total`` (all).
+        harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened until the episode ends, m2/s2.
-        others: index of each other vehicle -> its script, whose command must be fixed at the alert; None: the
-            scenario's scripts.
+        others: scripts of the unshielded vehicles (vehicle index -> script); each script must fix its commands at the
+            alert. None: the scenario's scripts.
         cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; None: only the
-            sum over the vehicles is bounded.
-        logging: whether ``log`` collects the interventions.
+            harm summed over all vehicles is bounded.
+        logging: whether ``log`` lists the interventions (replaced actions).
 
     Raises ``InvalidInput`` for an unknown harm count, an unknown vehicle, a negative allowance, or a script in
-    ``others`` whose command is not fixed at the alert.
+    ``others`` whose commands are not fixed at the alert.
 
     """
 
@@ -155,16 +158,16 @@ class StepShield:
 
     @property
     def chosen_policy(self) -> Bools:
-        """Whether no proposed action of the episode has been replaced so far, [n]."""
+        """For each world: true if no proposed action has been replaced so far in the running episode, [n]."""
         return np.asarray(self.interventions == 0, np.bool_)
 
     @property
     def log(self) -> list[Intervention] | None:
-        """Interventions (replaced actions) since the last call of ``clear_log``; None without ``logging``."""
+        """Interventions (replaced actions) since the last call of ``clear_log``; None if ``logging`` is False."""
         return self._entries[: self.memory.logged] if self.logging else None
 
     def clear_log(self) -> None:
-        """Delete all log entries. Without this call the log grows without limit."""
+        """Delete all log entries. If this method is never called, the log grows without limit."""
         self._entries, self.memory = [], self.memory._replace(logged=0)
 
     @property
@@ -173,14 +176,14 @@ class StepShield:
         return np.asarray(self.memory.replaced.reshape(len(self.memory.replaced), -1).sum(axis=1), np.int64)
 
     def shares(self) -> Floats:
-        """Return the harm that each vehicle bears if the current plan is executed, [n, N] m2/s2."""
+        """Return the harm that each vehicle bears in the whole episode under the present plan, [n, N] m2/s2."""
         running, backup = self.memory.running, self.memory.backup
         if running is None:
             raise InvalidInput("shield: shares() was called before any episode began; call begin first")
         return ends_under(running.nominal(), backup.plan)[1][:, -self.scenario.vehicles :]
 
     def take(self, rows: Ints) -> Self:
-        """Return an independent shield for the episodes in the rows with the indices ``rows``."""
+        """Return an independent copy of the shield with only the episodes in the rows ``rows`` (indices)."""
         part = copy.copy(self)
         part.memory = self.memory.take(rows)
         return part
@@ -195,15 +198,16 @@ class StepShield:
     ) -> None:
         """Start new episodes in some rows of the batch.
 
-        To enlarge the batch to k rows, start all rows 0 to k - 1 in one call.
+        To enlarge the batch to k rows, start episodes in all rows from 0 to k - 1 in one call.
 
         Args:
-            worlds: the worlds of these rows at the alert, as the shield assumes them.
-            rows: indices of the rows in which the episodes start.
-            policy: the proposing policy, which is simulated from the alert; for several vehicles, vehicle index ->
-                policy. None: the bound is the harm of the best constant actions.
-            possible: M possible worlds for each world, the first of which is the world itself, [len(rows) * M]; None:
-                the result of ``members_of(worlds)``.
+            worlds: worlds of the new episodes at the alert, as the shield assumes them (the true worlds may differ).
+            rows: indices of the batch rows in which the new episodes start.
+            policy: policy that proposes actions, or vehicle index -> policy for several vehicles. The policy is
+                simulated from the alert; in worlds where it does less harm than the best constant actions, its harm is
+                the bound. If ``policy`` is None, the bound is the harm of the best constant actions.
+            possible: the M possible worlds of each world (the world itself first), [len(rows) * M]; None: the result of
+                ``members_of(worlds)``.
 
         Raises ``InvalidInput`` for rows that do not exist in the batch, and if the messages in ``worlds`` lack a
         quantity that the shield needs.
@@ -222,7 +226,8 @@ class StepShield:
     def members_of(self, worlds: Worlds) -> Worlds:
         """Return the M possible worlds of each of n worlds at the alert, as n * M worlds.
 
-        In this class M is 1: the only possible world is the world itself. A subclass may return more.
+        In this class M is 1: the only possible world is the world itself. A subclass may return several possible worlds
+        for each world.
         """
         return worlds
 
@@ -233,7 +238,7 @@ class StepShield:
 
         Args:
             worlds: n worlds at the alert.
-            rows: rows of the batch in which the episodes start, [n].
+            rows: indices of the batch rows in which the new episodes start, [n].
             policy: the proposing policy, or vehicle index -> policy for several vehicles; None: no policy.
             possible: the M possible worlds of each world, [n * M].
 
@@ -272,11 +277,11 @@ class StepShield:
         )  # fmt: skip
 
     def _problem(self, possible: Worlds, members: int) -> ProfileProblem:
-        """Return the possible worlds and the unshielded vehicles' commands, prepared for ``engine.profiles``.
+        """Return the possible worlds and the unshielded vehicles' commands, as input for ``engine.profiles``.
 
-        ``members`` is the number of possible worlds of each world. Raises ``InvalidInput`` if the commands are not
-        fixed at the alert. With several possible worlds, it is also raised if the first decision in one of them is not
-        before the horizon, and if the shield has a cap.
+        ``members`` is the number of possible worlds of each world. Raises ``InvalidInput`` if a script's commands are
+        not fixed at the alert. With several possible worlds, also raises ``InvalidInput`` if the shield has a cap, or
+        if in one possible world the first decision is not before the horizon.
         """
         vehicles, horizon_s = self.vehicles, self.scenario.horizon_s
         if members > 1 and self.cap is not None:
@@ -302,15 +307,15 @@ class StepShield:
     def _bound_at_alert(
         self, possible: Worlds, problem: ProfileProblem, rows: Ints, plan: Floats, harm: Floats
     ) -> tuple[Floats, Any]:
-        """Return the bound of the first plans, [n] m2/s2, and further memory of a subclass (``StepMemory.enclosure``).
+        """Return the bound of each episode at the alert, [n] m2/s2, and a subclass's memory (``StepMemory.enclosure``).
 
-        In this class the bound is ``harm``, and the further memory is None.
+        This class returns ``harm`` as the bound, and None as the memory.
 
         Args:
             possible: the M possible worlds of each world at the alert.
-            problem: the same worlds, prepared for the functions of ``engine.profiles``.
-            rows: rows of the batch in which the episodes start.
-            plan: the first plans, [n, L] or [n, L, K].
+            problem: the possible worlds, as input for the functions of ``engine.profiles``.
+            rows: indices of the batch rows in which the new episodes start.
+            plan: first plan of each world, [n, L] or [n, L, K].
             harm: largest harm of each first plan over the possible worlds, [n] m2/s2.
 
         """
@@ -327,16 +332,17 @@ class StepShield:
         """Decide on the proposed actions in every running episode.
 
         Args:
-            proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. NaN means that nothing
-                is proposed; the planned action is then applied.
-            seen: the observed worlds, as the first columns of ``Running.states``, [n, columns]. None: no comparison
-                with the prediction.
-            only: whether to decide in each world, [n]; other worlds stay unchanged. None: decide in all worlds whose
-                episode has not ended.
-            proposer: the proposing policies. If no other plan certifies a proposal, these policies are simulated from
-                this decision on, and the resulting actions are tried as a plan. None: no policy is simulated.
+            proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. Where the proposal is
+                NaN, the planned action is applied.
+            seen: the observed worlds, which are compared with the prediction; the first columns of ``Running.states``,
+                [n, columns]. If ``seen`` is None, nothing is compared.
+            only: true for the worlds in which to decide, [n]; the other worlds stay unchanged. If ``only`` is None, the
+                shield decides in all worlds whose episode has not ended.
+            proposer: the policies that propose. If no other plan certifies a proposal, the shield simulates the
+                policies after this proposal, and tries their actions as a plan. If ``proposer`` is None, no policy is
+                simulated.
 
-        Returns the decision with the actions to apply. ``memory`` then contains the predicted next state.
+        Returns the decision with the actions to apply. After the call ``memory`` contains the predicted next state.
 
         """
         memory = self.memory
@@ -353,10 +359,10 @@ class StepShield:
     def _decided(
         self, memory: StepMemory, proposed: Floats, asked: Bools, proposer: Proposer | None
     ) -> tuple[Decision, StepMemory]:
-        """Return the decision on ``proposed`` [n] or [n, K], and the memory after it.
+        """Return the decision on ``proposed`` [n] or [n, K], and the memory after the decision.
 
-        ``memory`` is the memory before the decision, ``asked`` [n] whether to decide in each world, ``proposer`` the
-        policies to simulate, or None.
+        ``memory`` is the memory before the decision. ``asked`` [n] says in which worlds to decide. ``proposer``
+        contains the policies to simulate; None: no policy.
         """
         before, held, budget = memory.running, memory.backup, self._bound_of(memory)
         assert before is not None
@@ -387,16 +393,16 @@ class StepShield:
     def _also_certified(
         self, now: Running, memory: StepMemory, budget: Floats, decision: Decision, asked: Bools
     ) -> Decision:
-        """Return the final decision, given a decision that stays within the budget in every possible world.
+        """Return the final decision; ``decision`` already stays within the budget in every possible world.
 
         This class returns ``decision`` unchanged; a subclass may replace more actions.
 
         Args:
-            now: the episodes before the decision.
-            memory: memory before the decision, with the old plan.
+            now: the running episodes before the decision.
+            memory: the shield's memory before the decision, with the old plan.
             budget: largest harm that is accepted in each episode, [n] m2/s2.
-            decision: the decision that stays within the budget.
-            asked: whether a decision is needed in each world, [n].
+            decision: the decision of ``certify``, changed where a rollout of the policy certified a proposal.
+            asked: true for the trusted worlds in which to decide, [n].
 
         """
         return decision
@@ -404,8 +410,9 @@ class StepShield:
     def as_seen(self, seen: Floats) -> Floats:
         """Return the observed worlds ``seen`` [n, columns] in a form that can be compared with the prediction.
 
-        The prediction may have a column for the gap to an obstacle ahead. In worlds without an obstacle this gap is
-        infinite; it is replaced by the predicted gap. All other numbers stay the same.
+        Predictions may have a column for the gap to an obstacle ahead. In worlds without an obstacle, the observed gap
+        to the obstacle is infinite, and is replaced by the predicted number. All other numbers in ``seen`` stay the
+        same.
         """
         running = self.memory.running
         assert running is not None
@@ -419,9 +426,9 @@ class StepShield:
     def expects(self, seen: Floats) -> Bools:
         """Return whether each observed world in ``seen`` [n, columns] agrees with the prediction, [n].
 
-        With one possible world, the observed and the predicted world must be equal to the bit. With several possible
-        worlds, each observed number must lie within the range of the predictions. After an impact in any possible
-        world, every finite number is accepted.
+        With a single possible world, each observed number must equal the predicted number to the bit. With several
+        possible worlds, each observed number must lie within the range of its predictions in the possible worlds. Once
+        an impact has happened in a possible world, every finite number is accepted.
         """
         running = self.memory.running
         assert running is not None
@@ -437,8 +444,8 @@ class StepShield:
     def _leaves_range(self, running: Running) -> Bools:
         """Return whether an impact has happened in any possible world of each world, [n].
 
-        After such an impact, the true world may lie outside the range of the possible worlds. ``running`` contains the
-        predicted episodes.
+        After an impact in a possible world, the true world may lie outside the range of the possible worlds.
+        ``running`` contains the predicted episodes.
         """
         N = running.problem.mass.shape[1]
         predicted = running.states.reshape(running.n, running.members, -1)
@@ -447,7 +454,7 @@ class StepShield:
     def _compared(self, memory: StepMemory, seen: Floats, asked: Bools) -> StepMemory:
         """Compare the observed worlds with the prediction in ``memory``; return the new memory.
 
-        ``seen`` [n, columns] contains the observed worlds, as the first columns of ``Running.states``; ``asked`` [n]
+        ``seen`` [n, columns] contains the observed worlds, with the first columns of ``Running.states``. ``asked`` [n]
         says which worlds are compared. A world that differs from the prediction becomes distrusted, and gets a new plan
         from the observed state on.
         """

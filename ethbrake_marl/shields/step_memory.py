@@ -27,7 +27,7 @@ class StepMemory(NamedTuple):
     logged: int = 0  # number of interventions in the log
 
     def take(self, rows: Ints) -> StepMemory:
-        """Return the memory of the episodes in the rows with the indices ``rows``."""
+        """Return the memory of only the episodes in the rows ``rows`` (indices)."""
         running, backup, enclosure = self.running, self.backup, self.enclosure
         return self._replace(
             running=None if running is None else running.take(rows),
@@ -37,11 +37,11 @@ class StepMemory(NamedTuple):
         )
 
     def put(self, rows: Ints, begun: StepMemory) -> StepMemory:
-        """Return this memory with new episodes in the rows with the indices ``rows``.
+        """Return a copy of this memory in which new episodes replace the episodes in the rows ``rows`` (indices).
 
-        ``begun`` is the memory of the new episodes, in the order of ``rows``; only ``begun.enclosure`` contains all
-        rows of the batch. If there are at least as many new as present episodes, the new episodes replace the whole
-        batch. Episode numbers continue.
+        ``begun`` is the memory of the new episodes, in the order of ``rows``. Only ``begun.enclosure`` contains all
+        rows of the batch. If there are at least as many new episodes as rows in the batch, the new episodes replace the
+        whole batch. Episode numbers continue.
         """
         old, new = self.running, begun.running
         assert new is not None

@@ -49,9 +49,9 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
 
     Args:
         env: ``eb.parallel_env(...)`` with one learner (in mode ``step`` one or more), or a wrapper around it.
-        policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. It proposes actions that the
-            caller leaves out. In worlds where the policy does less harm than E-V2X-BM, its harm is the bound (the harm
-            that the episode will not exceed). Mode ``episode`` needs a policy.
+        policy: an agent or a policy, a ``Team``, or a mapping from learner name to policy. The policy proposes the
+            actions that the caller leaves out. In worlds where the policy does less harm than E-V2X-BM, the policy's
+            harm is the bound (the harm that the episode will not exceed). Mode ``episode`` needs a policy.
         agents: names of the shielded learners, which must be all learners; None: all learners.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
@@ -96,7 +96,8 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
         """Start an episode; return the observations and infos of the agents.
 
-        ``seed`` and ``options`` are passed to the environment. ``infos[agent]["shield_bound_harm"]`` is the bound.
+        ``seed`` and ``options`` are passed to the environment. ``infos[agent]["shield_bound_harm"]`` is the harm that
+        the agent's episode will not exceed (m2/s2).
         """
         self.attached.check_open()
         result: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
@@ -136,8 +137,9 @@ class ShieldedEnv(
 
     Args:
         env: an ``EthBrake-v1`` environment, or a wrapper around it.
-        policy: policy that is simulated from each alert; where it does less harm than E-V2X-BM, its harm is the bound.
-            It may be None, except in mode ``episode``.
+        policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
+            policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be None, except in
+            mode ``episode``.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
@@ -166,7 +168,8 @@ class ShieldedEnv(
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; return observation and info.
 
-        ``seed`` and ``options`` are passed to the environment. ``info["shield_bound_harm"]`` is the bound.
+        ``seed`` and ``options`` are passed to the environment. ``info["shield_bound_harm"]`` is the harm that the
+        episode will not exceed (m2/s2).
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
@@ -189,13 +192,14 @@ class ShieldedEnv(
 class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
-    In a row whose episode has just restarted, ``infos["shield_bound_harm"]`` and the other infos describe the new
-    alert, and ``infos["final_info"]`` describes the last step of the old episode.
+    In a row where a new episode has just started, ``infos["shield_bound_harm"]`` and the other infos describe the new
+    alert. In this row ``infos["final_info"]`` describes the last step of the old episode.
 
     Args:
         env: an ``EthBrakeVectorEnv``, or a wrapper around it.
-        policy: policy that is simulated from each alert; where it does less harm than E-V2X-BM, its harm is the bound.
-            It may be None, except in mode ``episode``.
+        policy: policy that is simulated from each alert. In worlds where the policy does less harm than E-V2X-BM, the
+            policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be None, except in
+            mode ``episode``.
         options: keywords of ``ShieldOptions``, including ``mode``.
 
     Raises ``InvalidInput`` for another kind of environment, and for invalid arguments.
@@ -222,7 +226,8 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every row; return observations [rows, F] and infos.
 
-        ``seed`` and ``options`` are passed to the environment. ``infos["shield_bound_harm"]`` is the bound of each row.
+        ``seed`` and ``options`` are passed to the environment. ``infos["shield_bound_harm"]`` [rows] is the harm that
+        each episode will not exceed (m2/s2).
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
@@ -247,14 +252,14 @@ def shield(env: Any, policy: Proposing | None = None, mode: str | None = None, *
 
     Args:
         env: an environment of this package, possibly wrapped: PettingZoo parallel or AEC, a Gymnasium or Gymnasium
-            vector environment, or a Stable-Baselines3 ``VecEnv``. If inner wrappers change actions, the shield
-            certifies the changed action. ``env`` may also be an agent or a team; ``options`` must then contain
+            vector environment, or a Stable-Baselines3 ``VecEnv``. If wrappers inside the shield change an action, the
+            shield certifies the changed action. ``env`` may also be an agent or a team; ``options`` must then contain
             ``scenario``, the scenario in which actions are certified.
         policy: policy that proposes the actions that the caller leaves out. In worlds where the policy does less harm
-            than E-V2X-BM, its harm is the bound (the harm that the episode will not exceed). It may be None, except in
-            mode ``episode``.
-        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if only the mode of an
-            extension has the ``options``, None means this mode.
+            than E-V2X-BM, the policy's harm is the bound (the harm that the episode will not exceed). ``policy`` may be
+            None, except in mode ``episode``.
+        mode: ``step``, ``episode``, or the mode of an extension. None means ``step``; but if ``step`` lacks one of the
+            ``options``, None means the first mode that has them all.
         options: further keywords of ``ShieldOptions``.
 
     Returns a ``HybridShield`` (for AEC, an AEC environment around a ``HybridShield``), a ``ShieldedEnv``, a
