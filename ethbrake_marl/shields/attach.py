@@ -41,7 +41,7 @@ def proposing_agents(
     Args:
         policy: a team, a mapping from vehicle name to policy, or one policy that proposes for all vehicles.
         vehicles: indices of the shielded vehicles.
-        where: name of the function or class that the user called, with which error messages begin.
+        where: name with which error messages begin: the function or class that the user called.
 
     Raises ``InvalidInput`` for any other type of ``policy``, and if a team or mapping does not contain exactly the
     shielded vehicles.
@@ -106,7 +106,7 @@ class Attached:
         interface: class of which ``env`` must be an instance, such as ``gymnasium.Env``.
         maker: code that makes such an environment, such as ``eb.parallel_env``; error messages name this code.
         policy: policy that proposes the actions that the caller leaves out; None: no policy.
-        where: name of the shield wrapper, with which error messages begin.
+        where: name with which error messages begin: the shield wrapper.
         options: keywords of ``ShieldOptions``.
 
     An ``Attached`` object has the attributes ``engine``, ``guard`` and ``options``. Raises ``InvalidInput`` if ``env``

@@ -58,7 +58,7 @@ def best_constant(world: Members, states: Floats, ended: Bools, step: int, const
     horizon. The time until the horizon is simulated at once, not decision by decision.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
@@ -88,7 +88,7 @@ def better_plan(
     """Replace the rest of a plan by the best constant action, if the harm is then below ``value`` and at most ``most``.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision; actions from this decision on are replaced.
@@ -144,7 +144,7 @@ def try_action(
     physics fails is not certified.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
@@ -159,7 +159,7 @@ def try_action(
         over: receives whether the episode has ended after the step in each possible world, [M].
 
     Returns the harm of the resulting plan, the least harm of any plan tried (both m2/s2), and the reason (a code of
-    ``ShieldReason``). The search succeeded if the first of these harms is at most ``budget``.
+    ``ShieldReason``). The search succeeded if the harm of the resulting plan is at most ``budget``.
 
     """
     going = take_steps(world, states, ended, step, action, after, over)
@@ -318,7 +318,7 @@ def harm_of_plans(running: Running, constants: Floats, plans: Floats, value: Flo
 
     The harm of a plan is its largest harm over the possible worlds; it is infinite if the physics fails. If one of the
     ``constants`` [C, K], held to the horizon, causes less harm than the rest of a plan, this constant action replaces
-    the rest of the plan in ``plans`` [n, L, K]. ``value`` then contains the harm of the changed plan.
+    the rest of the plan in ``plans`` [n, L, K], and ``value`` contains the harm of the changed plan.
     """
     n, every = running.steps.shape[0], all_members(running)
     trial = np.zeros((plans.shape[1], plans.shape[2]))

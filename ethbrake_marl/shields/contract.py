@@ -6,10 +6,15 @@ A *guard* is the object in an engine that decides which actions are applied. The
     decide(state, memory, proposed) -> (applied, memory, info)
 
 - ``state``: the engine with its running episodes. The guard reads the engine and does not change it.
-- ``memory``: the guard's memory of these episodes. It is never changed in place: ``decide`` returns a new memory.
-- ``proposed``: proposed actions, [n, L] in [-1, 1]. A column of NaN means that the caller gave that learner no action.
-  A single NaN is an invalid action.
+
+- ``memory``: the guard's memory of these episodes. The guard never changes its memory in place: ``decide`` returns a
+  new memory.
+
+- ``proposed``: proposed actions, [n, L] in [-1, 1]. A column of NaN means that the caller gave no action for the
+  learner of this column. A single NaN is an invalid action.
+
 - ``applied``: actions that the engine applies in this step, [n, L].
+
 - ``info``: details of the decision, which environments report in their infos as ``shield_...``.
 
 ``decide`` returns ``applied``, ``memory`` and ``info`` in one ``Ruling`` (``engine.engine``). After the step, ``check``
@@ -43,7 +48,7 @@ from ethbrake_marl.shields.rollouts import Proposer, proposed_actions
 
 
 class ShieldMode(IntEnum):
-    """Mode of a shield. The infos report the mode's number as ``shield_mode``. Extensions use other numbers.
+    """Mode of a shield. The infos report the mode's number as ``shield_mode``. Modes of extensions have other numbers.
 
     >>> import ethbrake_marl as eb
     >>> eb.ShieldMode(1).name
@@ -69,8 +74,7 @@ class Guarded(NamedTuple):
 
     @property
     def told(self) -> dict[str, Any]:
-        """Name -> value [n] of ``predicted_harm`` and ``chosen_policy``; None for a value that the shield does not
-        have.
+        """The shield's ``predicted_harm`` [n] and ``chosen_policy`` [n] by name; None if the shield has no such value.
 
         ``predicted_harm`` is the harm predicted at the alert (m2/s2). ``chosen_policy`` says in which worlds the policy
         drives.
@@ -91,7 +95,7 @@ class ShieldGuard(ABC):
             at every decision, even if its proposal is not needed, to update its memory.
         shield: initial state of the shield, before any episode; its type depends on the mode.
         mode: mode of the shield; the infos report the number of the mode.
-        where: name of the function or class that the user called, with which error messages begin.
+        where: name with which error messages begin: the function or class that the user called.
 
     """
 
@@ -111,8 +115,8 @@ class ShieldGuard(ABC):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; the
-                policy of this learner then proposes. A single NaN is an invalid action and is never applied.
+            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
+                this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.
 
         """
 
@@ -195,8 +199,7 @@ class ShieldGuard(ABC):
         return spread
 
     def _of_step(self, ruling: Ruling | None) -> dict[str, Any]:
-        """Return the infos that all modes report: mode, proposed and applied action, and whether the proposal was
-        replaced.
+        """Return the infos that all modes report: mode, proposed action, applied action, and if the shield intervened.
 
         ``ruling`` is the decision in the last step. Before the first step ``ruling`` is None; the proposed and the
         applied action are then 0.
@@ -210,8 +213,7 @@ class ShieldGuard(ABC):
     def _asked(
         self, worlds: Worlds | None, memories: dict[int, Memory], proposed: Floats
     ) -> tuple[Floats, dict[int, Memory]]:
-        """Let policies propose for learners without an action; return all proposals [n, L] and the policies' new
-        memories.
+        """Let policies propose for learners without an action; return proposals [n, L] and the policies' memories.
 
         Args:
             worlds: the n worlds that the policies observe; may be None if no policy is called.

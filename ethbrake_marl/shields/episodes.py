@@ -60,7 +60,7 @@ class Shielded(NamedTuple):
 
 
 def drive_shielded(driver: Driver, worlds: Worlds, task: Task, **settings: Any) -> Shielded:
-    """Let a copy of ``driver`` behind a step shield drive in every world, and return the results.
+    """Drive in every world with a copy of ``driver`` behind a step shield, and return the results.
 
     Args:
         driver: an agent or a team.

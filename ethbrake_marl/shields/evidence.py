@@ -36,7 +36,7 @@ class Review(NamedTuple):
     trusted: Bools  # [m] whether the world behaved as the shield predicted
 
     def share(self, verdict: str) -> float:
-        """Return the fraction of interventions with this ``verdict`` (one of ``VERDICTS``); 0 if there are none."""
+        """Return the fraction of interventions with ``verdict`` (one of ``VERDICTS``); 0 without interventions."""
         return float((self.verdict == verdict).mean()) if self.verdict.size else 0.0
 
 

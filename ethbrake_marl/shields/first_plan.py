@@ -4,7 +4,9 @@ For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled op
 the one of the following plans that does the least harm:
 
 - All vehicles brake fully.
-- One vehicle repeats its action of E-V2X-BM while the others brake fully.
+
+- One vehicle repeats the action of E-V2X-BM while the others brake fully.
+
 - All vehicles repeat the actions that a coordinate descent over the vehicles finds; it starts from the best of the
   other plans.
 """

@@ -32,7 +32,7 @@ class StepGuard(ShieldGuard):
             caller gives no action.
         shield: the shield of the engine's learners, before any episode.
         mode: mode of the shield; the infos report the number of the mode.
-        where: name of the function or class that the user called, with which error messages begin.
+        where: name with which error messages begin: the function or class that the user called.
         shares: whether the infos contain the harm that each vehicle bears; if the shield has a cap, they always contain
             this harm.
         later_rollouts: whether a rollout of the policy from a later decision on may certify an action.
@@ -86,8 +86,8 @@ class StepGuard(ShieldGuard):
         Args:
             running: the engine before the step.
             memory: memory of the guard.
-            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave that learner no action; the
-                policy of this learner then proposes. A single NaN is an invalid action and is never applied.
+            proposed: proposed actions, [n, L]. A column of NaN means that the caller gave no action for the learner of
+                this column; the learner's policy then proposes. A single NaN is an invalid action and is never applied.
 
         """
         shield: StepShield = memory.shield
@@ -110,9 +110,9 @@ class StepGuard(ShieldGuard):
         """Compare the worlds after the step with the shield's prediction; return the guard's memory.
 
         ``ruling`` is the decision that was applied. ``after`` is the engine after the step. Raises ``UncertifiedStep``
-        if a world differs from the prediction. If the shield may assume wrong worlds (``told``), a world that differs
-        from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed are not
-        compared.
+        if a world differs from the prediction. If the shield assumes the worlds ``told``, which may be wrong, a world
+        that differs from the prediction becomes distrusted, and no error is raised. Worlds in which the physics failed
+        are not compared.
         """
         memory: Guarded = ruling.memory
         shield: StepShield = memory.shield

@@ -85,7 +85,7 @@ def take_step(world: Members, m: int, state: Floats, step: int, action: Floats, 
     """Advance one possible world by one decision, and save its new state.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         m: index of the possible world to advance.
         state: present state of this possible world, [S].
         step: number of the present decision.
@@ -116,7 +116,7 @@ def take_steps(
     A possible world whose episode has ended keeps its state.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
@@ -197,7 +197,7 @@ def follow_plan(world: Members, m: int, state: Floats, ended: bool, step: int, p
     The harm equals the engine's harm to the bit, because both are computed with the same operations.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         m: index of the possible world to simulate.
         state: present state of this possible world, [S].
         ended: whether the episode has ended in this possible world.
@@ -231,7 +231,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
     """Return the largest harm of a plan over the possible worlds of one world, m2/s2.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
@@ -259,7 +259,7 @@ def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int,
     The time until the horizon is simulated at once, not decision by decision. Returns infinity if the physics fails.
 
     Args:
-        world: parameters of the M possible worlds of one world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         m: index of the possible world to simulate.
         state: present state of this possible world, [S].
         ended: whether the episode has ended in this possible world.

@@ -47,7 +47,7 @@ class ShieldOptions:
         shares: whether ``infos`` contains the harm that each vehicle bears under the current plan and under the
             constant actions of least harm; with a ``cap`` the infos always contain this harm. ``shares=True`` slows a
             step by a few percent, and is not allowed in mode ``episode``.
-        where: name of the function or class that the user called, with which error messages begin.
+        where: name with which error messages begin: the function or class that the user called.
 
     Raises ``InvalidInput`` for an invalid setting, and ``UnknownName`` for an unknown mode.
 
@@ -69,8 +69,7 @@ class ShieldOptions:
     where: str = field(default="shield", compare=False)
 
     def __new__(cls, mode: str | None = None, **settings: Any) -> ShieldOptions:
-        """Create an instance of the settings class of ``mode``; if it lacks a setting, of the first class with all
-        settings.
+        """Create an instance of the first class that has all ``settings``; the class of ``mode`` is tried first.
 
         ``ShieldOptions(mode, setting=...)`` thus accepts the settings of every installed mode.
         """
@@ -169,7 +168,7 @@ def misplaced(name: str, value: object, mode: str, takers: list[str], where: str
         value: value of the setting.
         mode: the mode that does not accept the setting.
         takers: modes that accept the setting.
-        where: name of the function or class that the user called, with which the message begins.
+        where: name with which the message begins: the function or class that the user called.
 
     """
     return InvalidInput(f"{where}: {name} = {value!r}: not a setting of mode {mode}; use mode {' or '.join(takers)}")

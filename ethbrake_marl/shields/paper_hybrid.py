@@ -47,7 +47,7 @@ class HybridAgent(AgentAround):
         harm_count: which harm is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
 
     The memory contains ``chosen_policy`` [n], true where the policy drives; the compared harms ``policy_harm`` [n] and
-    ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of the two. Raises ``InvalidInput`` for an unknown
+    ``bound_harm`` [n]; and ``predicted_harm`` [n], the lower of these two harms. Raises ``InvalidInput`` for an unknown
     ``bound`` or ``harm_count``, and if ``policy`` is not an agent.
 
     """
@@ -128,7 +128,7 @@ class EpisodeGuard(ShieldGuard):
     Args:
         engine: the engine that gets this guard.
         hybrid: the agent that chooses the driver at the alert, and then returns the driver's commands.
-        where: name of the function or class that the user called, with which error messages begin.
+        where: name with which error messages begin: the function or class that the user called.
 
     """
 

@@ -94,8 +94,8 @@ def certify_rollouts(
 
     In each world one plan is tried: the proposal, clipped to [-1, 1], followed by the policy's actions in a simulation
     from the next state on. If this plan stays within the budget and the caps, it becomes the backup, and the proposal
-    is accepted. If not, the reason stays ``NO_CERTIFICATE``. A vehicle whose proposal is NaN executes its planned
-    action.
+    is accepted. If the plan exceeds the budget or a cap, the reason stays ``NO_CERTIFICATE``. A vehicle whose proposal
+    is NaN executes its planned action.
 
     Args:
         running: the n episodes of the whole batch.
@@ -208,7 +208,7 @@ def proposed_action(policy: Agent, worlds: Worlds, memory: Memory, vehicle: int)
 class _Rounded(AgentAround):
     """Policy whose commands are converted to actions and back, as in a plan.
 
-    ``memory["action"]`` contains its last actions.
+    ``memory["action"]`` contains the last actions of the policy.
     """
 
     def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Memory:

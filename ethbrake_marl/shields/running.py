@@ -53,11 +53,11 @@ class Running(NamedTuple):
         return Decisions(clock[:, CLOCK.START], clock[:, CLOCK.TIME_STEP]).at(self.steps)
 
     def rows_of(self, worlds: Ints) -> Ints:
-        """Return the row indices of all possible worlds of the worlds ``worlds`` (indices), [len(worlds) * M]."""
+        """Return the row indices of all possible worlds of the worlds with indices ``worlds``, [len(worlds) * M]."""
         return np.asarray((worlds[:, np.newaxis] * self.members + np.arange(self.members)).ravel(), np.int64)
 
     def take(self, worlds: Ints) -> Running:
-        """Return the episodes of only the worlds ``worlds`` (indices), with all their possible worlds."""
+        """Return only the episodes of the worlds with indices ``worlds``, with all their possible worlds."""
         return self._select(self.rows_of(worlds), worlds)
 
     def nominal(self) -> Running:

@@ -9,21 +9,26 @@ rest or at the scenario's horizon. The claim does not cover anything that happen
 ``c`` be the harm of the plan: the harm of the whole episode if the plan is executed from the present state. ``c``
 includes the harm so far. In the first-impact count, ``c`` leaves out further impacts of pairs that already had an
 impact. The function ``members.follow_plan`` computes ``c``. ``follow_plan`` simulates the plan decision by decision,
-with the same floating-point operations as the engine's step, in the same order. It adds up the harm in the same order,
-too. Hence:
+with the same floating-point operations as the engine's step, in the same order. ``follow_plan`` also adds up the harm
+in the same order as the engine. Hence:
 
 1. *Start.* At the first decision ``c = B``.
+
 2. *A proposal is applied* only if the harm of some plan from the next state on is at most the budget. ``follow_plan``
    computes the harm of this new plan from exactly the next state. The new plan becomes the shield's plan, and its harm
    becomes ``c``. If the proposal equals the planned action, the plan and ``c`` stay the same, because a new simulation
    would repeat the same operations.
+
 3. *Otherwise the planned action is applied.* When ``follow_plan`` computed ``c``, its simulation passed through the
    state after the planned action. So from this state on, the rest of the plan again has the harm ``c``, to the last
    bit. A plan with less harm may replace the rest of the plan.
+
 4. *End.* When the episode ends, no action is left to execute, and ``c`` is the harm of the episode.
 
 The *budget* is the largest harm that a new plan may have: ``c``, or any value from ``c`` to ``B``. Hence ``c <= B`` at
-every decision. ∎ The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode and
+every decision. ∎
+
+The proof needs no tolerance: as long as the engine behaves as predicted, the harm of the episode and
 the last bound are the same floating-point number.
 
 **Several vehicles.** With several shielded vehicles, each action in the proof is an array with one action per shielded
@@ -71,8 +76,8 @@ Cap = Literal["baseline"]  # plan that sets the caps: a vehicle may bear at most
 class StepShield:
     """Bound the harm of a batch of episodes: call ``begin`` when episodes start and ``decide`` before every step.
 
-    ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If one of them raises an error,
-    the old memory remains. A copy of the shield by ``copy.copy`` is independent of the original.
+    ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If one of these methods raises
+    an error, the shield keeps its old memory. A copy of the shield by ``copy.copy`` is independent of the original.
 
     At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. If
     ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises, and
@@ -82,12 +87,12 @@ class StepShield:
     At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs from its
     prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked in
     ``memory.distrusted`` [n], and its bound no longer holds. In a distrusted world the shield ignores proposals for the
-    rest of the episode. It applies the rest of the plan or the best constant action, whichever does less harm, and
-    chooses between the two again whenever the world differs from the prediction. If an episode goes on after its
-    predicted end, the shielded vehicles brake fully.
+    rest of the episode, and applies the rest of the plan or the best constant action, whichever does less harm. The
+    shield repeats this choice whenever a distrusted world again differs from the prediction. If an episode goes on
+    after its predicted end, the shielded vehicles brake fully.
 
     If ``begin`` gets several ``possible`` worlds for each world, each harm is the largest harm over these possible
-    worlds. Each observed number must then lie within the range of its predictions in the possible worlds.
+    worlds. Each observed number must then lie within the range of its predictions in these possible worlds.
 
     Args:
         scenario: the scenario of all worlds.
@@ -95,7 +100,7 @@ class StepShield:
         harm_count: which harm is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: amount by which the bound is loosened until the episode ends, m2/s2.
         others: scripts of the unshielded vehicles (vehicle index -> script); each script must fix its commands at the
-            alert. None: the scenario's scripts.
+            alert. If ``others`` is None, the scenario's scripts drive.
         cap: with ``baseline``, no vehicle bears more harm than under the constant actions of least harm; None: only the
             harm summed over all vehicles is bounded.
         logging: whether ``log`` lists the interventions (replaced actions).
@@ -204,8 +209,8 @@ class StepShield:
             worlds: worlds of the new episodes at the alert, as the shield assumes them (the true worlds may differ).
             rows: indices of the batch rows in which the new episodes start.
             policy: policy that proposes actions, or vehicle index -> policy for several vehicles. The policy is
-                simulated from the alert; in worlds where it does less harm than the best constant actions, its harm is
-                the bound. If ``policy`` is None, the bound is the harm of the best constant actions.
+                simulated from the alert; in worlds where the policy does less harm than the best constant actions, the
+                policy's harm is the bound. If ``policy`` is None, the bound is the harm of the best constant actions.
             possible: the M possible worlds of each world (the world itself first), [len(rows) * M]; None: the result of
                 ``members_of(worlds)``.
 
@@ -334,8 +339,8 @@ class StepShield:
         Args:
             proposed: proposed actions, [n], or [n, K] for several vehicles; clipped to [-1, 1]. Where the proposal is
                 NaN, the planned action is applied.
-            seen: the observed worlds, which are compared with the prediction; the first columns of ``Running.states``,
-                [n, columns]. If ``seen`` is None, nothing is compared.
+            seen: the observed worlds, with the first columns of ``Running.states``, [n, columns]; they are compared
+                with the prediction. If ``seen`` is None, nothing is compared.
             only: true for the worlds in which to decide, [n]; the other worlds stay unchanged. If ``only`` is None, the
                 shield decides in all worlds whose episode has not ended.
             proposer: the policies that propose. If no other plan certifies a proposal, the shield simulates the

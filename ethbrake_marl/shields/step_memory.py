@@ -41,7 +41,7 @@ class StepMemory(NamedTuple):
 
         ``begun`` is the memory of the new episodes, in the order of ``rows``. Only ``begun.enclosure`` contains all
         rows of the batch. If there are at least as many new episodes as rows in the batch, the new episodes replace the
-        whole batch. Episode numbers continue.
+        whole batch. Each new episode gets a higher number than the old episode in its row.
         """
         old, new = self.running, begun.running
         assert new is not None

@@ -96,8 +96,8 @@ class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations
     ) -> tuple[dict[str, Observations], dict[str, dict[str, Any]]]:
         """Start an episode; return the observations and infos of the agents.
 
-        ``seed`` and ``options`` are passed to the environment. ``infos[agent]["shield_bound_harm"]`` is the harm that
-        the agent's episode will not exceed (m2/s2).
+        ``seed`` and ``options`` are passed to the environment. ``infos[agent]["shield_bound_harm"]`` is the shield's
+        bound on the harm of the episode, m2/s2.
         """
         self.attached.check_open()
         result: tuple[dict[str, Observations], dict[str, dict[str, Any]]] = super().reset(seed=seed, options=options)
@@ -168,8 +168,8 @@ class ShieldedEnv(
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode; return observation and info.
 
-        ``seed`` and ``options`` are passed to the environment. ``info["shield_bound_harm"]`` is the harm that the
-        episode will not exceed (m2/s2).
+        ``seed`` and ``options`` are passed to the environment. ``info["shield_bound_harm"]`` is the shield's bound on
+        the harm of the episode, m2/s2.
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
@@ -193,7 +193,7 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     """``EthBrakeVectorEnv`` behind a shield, by default in mode ``step``, which certifies or replaces each action.
 
     In a row where a new episode has just started, ``infos["shield_bound_harm"]`` and the other infos describe the new
-    alert. In this row ``infos["final_info"]`` describes the last step of the old episode.
+    alert. ``infos["final_info"]`` describes the last step of the old episode in this row.
 
     Args:
         env: an ``EthBrakeVectorEnv``, or a wrapper around it.
@@ -226,8 +226,8 @@ class ShieldedVectorEnv(_Closing, VectorWrapper):
     ) -> tuple[Observations, dict[str, Any]]:
         """Start an episode in every row; return observations [rows, F] and infos.
 
-        ``seed`` and ``options`` are passed to the environment. ``infos["shield_bound_harm"]`` [rows] is the harm that
-        each episode will not exceed (m2/s2).
+        ``seed`` and ``options`` are passed to the environment. ``infos["shield_bound_harm"]`` [rows] contains the
+        shield's bound on the harm of each episode, m2/s2.
         """
         self.attached.check_open()
         result = self.env.reset(seed=seed, options=options)
