@@ -52,10 +52,10 @@ NEARLY = 1e-9
 
 @compiled(apart=True)
 def best_constant(world: Members, states: Floats, ended: Bools, step: int, constants: Floats) -> tuple[int, float]:
-    """Return the index (in ``constants``) of the constant action of least harm, and its harm, m2/s2.
+    """Return the index (in ``constants``) of the action that does the least harm, and its harm, m2/s2.
 
     The harm of a constant action is the largest harm over the possible worlds if the action is held from now to the
-    horizon. The time until the horizon is simulated at once, not decision by decision.
+    horizon. The time until the horizon is simulated in one go, not decision by decision.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).
@@ -358,7 +358,7 @@ def descend_constants(running: Running, grid: Floats, rounds: int, action: Float
 
     For one vehicle after the other, the vehicle's action is replaced by the action in ``grid`` that does the least harm
     while the other vehicles keep their actions. Each tried action is held to the horizon, and the time until the
-    horizon is simulated at once, not decision by decision.
+    horizon is simulated in one go, not decision by decision.
 
     Args:
         running: the episodes, n worlds with exactly one possible world each.

@@ -61,7 +61,7 @@ class ShieldMode(IntEnum):
 
 
 class Guarded(NamedTuple):
-    """Memory of a guard for n episodes. A guard is the part of an engine that certifies or replaces actions."""
+    """Memory of a guard (``ShieldGuard``) for n episodes."""
 
     shield: Any  # the shield of the mode, with a method ``take(rows)``; in mode ``episode`` the HybridAgent's memory
     policies: dict[int, Memory]  # index of a shielded vehicle -> memory of its policy; empty without policies
@@ -83,7 +83,7 @@ class Guarded(NamedTuple):
 
 
 class ShieldGuard(ABC):
-    """Base class of the guards of all modes: the part of an engine that certifies or replaces the learners' actions.
+    """Base class of all guards. A guard is the part of an engine that certifies or replaces the learners' actions.
 
     A subclass implements ``decide`` (choose the applied actions), ``_started`` (start episodes) and ``tell`` (compute
     the infos). A subclass may also override ``check`` (compare the world after the step with the prediction) and

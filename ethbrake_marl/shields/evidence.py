@@ -43,8 +43,8 @@ class Review(NamedTuple):
 def review(shield: StepShield, policy: Driver, worlds: Worlds) -> Review:
     """Compare each intervention with the same episode in which ``policy`` drives unshielded from that decision on.
 
-    An intervention is *needed* if the harm without it is higher than the harm with it, *costly* if the harm without it
-    is lower, and *harmless* if the harm is the same. The episode with the interventions is also simulated again, so
+    An intervention is *needed* if the episode without it does more harm, *costly* if the episode without it does less
+    harm, and *harmless* if both episodes do equal harm. The episode with the interventions is also simulated again, so
     that both harms are computed in ``worlds``, even if the shield assumed other worlds.
 
     Args:

@@ -1,4 +1,4 @@
-"""The first plan of a step shield at the alert: the constant actions of least harm.
+"""The first plan of a step shield at the alert: the constant actions that do the least harm.
 
 For one shielded vehicle the plan repeats the action of E-V2X-BM (the coupled optimum). For several vehicles the plan is
 the one of the following plans that does the least harm:

@@ -256,7 +256,7 @@ def worst_of_plan(world: Members, states: Floats, ended: Bools, step: int, plan:
 def hold_constant(world: Members, m: int, state: Floats, ended: bool, step: int, constants: Floats, c: int) -> float:
     """Return the harm in one possible world if a constant action is held to the horizon, m2/s2.
 
-    The time until the horizon is simulated at once, not decision by decision. Returns infinity if the physics fails.
+    The time until the horizon is simulated in one go, not decision by decision. Returns infinity if the physics fails.
 
     Args:
         world: parameters of the M possible worlds that the shield considers for one world (``Members``).

@@ -229,7 +229,7 @@ class StepShield:
         self.memory = self.memory.put(rows, self._begun(worlds, rows, policy, possible))
 
     def members_of(self, worlds: Worlds) -> Worlds:
-        """Return the M possible worlds of each of n worlds at the alert, as n * M worlds.
+        """Return the M possible worlds of each of n worlds at the alert, as one batch of n * M worlds.
 
         In this class M is 1: the only possible world is the world itself. A subclass may return several possible worlds
         for each world.

@@ -42,8 +42,8 @@ class _Closing:
 class HybridShield(_Closing, SeededInside, BaseParallelWrapper[str, Observations, NDArray[Any]]):  # type: ignore[misc]  # PettingZoo is untyped
     """Shield all learners of a parallel environment.
 
-    Mode ``step``, the default, certifies or replaces the actions of all learners together. In mode ``episode``, the
-    paper's Algorithm 1, the policy or E-V2X-BM drives the whole episode, whatever actions are proposed. The bounds hold
+    Mode ``step`` (the default) certifies or replaces the actions of all learners together. In mode ``episode`` (the
+    paper's Algorithm 1) the policy or E-V2X-BM drives the whole episode, whatever actions are proposed. The bounds hold
     as long as the other vehicles follow their scripts. ``infos[agent]`` reports each decision under ``shield_reason``
     and other ``shield_...`` keys. See docs/shield.md.
 
