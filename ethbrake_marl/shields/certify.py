@@ -213,7 +213,7 @@ def decide_world(
     part of the plan before the next vehicle's proposal is tried.
 
     Args:
-        world: the M possible worlds of this world (``Members``).
+        world: parameters of the M possible worlds that the shield considers for one world (``Members``).
         states: present state of each possible world, [M, S], in the layout of ``Running.states``.
         ended: whether the episode has ended in each possible world, [M].
         step: number of the present decision.
@@ -338,8 +338,8 @@ def ends_of_plans(running: Running, plans: Floats, rests: Bools, borne: Floats) 
     """Simulate the ``plans`` [n, L, K] from now on and report how the episodes end.
 
     ``running`` contains n worlds, each with M possible worlds. The results are written into two arrays. ``rests`` [n]:
-    whether all vehicles come to rest before the horizon and stay at rest, in every possible world of the world.
-    ``borne`` [n * M, N]: the harm that each vehicle bears in the whole episode, m2/s2 (0 for an obstacle ahead).
+    whether all vehicles come to rest before the horizon and stay at rest, in every possible world. ``borne`` [n * M,
+    N]: the harm that each vehicle bears in the whole episode, m2/s2 (0 for an obstacle ahead).
     """
     n, every = running.steps.shape[0], all_members(running)
     M = running.states.shape[0] // max(n, 1)

@@ -20,9 +20,9 @@ class ShieldedDriver(ByPolicy):
     """An agent or a team behind a shield that certifies every action: mode ``step``, or a mode of an extension.
 
     At the alert the policy is simulated to the end of the episode. In worlds where the policy does at most the harm of
-    E-V2X-BM, the policy drives without interventions, and its harm is the bound. In all other worlds each proposed
-    action must be certified: by the rest of the plan, by a constant action, or by a rollout, which simulates the policy
-    from the state after the action. The shield decides on all proposals of a team together.
+    E-V2X-BM, the policy drives without interventions, and the policy's harm is the bound. In all other worlds each
+    proposed action must be certified: by the rest of the plan, by a constant action, or by a rollout, which simulates
+    the policy from the state after the action. The shield decides on all proposals of a team together.
 
     Args:
         policy: the agent or team that proposes.

@@ -79,10 +79,10 @@ class StepShield:
     ``begin`` and ``decide`` replace ``memory`` as a whole and change no array in place. If one of these methods raises
     an error, the shield keeps its old memory. A copy of the shield by ``copy.copy`` is independent of the original.
 
-    At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. If
-    ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises, and
-    covers the time up to the scenario's horizon. ``memory.settles`` [n] says for each world whether all vehicles are at
-    rest at the horizon under the first plan.
+    At the alert the bound is the harm of E-V2X-BM's constant deceleration, executed decision by decision. In worlds
+    where ``policy``, simulated from the alert, does less harm, the bound is the policy's harm. The bound never rises,
+    and covers the time up to the scenario's horizon. ``memory.settles`` [n] says for each world whether all vehicles
+    are at rest at the horizon under the first plan.
 
     At each decision the observed worlds are compared with the prediction, bit by bit. If a world differs from its
     prediction (a vehicle brakes beyond its capacity, a number is NaN, a message is missing), this world is marked in
