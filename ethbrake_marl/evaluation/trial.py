@@ -73,16 +73,17 @@ def load_runnable(
 def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     """Simulate ``worlds`` of a scenario, and count the worlds in which something unusual happens.
 
-    Learners brake fully; the other vehicles follow their scripts. Scripts that search try only a few candidates, to
-    save time. The result has these keys:
+    Learners brake fully; the other vehicles follow their scripts. To save time, scripts that search for good commands
+    try only a few commands. The result has these keys:
 
     - ``early_impacts``: number of worlds with an impact before a learner may act;
     - ``moving_at_horizon``: number of worlds in which a vehicle still moves at the horizon;
     - ``vehicle_1_late``: number of worlds in which Vehicle 1 has a latency;
-    - ``commands_out_of_range``: name of a vehicle -> row of a world -> error message, where a script commanded more
-      than the vehicle's capacity;
+    - ``commands_out_of_range``: name of a vehicle -> row of a world in which its script commanded more than the
+      vehicle's capacity -> error message;
     - ``not_state_free``: name of a vehicle -> its script, for scripts that react to the state of the world;
-    - ``refused_by``: name of an agent, shield or setting that refuses such scripts -> error message.
+    - ``refused_by``: name of an agent, shield or setting that refuses scripts that react to the state of the world ->
+    error message.
 
     Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds in which the physics fails.
     """
@@ -130,9 +131,9 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Try all agents, shields and settings on ``worlds``, and return the error message of each that fails.
+    """Try agents, shields and a setting on ``worlds``, and return the error message of each that refuses the scenario.
 
-    The keys of the result are specs of agents, ``+SHIELD`` for shields, and names of settings.
+    A key of the result is the spec of an agent, ``+`` and the name of a shield, or ``early_impacts: reject``.
     """
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:
