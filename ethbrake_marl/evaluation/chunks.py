@@ -131,8 +131,8 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every Python file and weights file whose path stands in an agent's spec or a measure's
-        name.
+        """Return the SHA-256 of every Python file and weights file whose path an agent's spec or a measure's name
+        contains.
         """
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]

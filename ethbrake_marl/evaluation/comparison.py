@@ -56,9 +56,7 @@ class Comparison:
 
     @property
     def exploits_line(self) -> str:
-        """Sentence that says which agents have exploits, and in which of the two results; "" if no agent has
-        exploits.
-        """
+        """Sentence that says which agents have exploits in which of the two results; "" if no agent has exploits."""
         of_agents: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits

@@ -106,9 +106,7 @@ class ShieldModes(list[ModeRow]):
         return [about | row.to_json() for row in self]
 
     def sheets(self) -> list[Sheet]:
-        """Return tables for a terminal: harm of each agent and mode; for teams also the harm that each vehicle
-        bears.
-        """
+        """Return tables for a terminal: harm of each agent in each mode; for teams also each vehicle's harm."""
         share, teams = partial(Column, digits=1, scale=100.0, unit=" %"), self.of_teams
         head = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
         head += [Column("minus no shield" if teams else "minus episode mode", sign="+")]

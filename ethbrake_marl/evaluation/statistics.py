@@ -140,9 +140,7 @@ class Moments:
 
     @property
     def mean(self) -> float:
-        """Mean of the values, computed exactly and then rounded. Raises ``ZeroDivisionError`` if there are no
-        values.
-        """
+        """Mean of the values, computed exactly and then rounded. Without values, ``ZeroDivisionError`` is raised."""
         return float(self.total / self.count)
 
     @property
@@ -161,7 +159,7 @@ class Moments:
 
     @property
     def estimate(self) -> Estimate:
-        """Mean with its t interval (see the function ``mean``). Raises ``ZeroDivisionError`` if there are no values."""
+        """Mean with its t interval (see the function ``mean``). Without values, ``ZeroDivisionError`` is raised."""
         estimate = self._around(self.mean, self.standard_error if self.independent > 1 else 0.0)
         return estimate if self.negative else of_amounts(estimate, nothing=not self.squares)
 
@@ -189,11 +187,11 @@ class Moments:
     def ratio_error(self, others: Moments, products: Fraction) -> float:
         """Return the standard error of ``r = mean(values) / mean(others)``, paired by world, by the delta method.
 
-        The residuals ``values - r * others`` have mean 0, so the error is ``std(residuals) / (sqrt(n) *
-        abs(mean(others)))``. The square of the error is ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``,
-        where n is the number of values, x are the values, y are the others, Sx and Sy are their sums, and Qxx, Qxy and
-        Qyy are the sums of x x, x y and y y. With clusters, n is the number of clusters, and x and y are the sums of
-        values and others in each cluster.
+        The residuals ``values - r * others`` have mean 0, so the error is
+        ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of the error is
+        ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where n is the number of values, x are the
+        values, y are the others, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of x x, x y and y y. With
+        clusters, n is the number of clusters, and x and y are the sums of values and others in each cluster.
 
         Args:
             others: moments of ``others``, the values in the denominator, in the same worlds.
@@ -257,9 +255,9 @@ def root(number: Fraction) -> float:
 def rate(successes: int, count: int) -> Estimate:
     """Return the share ``p = successes / count`` with Wilson's score interval, which lies within [0, 1].
 
-    The interval has the centre ``(p + z^2/2n) / (1 + z^2/n)`` and the half-width ``z / (1 + z^2/n) sqrt(p (1 - p) / n +
-    z^2/4n^2)``, where n is ``count``, and z the quantile of the normal distribution. Raises ``InvalidInput`` unless 0
-    <= successes <= count and count >= 1.
+    The interval has the centre ``(p + z^2/2n) / (1 + z^2/n)`` and the half-width
+    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``, where n is ``count``, and z the quantile of the normal
+    distribution. Raises ``InvalidInput`` unless 0 <= successes <= count and count >= 1.
     """
     if not (count >= 1 and 0 <= successes <= count):
         raise InvalidInput(
@@ -332,9 +330,9 @@ def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> 
     """Return the difference ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
     The standard errors s1 and s2 of the two means are computed from their t intervals: each is half of the interval's
-    width, divided by the quantile of the t distribution. The difference has the standard error ``s = sqrt(s1^2 +
-    s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two means has no
-    interval, the difference has no interval either.
+    width, divided by the quantile of the t distribution. The difference has the standard error
+    ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two
+    means has no interval, the difference has no interval either.
 
     Args:
         value: mean from which the baseline is subtracted, with its interval.
@@ -395,9 +393,7 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
 
 
 def _check_pair(values: Floats, baseline: Floats, clusters: Texts | None) -> tuple[Moments, Moments, Fraction]:
-    """Return the moments of ``values`` and of ``baseline``, and the exact sum over all worlds of ``value *
-    baseline``.
-    """
+    """Return the moments of ``values`` and of ``baseline``, and the exact sum of the products ``value * baseline``."""
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(

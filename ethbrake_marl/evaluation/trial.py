@@ -83,7 +83,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
       vehicle's capacity -> error message;
     - ``not_state_free``: name of a vehicle -> its script, for scripts that react to the state of the world;
     - ``refused_by``: name of an agent, shield or setting that refuses scripts that react to the state of the world ->
-    error message.
+      error message.
 
     Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds in which the physics fails.
     """

@@ -49,7 +49,8 @@ class TrainingState(NamedTuple):
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
     """Write ``state`` as a checkpoint to a new ``folder``, and delete all but the two newest checkpoints.
 
-    If the write fails, no incomplete checkpoint is left: all bytes are on the disk before the folder gets its name.
+    If writing fails, no incomplete checkpoint is left behind, because the folder gets its name only after all bytes are
+    on the disk.
     """
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in state.arrays.items()}
     with new_folder(folder) as partial:
@@ -104,7 +105,7 @@ def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
 
 
 def checkpoint_folders(folder: Path) -> list[Path]:
-    """Return the folders of all checkpoints inside ``folder``, newest first. Their content is not checked."""
+    """Return the folders of all checkpoints inside ``folder``, newest first; the checkpoints are not checked."""
     folders = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
     return sorted(folders, reverse=True)
 

@@ -64,7 +64,7 @@ class PpoRecipe(TrainingRecipe):
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the training has fewer updates than all learners together have turns."""
+        """Raise ``InvalidInput`` if the training has fewer updates than all learners together have turns to learn."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
@@ -86,7 +86,7 @@ class SquashedShape(Shape):
 
         Args:
             observation_size: number of features of an observation.
-            more: further fields of ``NetworkSpec``.
+            more: further fields of the returned ``NetworkSpec``.
 
         """
         return super().spec(observation_size, output="tanh", **more)
@@ -144,7 +144,9 @@ class SacRecipe(TrainingRecipe):
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """Return ``{"update_ratio": ...}``, the number of gradient steps per decision, for ``config.json``."""
+        """Return ``{"update_ratio": ...}``, the number of gradient steps per decision, which ``config.json``
+        records.
+        """
         return {"update_ratio": self.update_ratio}
 
 
