@@ -131,9 +131,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every Python file and weights file whose path an agent's spec or a measure's name
-        contains.
-        """
+        """Return the SHA-256 of every Python file and weights file that a spec or the name of a measure contains."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]

@@ -59,7 +59,7 @@ def evaluate(
 ) -> Evaluation:
     """Let each agent drive every world once, from the alert to the end of the episode.
 
-    Vehicles that no agent controls follow the scenario's scripts. The outcome in a world does not depend on the other
+    Vehicles that no agent controls follow the scenario's scripts. The outcome in a world does not depend on other
     worlds. If the physics fails in a world with one agent, the world is left out for all agents (``left_out``).
 
     Args:

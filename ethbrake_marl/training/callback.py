@@ -117,8 +117,7 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights as policies into ``course``, unless ``course`` already has the weights of this
-        update.
+        """Copy the current weights as policies into ``course``, unless it already has the weights of this update.
 
         Raises ``TrainingDiverged`` if a weight is not finite.
         """

@@ -1,4 +1,4 @@
-"""Checkpoint of a training between two updates: a folder with arrays and JSON, written atomically."""
+"""Checkpoint of a training run between two updates: a folder with arrays and JSON, written atomically."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MOST_CHECKPOINTS = 2  # number of checkpoints to keep; if the newest is damaged,
 
 
 class TrainingState(NamedTuple):
-    """State of a training between two updates, from which the training continues as if it had not stopped."""
+    """State of a training run between two updates, from which the training continues as if it had not stopped."""
 
     numbers: dict[str, Any]  # counters, settings and log, as plain data for JSON
     arrays: Arrays  # weights, optimiser states, environment and random generators, by name

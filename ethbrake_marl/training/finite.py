@@ -1,4 +1,4 @@
-"""Checks that stop a training if an observation, a reward, a loss, a gradient or a weight is not finite."""
+"""Checks that stop a training run if an observation, a reward, a loss, a gradient or a weight is not finite."""
 
 from __future__ import annotations
 

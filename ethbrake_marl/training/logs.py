@@ -1,4 +1,4 @@
-"""Logs of a training, which are ``progress.csv`` and TensorBoard events."""
+"""Logs of a training run, which are ``progress.csv`` and TensorBoard events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Build the environment and the model of a training, and create policies from the model's weights."""
+"""Build the environment and the model of a training run, and create policies from the model's weights."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Learner(NamedTuple):
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """Build the vectorised environment for a training, with one row for each learner in each world."""
+    """Build the vectorised environment for a training run, with one row for each learner in each world."""
     recipe = training.recipe
     appended: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
     return make_sb3_vec_env(
@@ -52,7 +52,7 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
-    """Build the model of a training. The optimisers raise ``TrainingDiverged`` for gradients that are not finite.
+    """Build the model of a training run. The optimisers raise ``TrainingDiverged`` for gradients that are not finite.
 
     Args:
         algorithm: the learning algorithm that the recipe names.

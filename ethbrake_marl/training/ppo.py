@@ -22,7 +22,7 @@ class Ppo(Algorithm):
     """Algorithm PPO: one policy for all learners (optionally with a central critic), or one policy per learner."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
-        """Return a new PPO model for a training, which learns in ``environment``.
+        """Return a new PPO model for a training run, which learns in ``environment``.
 
         The training's scheme decides whether the model has a shared policy, a central critic, or one policy for each
         learner.

@@ -1,4 +1,4 @@
-"""``Course``: last policy, best policy and evaluations of a training so far."""
+"""``Course``: last policy, best policy and evaluations of a training run so far."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``TrainingRecipe``: the settings of a training, read from a YAML file."""
+"""``TrainingRecipe``: the settings of a training run, read from a YAML file."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class EvaluationPlan(FileModel):
 
 
 class TrainingRecipe(FileModel):
-    """Settings of a training that all algorithms have: algorithm, reward, seed, checkpoints and measurements.
+    """Settings of a training run that all algorithms have: algorithm, reward, seed, checkpoints and measurements.
 
     An *update* is one round of collecting decisions and learning from them. Each algorithm has a subclass of this
     class, with further keys. The text in ``Field(description=...)`` explains a key in new recipe files, in the JSON
@@ -391,7 +391,7 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
         recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which also checks their YAML files.
         algorithm: class of the algorithm, a subclass of ``training.algorithm.Algorithm``, or the text
             ``"module:class"``. If the text is given, the module (and torch, whose import takes seconds) is imported
-            only when a training begins.
+            only when a training run begins.
 
     Raises ``InvalidInput`` for an invalid name or a class that lacks a required method, and ``AlreadyExists`` if
     another algorithm has the name.

@@ -144,9 +144,7 @@ class SacRecipe(TrainingRecipe):
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """Return ``{"update_ratio": ...}``, the number of gradient steps per decision, which ``config.json``
-        records.
-        """
+        """Return the number of gradient steps per decision as ``{"update_ratio": ...}``, for ``config.json``."""
         return {"update_ratio": self.update_ratio}
 
 

@@ -1,4 +1,4 @@
-"""``RunDirectory``: the folder of a run, which contains a training and its results."""
+"""``RunDirectory``: the folder of a run, which contains a training run and its results."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ class RunDirectory:
         ``harm_count``.
 
         Args:
-            evaluations: evaluations of a training (``TrainResult.evaluations``), or rows of ``progress.csv``.
+            evaluations: evaluations of a training run (``TrainResult.evaluations``), or rows of ``progress.csv``.
             harm_count: count of harm that the training minimises.
             prefix: prefix of the metrics' names in ``evaluations`` and in the result: ``eval/`` for rows of
                 ``progress.csv``.

@@ -1,4 +1,4 @@
-"""Train policies, or resume a training: build the model, learn, evaluate, save."""
+"""Train policies, or resume a training run: build the model, learn, evaluate, save."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Continue a training that was stopped or killed. The resulting policies are the same as without the stop.
+    """Continue a training run that was stopped or killed. The resulting policies are exactly the same as without the stop.
 
     The training continues from the newest undamaged checkpoint, or from the beginning if there is no such checkpoint.
     Log rows that were written after this checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about
@@ -192,7 +192,8 @@ def resume(
 def build(
     training: Training, run: RunDirectory, measure: Measure | None, stop_at: StopAt | None, on_progress: Told
 ) -> Iterator[RunCallback]:
-    """Context manager that builds environment and model of a training, and yields the callback to pass to ``learn``.
+    """Context manager that builds environment and model of a training run, and yields the callback to pass to
+    ``learn``.
 
     Inside the ``with`` block, Ctrl-C stops the training after the current update. At its end, the environment is
     closed, and the global random generators are restored.
@@ -311,8 +312,7 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
 def _newest_checkpoint(
     run: RunDirectory, training: Training, other_versions: bool
 ) -> tuple[TrainingState | None, list[str]]:
-    """Return the newest undamaged checkpoint (None if there is none), and error messages about damaged newer
-    checkpoints.
+    """Return the newest undamaged checkpoint (or None), and error messages about damaged newer checkpoints.
 
     Raises ``InvalidInput`` if the checkpoint belongs to another training, or if other versions of packages wrote it
     (unless ``other_versions``).
