@@ -1,4 +1,4 @@
-"""Two measurements taken while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+"""Two measurements that are made while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class AgentTally:
         """Return the fraction (0 to 1) of the worlds in which the true/false measure ``name`` is true.
 
         ``worlds`` is the number of worlds in the evaluation. The result is None if the measure has no value in one of
-        them.
+        these worlds.
         """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
@@ -58,7 +58,7 @@ class AgentTally:
         """Return the sum and the sum of squares of the numeric measure ``name``, and the number of its values.
 
         ``worlds`` is the number of worlds in the evaluation. The result is None if the measure has no value in one of
-        them.
+        these worlds.
         """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
@@ -122,7 +122,7 @@ def estimate_all(
 
     Args:
         tallies: sums of the measures of every agent, by the agent's name.
-        agent: name of the agent.
+        agent: name of the agent whose measures are estimated.
         worlds: number of worlds in the evaluation. The estimate of a measure is None if the measure has no value in one
             of these worlds.
         baseline: name of the agent with which ``agent`` is compared. If the baseline was not evaluated, all comparisons
@@ -178,7 +178,7 @@ def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
 
     Args:
         tally: sums of the agent's measures.
-        worlds: number of evaluated worlds.
+        worlds: number of worlds in the evaluation.
 
     """
 

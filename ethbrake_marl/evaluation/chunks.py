@@ -45,7 +45,7 @@ _BUILT: dict[str, Mapping[str, Driver]] = {}
 
 @dataclass(frozen=True, slots=True)
 class Lineup:
-    """Description of an evaluation's agents as plain data, from which every worker process builds the same agents.
+    """List of the agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
         agents: specs of the agents (``full_brake``, ``ppo+step``), as on the command line.
@@ -75,7 +75,7 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """Return a lineup of these agents, with a hash of their policies, the measures and the software versions.
+        """Return a lineup of these agents, with a hash of policies, measures and software versions.
 
         Every worker process computes this hash again, and refuses the lineup if the result differs (``make``).
 
@@ -180,7 +180,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome without the user measures (``Outcome.metrics``) that ``names`` does not list."""
+    """Return the outcome without those measures of the user (``Outcome.metrics``) that ``names`` does not list."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 

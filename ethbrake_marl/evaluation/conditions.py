@@ -33,7 +33,7 @@ _STAY = "\u00a0"  # a non-breaking space
 
 
 class Conditions(dict[str, Any]):
-    """Dictionary that describes how a result was obtained: scenario, seed, vehicles, scripts, quantities of the worlds.
+    """Dictionary that says how a result was obtained: scenario, seed, vehicles, scripts, and quantities of the worlds.
 
     ``of`` and ``of_ranges`` return a dictionary with only the quantities; ``of_test`` returns all of these entries.
     """

@@ -134,7 +134,7 @@ class Evaluation:
 
     @property
     def hidden(self) -> Bools:
-        """Whether the V2X channel hides something from a controlled vehicle, for each world, [n].
+        """For each world: whether the V2X channel hides something from a controlled vehicle, [n].
 
         The channel hides something if messages arrive late, only from time to time or not at all, if messages omit a
         quantity, or if another vehicle reacts later than its message says.
@@ -166,8 +166,8 @@ class Evaluation:
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as a dictionary: name of a column -> its values.
 
-        docs/evaluate.md lists the columns. Initial quantities have names such as ``gap_1_m``, ``speed_1_mps``,
-        ``latency_2_s`` and ``restitution``. A missing value is None.
+        docs/evaluate.md lists the columns. Columns of initial quantities have names such as ``gap_1_m``,
+        ``speed_1_mps``, ``latency_2_s`` and ``restitution``. A missing value is None.
 
         Args:
             objectives: objectives such as ``"social:45"``; each objective adds columns with its value for every
@@ -203,7 +203,7 @@ class Evaluation:
         return table
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
-        """Return the columns of ``per_world`` as arrays, by name.
+        """Return the columns of ``per_world`` as a dictionary: name of a column -> array of its values.
 
         A missing number is NaN, and a missing text is empty. ``objectives`` is the same argument as in ``per_world``.
         """

@@ -27,7 +27,8 @@ def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenari
         agents: agents or teams by name.
         worlds: worlds at the alert in which the agents are to drive.
         scenario: scenario whose learners the agents drive.
-        warn: also warn about policies that drive in worlds unlike their training worlds (``warn_unfamiliar``).
+        warn: whether to also warn about policies that drive in worlds unlike their training worlds
+            (``warn_unfamiliar``).
 
     """
     if warn:
@@ -66,8 +67,8 @@ def make_lineup(
         bare: whether to refuse agents with a shield, because the caller adds a shield. If the scenario has one learner,
             teams are also refused.
 
-    Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, or a team or shield that is refused.
-    Also raises the errors of ``make_agent``.
+    Raises ``InvalidInput`` for a repeated spec, for an uncertainty that is missing or unused, and for a team or shield
+    that is refused. Also raises the errors of ``make_agent``.
 
     """
     listed = split_specs(specs) if isinstance(specs, str) else specs

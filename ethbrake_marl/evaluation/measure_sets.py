@@ -1,8 +1,8 @@
 """Measures of an agent, and sets of measures: the base class, the registry, and the set of the core package.
 
 A measure computes one value per world from an agent's outcome. Measures that need the same information about the worlds
-form a set. Extensions add sets with entry points of the group ``ethbrake_marl.measure_sets``. Tables, JSON and files
-show the measures of every installed set.
+form a set. Extensions add sets by declaring entry points of the group ``ethbrake_marl.measure_sets``. Results tables,
+JSON results and files with one row per world show the measures of every installed set.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BASELINE = "full_brake"
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One measure of an agent. Tables show the mean of its values, or the fraction that is true if they are true/false.
+    """One measure of an agent. Tables show the mean of a measure, or how often a true/false measure is true.
 
     The field ``of`` is a function of the agent's outcome and of the context that ``MeasureSet.prepare`` returned. The
     function returns one value per world, [n], or None if the measure is not defined for this outcome. If the measure
@@ -64,7 +64,7 @@ class Measure:
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """Context of a set of measures that does not apply to an evaluation: measures in the set have no values."""
+    """Context of a set of measures that does not apply to an evaluation, and whose measures thus have no values."""
 
     because: str  # why the set does not apply: a clause for users, without capital and full stop
 
@@ -125,7 +125,7 @@ class MeasureSet:
         return {}
 
     def warnings(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return warnings about a results table, each a clause without capital and full stop; by default none.
+        """Return warnings about a results table, each a clause without capital letter and full stop; by default none.
 
         ``rows`` are the table's rows (``SummaryRow``, one per agent).
         """

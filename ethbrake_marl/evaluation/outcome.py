@@ -85,7 +85,7 @@ class Outcome:
 
     @property
     def collided(self) -> Bools:
-        """Whether at least one impact happened, for each world, [n]."""
+        """For each world: whether at least one impact happened, [n]."""
         return self.ledger.collided
 
     @property
@@ -119,7 +119,7 @@ class Outcome:
 
     @property
     def ended(self) -> NDArray[np.str_]:
-        """How each episode ended, ``at_rest`` or ``horizon``, [n]."""
+        """For each world: how the episode ended (``at_rest`` or ``horizon``), [n]."""
         return np.where(self.at_rest, "at_rest", "horizon")
 
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:

@@ -39,8 +39,8 @@ def write_per_world(
     Args:
         path: file to write, with the ending ``.csv`` or ``.parquet``.
         evaluation: outcomes of the agents.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md); each objective adds columns with its value
-            for every vehicle.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). For each objective the table has further
+            columns, with the value of the objective for each vehicle.
         force: whether to replace an existing file.
 
     Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` for a missing folder or another
@@ -71,8 +71,8 @@ Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impa
 def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
     """Read a file of ``write_per_world``: the harms of each agent in each world, and each world's recording.
 
-    The result is two dictionaries. The second one is empty if the file has no column ``recording``. Left-out worlds are
-    omitted.
+    The result is two dictionaries. The second dictionary is empty if the file has no column ``recording``. Left-out
+    worlds are omitted.
 
     Args:
         path: name of the file, whose ending decides the format. The file is not read, because ``data`` is its content.

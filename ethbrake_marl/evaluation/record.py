@@ -75,7 +75,7 @@ def record_episode(
 
     Args:
         world: the world at the alert, n = 1.
-        agent: agent or team. The object that you pass does not change.
+        agent: agent or team that drives the controlled vehicles. The object that you pass does not change.
         scenario: scenario of the world, whose scripts drive the other vehicles.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         sample_s: largest time between two samples (s). The state at each decision is always one of the samples.
@@ -104,10 +104,10 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Consecutive samples are at most ``sample_s`` seconds apart. The end of a step is the first sample of the next step;
-    the end of the last step is its last sample. A world does not contain positions, so Vehicle 1's position is computed
-    from its gap to an obstacle. In a world without an obstacle, an obstacle is placed so far ahead that Vehicle 1
-    cannot reach it.
+    Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step counts as the first
+    sample of the next step, except for the last step. A world does not contain positions, so Vehicle 1's position is
+    computed from its gap to an obstacle. In a world without an obstacle, an obstacle is placed so far ahead that
+    Vehicle 1 cannot reach it.
 
     Args:
         segments: time steps of one episode, each as (world at the beginning of the step, commands [1, N] (m/s2), time

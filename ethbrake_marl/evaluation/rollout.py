@@ -124,7 +124,7 @@ def drive_chunk(
 ) -> Evaluation:
     """Let each agent drive all worlds of one chunk at once, from the alert to the end of their episodes.
 
-    If the simulation fails in every world, the result contains no world.
+    If every simulation fails, the returned ``Evaluation`` contains no world.
 
     Args:
         sample: the worlds of the chunk, at the alert.
@@ -132,7 +132,7 @@ def drive_chunk(
         scenario: scenario of the worlds.
         seed: seed of the evaluation list, which is recorded in the result.
         vehicles: indices (0 = front) of the controlled vehicles.
-        first: number of the chunk's first world in the evaluation list (from 0), for error messages.
+        first: position of the chunk's first world among all evaluated worlds (from 0), for error messages.
         aftermath: whether to also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user
             registered.
 
@@ -181,8 +181,8 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
-    The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. If the
-    scenario has no learner and ``vehicle`` is None, the result is empty if all agents are teams; otherwise
+    The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. For a
+    scenario without learners, ``vehicle`` may be None only if all agents are teams. The result is then empty; otherwise
     ``InvalidInput`` is raised.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):

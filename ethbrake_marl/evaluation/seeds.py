@@ -77,15 +77,15 @@ def mean_over_seeds(
 
     The bootstrap resamples the seeds of ``values``, the seeds of ``baseline``, and the worlds (or clusters of worlds).
     The interval therefore says what to expect of other seeds and other worlds. There is no interval if there is only
-    one world or cluster, or if no baseline is given and all values are 0. If no baseline is given, the interval of
-    true/false values always contains Wilson's interval, because bootstrap intervals of nearly constant values are too
-    narrow.
+    one world or cluster, or if no baseline is given and all values are 0. Without a baseline, the interval of
+    true/false values is widened so that it contains Wilson's interval, because bootstrap intervals of nearly constant
+    values are too narrow.
 
     Args:
         values: result of the training run with each seed in each world, [seeds, worlds].
         baseline: results to subtract, in the same worlds, [seeds, worlds]; the number of seeds may differ from the
             number in ``values``.
-        clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
+        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
     Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite.
@@ -121,7 +121,7 @@ def share_over_seeds(
         values: harms of the training runs to judge, [seeds, worlds] (m2/s2).
         worst: harms of the agent whose share is 0 by definition, in the same worlds, [seeds, worlds].
         best: harms of the agent whose share is 1 by definition, in the same worlds, [seeds, worlds].
-        clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
+        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
     """
@@ -167,7 +167,7 @@ def _resampled(
         sides: results to resample, each an array [seeds, worlds] in the same worlds.
         of: function that computes a statistic from the resampled means [resamples, sides]. The ends of the interval are
             percentiles of this statistic.
-        clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
+        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
         seed: seed of the bootstrap's random numbers.
 
     """

@@ -138,19 +138,20 @@ def compare_modes(
 ) -> ShieldModes:
     """Compare every agent in the same worlds: without a shield, with one in episode mode, and with one in step mode.
 
-    Two variants of step mode are also compared: ``step-alert`` has rollouts of the policy only at the alert, and
-    ``step-cap`` caps each vehicle's harm. ``step-cap`` is for teams only, which have no episode mode. For each decision
-    that step mode replaced, the episode is simulated again with the policy driving without a shield from this decision
-    on. If the simulation of a world fails with one agent, the world is left out for all agents, and every row lists it
-    in ``left_out``.
+    Two variants of step mode are also compared. In ``step-alert`` the shield simulates the policy's rollout only at the
+    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is for teams only, which
+    have no episode mode. For each decision that step mode replaced, the episode is simulated again; from this decision
+    on, the policy drives without a shield. If the simulation of a world fails with one agent, the world is left out for
+    all agents, and every row lists it in ``left_out``.
 
     Args:
         agents: agents or teams by name, without a shield. The objects that you pass do not change.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        behind: whether ``agents`` already have shields. If so, the policies behind episode and step shields are
-            compared, and all other agents are ignored; the result is empty if no agent has such a shield.
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        behind: whether ``agents`` already have shields. If they have, the policies of agents with a shield in episode
+            or step mode are compared, and all other agents are ignored. If no agent has such a shield, the result is
+            empty.
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
         on_progress: function that is called with an agent's name and the number of worlds that the agent has driven so
             far.
 
@@ -179,7 +180,7 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """Results of one chunk of worlds in one mode of the shield. Other modes than step mode lack the last two fields."""
+    """Results of one chunk of worlds in one mode of the shield. Only step mode has the last two fields."""
 
     harm: Floats  # [n] harm of the line in each world (m2/s2)
     moving: int  # number of worlds in which a vehicle still moves at the horizon
@@ -246,7 +247,7 @@ def _row(
         harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The row also compares its harm with
             the harm in other modes.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
 

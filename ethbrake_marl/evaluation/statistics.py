@@ -48,7 +48,7 @@ def cluster_sums(values: Floats, clusters: Texts) -> dict[str, tuple[int, Fracti
 
     Args:
         values: numbers to add, [n].
-        clusters: name of the cluster of each value, [n].
+        clusters: name of the cluster (recording) of each value, [n].
 
     Raises ``InvalidInput`` if a value is not finite, or if the arrays have different lengths.
 
@@ -81,7 +81,7 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number of values, their exact sum, and the exact sum of their squares; moments of chunks can be added.
+    """Number of values, their exact sum, and the exact sum of their squares. Two ``Moments`` can be added.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -105,7 +105,7 @@ class Moments:
 
         Args:
             values: numbers, one per world, [n].
-            clusters: name of the cluster of each value, [n]; None: all values are independent.
+            clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
 
         Raises ``InvalidInput`` if a value is not finite.
 
@@ -147,7 +147,7 @@ class Moments:
     def standard_error(self) -> float:
         """Standard error of the mean, ``s / sqrt(n)``, where s is the standard deviation with n - 1 degrees of freedom.
 
-        With G clusters the standard error is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where n is the number of
+        With G clusters, the standard error is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where n is the number of
         values, and D_g the sum of the deviations from the mean in cluster g. Raises ``ZeroDivisionError`` for fewer
         than two values or clusters.
         """
@@ -165,7 +165,7 @@ class Moments:
 
     @property
     def share(self) -> Estimate:
-        """Mean p of values that are all 0 or 1, with Wilson's interval (``rate``).
+        """Mean p of values, each of which is 0 or 1, with Wilson's interval (``rate``).
 
         With G clusters, Wilson's interval is computed for an effective number of independent draws: the number of
         independent draws that would have the same standard error, ``1 + p (1 - p) / error ** 2``, but at most the
@@ -237,8 +237,8 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
 
     Args:
         estimate: mean with an interval that may extend below 0.
-        nothing: whether all values are 0. In this case the result has no interval: values that are all 0 show that
-            other values are rare, but not how large those are.
+        nothing: whether all values are 0. In this case the result has no interval: zeros show that larger values are
+            rare, but not how large such values can be.
 
     """
     if nothing or estimate.interval is None:
@@ -292,7 +292,7 @@ def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
 
     Args:
         values: numbers to average, one per world, [n].
-        clusters: name of the cluster of each value, [n]; None: all values are independent.
+        clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
 
     Raises ``InvalidInput`` if ``values`` is empty or not finite.
 
@@ -305,7 +305,7 @@ def share_of(truths: Bools, clusters: Texts | None = None) -> Estimate:
 
     Args:
         truths: true/false values, one per world, [n].
-        clusters: name of the cluster of each value, [n]; None: all values are independent.
+        clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
 
     """
     return Moments.of(check(truths), clusters).share
@@ -317,7 +317,7 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
     Args:
         values: numbers from which the baseline is subtracted, one per world, [n].
         baseline: numbers to subtract, in the same worlds, [n].
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     Raises ``InvalidInput`` if the lengths differ, or if an array is empty or not finite.
 
@@ -363,7 +363,7 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
     Args:
         values: numbers to compare with the baseline, one per world, [n].
         baseline: numbers of the baseline, in the same worlds, [n].
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     Returns None if the baseline's mean is 0. Raises ``InvalidInput`` if the lengths differ, or if an array is empty or
     not finite.

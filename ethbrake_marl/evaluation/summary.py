@@ -140,7 +140,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Return the names of the measures that a narrow terminal shows."""
+        """Return the names of the measures that the table in a narrow terminal shows."""
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):

@@ -21,7 +21,7 @@ Range = tuple[float, float]  # smallest and largest value
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Sums of all agents' measures over some worlds of a list. ``tally + other`` covers the worlds of both."""
+    """Sums of all agents' measures over some of the worlds. ``tally + other`` covers the worlds of both."""
 
     worlds: int = 0  # number of worlds, without left-out worlds
     hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle

@@ -29,10 +29,10 @@ TRIED_CANDIDATES = 16  # number of candidates of a searching script while a scen
 def load_runnable(
     name_or_path: str, settings: Sequence[Override] = (), *, drives: Literal["nobody", "one", "some"] = "nobody"
 ) -> Scenario:
-    """Load a scenario, and let each of its scripts decide once in one world, to find errors in the scripts.
+    """Load a scenario, and find errors in its scripts by letting each script decide once in one world.
 
     Args:
-        name_or_path: name of a scenario, or path of a YAML file.
+        name_or_path: name of a scenario, or path of its YAML file.
         settings: settings ``KEY=VALUE`` that override values of the file.
         drives: number of learners that the scenario must have: exactly one (``one``), at least one (``some``), or any
             number (``nobody``).

@@ -65,7 +65,7 @@ class Algorithm(ABC):
         return {}
 
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
-        """Return the logarithm of the model's exploration noise, or None if it has no such noise.
+        """Return the logarithm of the model's exploration noise, or None if the model has no such noise.
 
         If the noise is not finite and positive, the training stops with an error.
         """

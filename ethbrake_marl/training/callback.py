@@ -203,7 +203,7 @@ class RunCallback(BaseCallback):
     def restore(self, state: TrainingState) -> None:
         """Restore model and progress from a checkpoint, so that the training continues from this checkpoint.
 
-        Raises ``CorruptBundle`` if the checkpoint belongs to another model.
+        Raises ``CorruptBundle`` if the checkpoint does not fit this model.
         """
         numbers, course = state.numbers, self.course
         try:

@@ -67,7 +67,7 @@ class Experiment:
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """Texts that ``ethbrake run`` prints about a report that it has written."""
+    """Tables and texts that ``ethbrake run`` prints about a report that it has written."""
 
     tables: tuple[Any, ...]  # tables to print instead of the results table
     note: str  # text that says where the report is
@@ -200,8 +200,9 @@ def compared_agents(
     """Return the agents to compare, by name: baselines, and the trained policy or team with and without a shield.
 
     With one learner, the trained agent is ``trained policy``, and ``hybrid`` is this policy with the paper's shield.
-    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a step shield. For
-    several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i brakes fully.
+    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a shield in step
+    mode. For several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i brakes
+    fully.
 
     Args:
         trained: the trained policy, or one trained policy for each learner.

@@ -16,7 +16,7 @@ LOSSES = ("loss", "policy_loss", "value_loss", "policy_gradient_loss", "actor_lo
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """An observation, reward, loss, gradient or weight is not finite; the last policy with finite weights was saved."""
+    """Raised if an observation, reward, loss, gradient or weight is not finite; the last finite policy is saved."""
 
 
 def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:

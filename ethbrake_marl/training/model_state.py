@@ -59,11 +59,11 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
     """Put a state that ``capture_model`` returned into a new model of the same recipe.
 
     Args:
-        model: the new model, which is changed. It must have a logger.
+        model: the new model, which must have a logger; its state is replaced.
         algorithm: learning algorithm of the model.
         state: checkpoint with the dictionaries that ``capture_model`` returned.
 
-    Raises various errors of Python, NumPy and torch if the state belongs to another model.
+    Raises various errors of Python, NumPy and torch if the state does not fit the model.
 
     """
     numbers, arrays = state

@@ -18,11 +18,11 @@ RETURN = "episode_return"
 
 @dataclass
 class Course:
-    """Last policy, best policy and evaluations of a running training.
+    """Last policy, best policy and evaluations of a training run in progress.
 
     The best policy is the policy with the smallest mean of the learners' objectives on the fixed list of worlds. If all
-    learners have the harm of the line as objective, the best policy is the policy with the least harm in
-    ``harm_count``. Without evaluations there is no best policy.
+    learners have the harm of the line as objective, the best policy is the policy with the least harm of the line
+    (``harm_count`` says which impacts count). Without evaluations there is no best policy.
     """
 
     harm_count: HarmCount = "first"  # count of harm by which the best policy is chosen

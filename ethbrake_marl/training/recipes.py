@@ -93,7 +93,10 @@ class SquashedShape(Shape):
 
 
 class SacRecipe(TrainingRecipe):
-    """Recipe of SAC: an update adds ``steps_per_update`` decisions of every learner to a replay buffer, and learns."""
+    """Recipe of SAC, which learns from a replay buffer.
+
+    An update adds ``steps_per_update`` decisions of every learner to the buffer, and learns from decisions in it.
+    """
 
     algorithm: Literal["sac"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)

@@ -141,8 +141,8 @@ class RunDirectory:
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
         """Return the name of the metric that is smallest for the best policy.
 
-        The metric is ``objective`` if every evaluation has an entry ``objective``, else the harm of the line in
-        ``harm_count``.
+        The metric is ``objective`` if every evaluation has an entry ``objective``, otherwise the harm of the line
+        (``first_impact_harm`` or ``total_harm``, as ``harm_count`` says).
 
         Args:
             evaluations: evaluations of a training run (``TrainResult.evaluations``), or rows of ``progress.csv``.

@@ -1,4 +1,4 @@
-"""Train policies, or resume a training run: build the model, learn, evaluate, save."""
+"""Train policies, or resume a training run: build the model, let it learn, measure its policies, save them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _BUSY = "another process is training in this folder"
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """Result of ``train`` or ``resume``: the policies and the course of the training.
+    """Result of ``train`` or ``resume``: the policies, and the evaluations during the training.
 
     ``trained`` is the best policy: the policy with the least harm on the fixed list of worlds, or the last policy if
     nothing was measured.
@@ -158,7 +158,7 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Continue a training run that was stopped or killed. The resulting policies are exactly the same as without the stop.
+    """Continue a training run that was stopped or killed. The policies are exactly the same as without the stop.
 
     The training continues from the newest undamaged checkpoint, or from the beginning if there is no such checkpoint.
     Log rows that were written after this checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about
@@ -167,7 +167,8 @@ def resume(
     Args:
         directory: the folder of the run.
         measure: the same argument as in ``train``.
-        stop_at: the same argument as in ``train``. This function is called only with new evaluations.
+        stop_at: the same argument as in ``train``. Evaluations that were made before the stop are not passed to it
+            again.
         on_progress: the same argument as in ``train``.
         other_versions: whether to accept a checkpoint that other versions of packages wrote. The resulting policies may
             then differ from the policies of an uninterrupted training.
@@ -195,8 +196,8 @@ def build(
     """Context manager that builds environment and model of a training run, and yields the callback to pass to
     ``learn``.
 
-    Inside the ``with`` block, Ctrl-C stops the training after the current update. At its end, the environment is
-    closed, and the global random generators are restored.
+    Inside the ``with`` block, Ctrl-C stops the training after the current update. At the end of the block, the
+    environment is closed, and the global random generators are restored.
 
     Args:
         training: recipe and scenario of the training.

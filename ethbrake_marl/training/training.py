@@ -156,7 +156,7 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
 
 
 def check_same_training(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput`` if a run has another recipe or scenario; the message names the keys that differ."""
+    """Raise ``InvalidInput`` if recipe or scenario of a run differ from ``training``; the message names the keys."""
     recorded = recorded_training(run, read_object(run.config))
     if recorded.identity == training.identity:
         return
