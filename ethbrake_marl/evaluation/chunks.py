@@ -48,7 +48,7 @@ class Lineup:
     """List of the agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: specs of the agents (``full_brake``, ``ppo+step``), as on the command line.
+        agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
         uncertainty: intervals around the reported quantities, for shields that need them, as a text such as
@@ -75,12 +75,12 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """Return a lineup of these agents, with a hash of policies, measures and software versions.
+        """Return a lineup (list of agents), with a hash of policies, measures and software versions.
 
         Every worker process computes this hash again, and refuses the lineup if the result differs (``make``).
 
         Args:
-            agents: specs of the agents, as on the command line.
+            agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
             scenario: scenario whose learners the agents drive.
             how: values of ``harm_count``, ``uncertainty`` and ``measures``, which mean the same as in ``Lineup``.
 
@@ -97,7 +97,7 @@ class Lineup:
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """Return the agents of the lineup (spec -> agent); each process builds the agents only once.
+        """Return the agents by their names on the command line; each process builds the agents only once.
 
         Raises ``InvalidInput`` if this process has other policies, measures or versions than the process that created
         the lineup.
@@ -131,7 +131,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every Python file and weights file that a spec or the name of a measure contains."""
+        """Return the SHA-256 of every Python file and weights file that an agent's or a measure's name contains."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
@@ -153,7 +153,7 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """Let the agents of a lineup drive all worlds of a sample, and return their outcomes.
+    """Let the agents of ``lineup`` drive all worlds of ``sample``, and return their outcomes.
 
     Args:
         lineup: the agents to evaluate.
@@ -195,7 +195,7 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """Let the agents of a lineup drive an evaluation list of any length, and return sums over its worlds.
+    """Let the agents of ``lineup`` drive an evaluation list of any length, and return sums of their measures.
 
     The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. Sets of
     measures whose computation takes longer than the simulation of the episodes are omitted.

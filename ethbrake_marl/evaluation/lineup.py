@@ -55,7 +55,7 @@ def make_lineup(
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
-    """Build one agent for each spec, and return the agents as a dictionary: spec -> agent.
+    """Build one agent for each text in ``specs``, and return a dictionary: text -> agent.
 
     Args:
         specs: texts that name agents (``"full_brake"``, ``"ppo+step"``), as a list or as one text with commas between
@@ -99,7 +99,7 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """Build one agent of a single vehicle for each spec, and return a dictionary: spec -> agent.
+    """Build one agent of a single vehicle for each text in ``specs``, and return a dictionary: text -> agent.
 
     Args:
         specs: texts that name agents, such as ``full_brake``.

@@ -252,10 +252,10 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 
 
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
-    """Return the context of each installed set of measures for an ``Evaluation``, by the set's name.
+    """Return the context (information about the worlds) of each installed set of measures, by the set's name.
 
-    The context is what ``MeasureSet.prepare`` returned: the set's information about the worlds, or ``Silent`` with the
-    reason why the set does not apply. The context is computed once per evaluation.
+    The context is what ``MeasureSet.prepare`` returned. If the set does not apply to the evaluation, the context is
+    ``Silent``, with the reason. The context is computed once per evaluation.
 
     Args:
         evaluation: the evaluation.

@@ -60,7 +60,7 @@ def evaluate(
     """Let each agent drive every world once, from the alert to the end of the episode.
 
     Vehicles that no agent controls follow the scenario's scripts. The outcome in a world does not depend on other
-    worlds. If the physics fails in a world with one agent, the world is left out for all agents (``left_out``).
+    worlds. If the simulation of a world fails with one agent, the world is left out for all agents (``left_out``).
 
     Args:
         worlds: worlds at the alert, or a sample from ``scenario.sample``; None: draw ``episodes`` worlds from ``seed``.

@@ -183,7 +183,7 @@ def _resampled(
 def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed: int) -> Floats:
     """Return the mean of each side (array of results) in each bootstrap resample, [resamples, sides].
 
-    Seeds are resampled separately for each side. Clusters of worlds are resampled once for all sides together, and a
+    Seeds are resampled separately for each of ``sides``. Clusters of worlds are resampled once for all of them, and a
     drawn cluster contributes all its worlds.
 
     Args:

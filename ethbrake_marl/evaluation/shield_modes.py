@@ -91,7 +91,7 @@ class ShieldModes(list[ModeRow]):
         return all(row.against_episode is None for row in self)
 
     def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
-        """Return the content of a results file of ``ethbrake shield``: one object per row.
+        """Return the content of a results file of ``ethbrake shield``: one object per agent and mode.
 
         Args:
             sample: the worlds that were passed to ``compare_modes``.
@@ -139,10 +139,10 @@ def compare_modes(
     """Compare every agent in the same worlds: without a shield, with one in episode mode, and with one in step mode.
 
     Two variants of step mode are also compared. In ``step-alert`` the shield simulates the policy's rollout only at the
-    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is for teams only, which
-    have no episode mode. For each decision that step mode replaced, the episode is simulated again; from this decision
-    on, the policy drives without a shield. If the simulation of a world fails with one agent, the world is left out for
-    all agents, and every row lists it in ``left_out``.
+    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is for teams only,
+    which have no episode mode. For each decision that step mode replaced, the episode is simulated again; from this
+    decision on, the policy drives without a shield. If the simulation of a world fails with one agent, the world is
+    left out for all agents, and every row lists it in ``left_out``.
 
     Args:
         agents: agents or teams by name, without a shield. The objects that you pass do not change.
@@ -180,7 +180,7 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """Results of one chunk of worlds in one mode of the shield. Only step mode has the last two fields."""
+    """Results of one chunk of worlds in one mode of the shield. Only step mode has ``shielded`` and ``verdicts``."""
 
     harm: Floats  # [n] harm of the line in each world (m2/s2)
     moving: int  # number of worlds in which a vehicle still moves at the horizon
@@ -197,7 +197,7 @@ def _compare(
 ) -> list[ModeRow]:
     """Return the result rows of all agents and modes; the arguments are the same as in ``compare_modes``.
 
-    Raises ``PhysicsError`` with the worlds in which the physics failed.
+    Raises ``PhysicsError`` with the worlds whose simulation failed.
     """
     rows = []
     for name, agent in agents.items():
@@ -244,8 +244,8 @@ def _row(
         agent: name of the agent.
         mode: the shield's mode.
         parts: results of the agent in this mode, one entry for each chunk of worlds.
-        harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The row also compares its harm with
-            the harm in other modes.
+        harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The returned row also contains the
+            differences from the harm in other modes.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 

@@ -85,7 +85,7 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     - ``refused_by``: name of an agent, shield or setting that refuses scripts that react to the state of the world ->
       error message.
 
-    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds in which the physics fails.
+    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds whose simulation fails.
     """
     searches = {
         scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"

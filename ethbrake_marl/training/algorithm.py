@@ -44,7 +44,7 @@ class Algorithm(ABC):
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of the weights of a policy, by their names in a policy bundle.
+        """Return a copy of a policy's weights: name of a tensor in a policy bundle -> its values.
 
         Args:
             actor: one of the policies that ``actors`` returns.

@@ -208,7 +208,8 @@ def compared_agents(
         trained: the trained policy, or one trained policy for each learner.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that baselines minimise and shields bound, ``first`` or ``total``.
-        baselines: specs of the baselines; None: ``BASELINES`` for one learner, ``TEAM_BASELINES`` for several learners.
+        baselines: names of the baselines as on the command line; None: ``BASELINES`` for one learner,
+            ``TEAM_BASELINES`` for several learners.
 
     """
     several = len(scenario.learners) > 1
@@ -291,7 +292,9 @@ def _status(run: RunDirectory) -> Iterator[None]:
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Update status, stage, reason and end time in ``run.json``. Other entries, such as ``wall_s``, do not change."""
+    """Write status, stage, reason and end time of the run into ``run.json``. Other entries, such as ``wall_s``, do not
+    change.
+    """
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

@@ -46,7 +46,7 @@ def measure_on_list(training: Training) -> Evaluate:
 
 
 def measure_full_braking(training: Training) -> dict[str, float]:
-    """Return the metrics of ``measure_team`` on the fixed list of worlds for learners that brake fully."""
+    """Return the metrics (``measure_team``) of learners that brake fully, on the fixed list of worlds."""
     scenario = training.scenario
     braking: Any = make_agents(["full_brake"], scenario)["full_brake"]
     return measure_team(training, fixed_list(training), Team(dict.fromkeys(scenario.learners, braking), "full_brake"))

@@ -15,7 +15,7 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 
 
 def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
-    """Return a copy of the weights of a policy, by their names in a policy bundle.
+    """Return a copy of a policy's weights: name of a tensor in a policy bundle -> its values.
 
     Args:
         policy: policy of Stable-Baselines3's PPO or SAC.
@@ -49,7 +49,7 @@ def sb3_names(spec: NetworkSpec) -> dict[str, str]:
 
 
 def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
-    """Return a copy of the weights of a perceptron, by their names in a policy bundle.
+    """Return a copy of a perceptron's weights: name of a tensor in a policy bundle -> its values.
 
     Args:
         name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all tensors begin with

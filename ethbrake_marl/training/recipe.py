@@ -207,7 +207,7 @@ class TrainingRecipe(FileModel):
         return None
 
     def derived(self) -> dict[str, float]:
-        """Return numbers that are computed from the keys and recorded in ``config.json``, by name; by default none."""
+        """Return numbers for ``config.json`` that are computed from the recipe's keys, by name; by default none."""
         return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
@@ -366,9 +366,9 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return the descriptions of all keys in recipes of a class, by key.
+    """Return the description of every key that recipes of this class have, by key.
 
-    If a class declares a key without a description, the description of its base class is used.
+    If a class declares a key without a description, the description in its base class is used.
     """
     meanings: dict[str, str] = {}
     for each in reversed(recipe.__mro__):

@@ -62,7 +62,7 @@ class TrainResult:
 
     @property
     def agent(self) -> str:
-        """Spec of the trained agent, for ``make_agent`` and ``--agents``, such as ``ppo@runs/mine``."""
+        """Text that names the trained agent for ``make_agent`` and ``--agents``, such as ``ppo@runs/mine``."""
         return self.training.agent_in(self.directory)
 
     @property

@@ -118,7 +118,7 @@ class Training:
         return file.model_dump(mode="json")
 
     def agent_in(self, folder: Path) -> str:
-        """Return the spec of the agent that this training writes to the run's ``folder``, such as ``ppo@runs/mine``."""
+        """Return the text that names the agent trained in the run's ``folder``, such as ``ppo@runs/mine``."""
         several, algorithm = len(self.drivers) > 1, self.recipe.algorithm
         return f"{'team' if several else algorithm if algorithm in AGENTS else 'policy'}@{folder}"
 
