@@ -292,9 +292,7 @@ def _status(run: RunDirectory) -> Iterator[None]:
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Write status, stage, reason and end time of the run into ``run.json``. Other entries, such as ``wall_s``, do not
-    change.
-    """
+    """Write status, stage, reason and end time into ``run.json``; other entries, such as ``wall_s``, do not change."""
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})
