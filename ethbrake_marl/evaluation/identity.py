@@ -121,8 +121,8 @@ def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
 def result_versions() -> dict[str, str]:
     """Return the versions of Python and of every package on which the numbers of a result depend, by name.
 
-    The result includes the extension packages that this process used. It also includes the SHA-256 of each Python file
-    of the user that this process ran.
+    The result includes the extension packages that this process used. The result also includes the SHA-256 of each
+    Python file of the user that this process ran.
     """
     return own_versions() | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 

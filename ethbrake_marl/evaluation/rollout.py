@@ -72,7 +72,7 @@ def evaluate(
         episodes: number of worlds to draw; None: 10,000.
         seed: seed from which the worlds are drawn; None: 7. If ``worlds`` is passed, the seed is only recorded in the
             result.
-        chunk: number of worlds that are simulated together; None: 2,500. This number does not change the results.
+        chunk: number of worlds that are simulated together; None: 2,500. The results do not depend on ``chunk``.
         on_progress: function that is called after each chunk with an agent's name and the number of worlds that the
             agent has driven so far.
         aftermath: whether to also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the

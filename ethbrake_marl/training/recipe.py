@@ -63,8 +63,8 @@ class LearningRate(FileModel):
 class Shape(FileModel):
     """Base class for the value of a recipe's key ``network``, which describes the networks to train.
 
-    A subclass declares the keys inside ``network`` as fields. It needs the fields ``policy`` (sizes of the actor's
-    hidden layers, such as ``[64, 64]``) and ``activation``, unless it overrides ``spec``.
+    A subclass declares the keys inside ``network`` as fields. A subclass needs the fields ``policy`` (sizes of the
+    actor's hidden layers, such as ``[64, 64]``) and ``activation``, unless it overrides ``spec``.
     """
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
