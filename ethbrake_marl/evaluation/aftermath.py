@@ -1,4 +1,4 @@
-"""Two measurements taken while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+"""Two measurements that are made while episodes run: how far Vehicle 1 is shoved, and the paper's sampled harm."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class ShovedFront:
     """Measure how far other vehicles shove Vehicle 1 beyond the place that it would reach if nobody touched it.
 
     ``shoved = distance that Vehicle 1 drives - distance that it would drive until the horizon if nobody touched it``.
-    The result is negative if Vehicle 1 ends short of that place, for instance because an obstacle threw it back.
-    ``of`` creates the object, and ``see`` is called for each step.
+    ``shoved`` is negative if Vehicle 1 ends short of the place that it would reach, for instance because an obstacle
+    threw it back. Create the object with ``of``, and call ``see`` for each step.
 
     Args:
         worlds: the n worlds at the alert.
@@ -53,13 +53,13 @@ class ShovedFront:
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
         """Add the distance that Vehicle 1 drives in one step.
 
-        The distance is the change of Vehicle 1's gap to an obstacle. If the world has no obstacle, one is assumed that
-        Vehicle 1 cannot reach in this step.
+        Vehicle 1's distance is the decrease of its gap to an obstacle. In a world without an obstacle, an obstacle is
+        placed so far ahead that Vehicle 1 cannot reach it in this step.
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: commanded accelerations during the step, [n, N].
-            until_s: time at which the step ends, [n].
+            command_mps2: commanded accelerations during the step (m/s2), [n, N].
+            until_s: time since the alert at which the step ends (s), [n].
 
         """
         post = before.with_post_ahead(until_s - before.time_s)
@@ -79,10 +79,10 @@ VEHICLE_2 = 1  # index of the vehicle whose latency sets the time of the map's f
 class SampledHarm:
     """Compute the sampled harm of the episodes: the paper's sum of squared closing speeds over time samples.
 
-    The agents' commands are applied again in ``advance_sampled``, the paper's equations of motion with a fixed step.
-    Every world is simulated up to the horizon. If the episode of a world ended earlier in the exact physics, the last
-    commands of its vehicles remain in force. The agents made their decisions in the exact physics, and make no new
-    decisions here. ``of`` creates the object, ``see`` is called for each step, and ``finish`` returns the harm.
+    The commands that the agents gave in the exact physics are applied again in the paper's equations of motion with a
+    fixed step (``advance_sampled``). The agents make no new decisions. Every world is simulated up to the horizon. If
+    the episode of a world ended earlier in the exact physics, the last commands of its vehicles remain in force. Create
+    the object with ``of``, call ``see`` for each step, and get the harm from ``finish``.
 
     Args:
         worlds: the n worlds at the alert; they are copied.
@@ -102,9 +102,9 @@ class SampledHarm:
     def of(cls, worlds: Worlds, task: Task) -> SampledHarm | None:
         """Return the measurement for ``worlds`` at the alert, or None if sampled harm is not defined for the task.
 
-        Sampled harm is defined if Vehicle 2 is the only controlled vehicle and no script reacts to the state of the
-        world, because the samples are taken at Vehicle 2's decisions. Sampled harm is not defined with an obstacle or
-        with brake force that builds up gradually, which the paper's equations do not cover.
+        The samples are taken at Vehicle 2's decisions. Sampled harm is therefore defined only if Vehicle 2 is the only
+        controlled vehicle and no script reacts to the state of the world. With an obstacle, or with brake force that
+        builds up gradually, sampled harm is not defined, because the paper's equations cover neither.
         """
         obstacle = task.scenario.has_obstacle or worlds.obstacle_ahead.any()
         if task.vehicles != (VEHICLE_2,) or obstacle or worlds.vehicles.build_up.any():
@@ -114,14 +114,14 @@ class SampledHarm:
         return cls(worlds, task.scenario)
 
     def see(self, before: Worlds, command_mps2: Floats, until_s: Floats) -> None:
-        """Apply the commands of one step in the paper's equations.
+        """Apply the commands of one step in the paper's equations of motion, and add the harm of one time sample.
 
-        A world whose episode has ended repeats its last commands.
+        In a world whose episode has ended, the last commands of the vehicles are applied again.
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: commanded accelerations during the step, [n, N].
-            until_s: time at which the step ends, [n]; where the episode has ended, the time of its end.
+            command_mps2: commanded accelerations during the step (m/s2), [n, N].
+            until_s: time at which the step ends (s), [n]; in a world whose episode has ended, the end of the episode.
 
         """
         running = until_s > before.time_s
@@ -129,7 +129,7 @@ class SampledHarm:
         self._move()
 
     def _move(self) -> None:
-        """Advance every world to its next sample, or to the horizon if that comes first."""
+        """Advance every world to its next time sample, or to the horizon if the horizon comes first."""
         self._samples += 1
         next_s = np.minimum(Decisions(self._start_s, self._step_s).at(self._samples), self._horizon_s)
         until_s = np.maximum(next_s, self._worlds.time_s)

@@ -22,7 +22,7 @@ from ethbrake_marl.game.measures import REPORTED
 
 @dataclass(frozen=True, slots=True)
 class AgentTally:
-    """Exact sums of one agent's measures over many worlds; ``+`` adds the sums over other worlds."""
+    """Exact sums of one agent's measures over many worlds; ``tally + other`` has the sums over the worlds of both."""
 
     # Name of a true/false measure -> number of worlds in which it is true, number of worlds in which it has a value.
     counts: Mapping[str, tuple[int, int]] = field(default_factory=dict)
@@ -48,15 +48,17 @@ class AgentTally:
     def share(self, name: str, worlds: int) -> float | None:
         """Return the fraction (0 to 1) of the worlds in which the true/false measure ``name`` is true.
 
-        ``worlds`` is the number of evaluated worlds. The result is None if the measure has no value in some of them.
+        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure has no value in one of
+        these worlds.
         """
         so, of = self.counts.get(name, (0, 0))
         return so / worlds if of == worlds else None
 
     def sums(self, name: str, worlds: int) -> Moments | None:
-        """Return count, sum and sum of squares of the numeric measure ``name``.
+        """Return the sum and the sum of squares of the numeric measure ``name``, and the number of its values.
 
-        ``worlds`` is the number of evaluated worlds. The result is None if the measure has no value in some of them.
+        ``worlds`` is the number of worlds in the evaluation. The result is None if the measure has no value in one of
+        these worlds.
         """
         moments = self.moments.get(name)
         return moments if moments is not None and moments.count == worlds else None
@@ -70,14 +72,16 @@ def tally_agents(
     objectives: Sequence[str] | None = None,
     clusters: Texts | None = None,
 ) -> dict[str, AgentTally]:
-    """Return the sums of every agent's measures over the same worlds, by the agent's name.
+    """Return the sums of every agent's measures over the same worlds: name of the agent -> its sums.
 
     Args:
         outcomes: outcome of each agent, by the agent's name.
         contexts: data that each set of measures computed once for these worlds (``contexts_of``), by the set's name.
-        baseline: name of the agent to compare with, for sets of measures that name no baseline.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list, even an empty one, the
-            result also has the harm that each vehicle bears, and the value of each objective for each vehicle.
+        baseline: name of the agent with which the other agents are compared, unless a set of measures names its own
+            baseline.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list (an empty list is
+            enough), the result also has the sums of the harm that each vehicle bears, and of the value of each
+            objective for each vehicle.
         clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
@@ -117,11 +121,12 @@ def estimate_all(
     """Return the estimate (mean and 95 % interval) of every measure of one agent, by the measure's name.
 
     Args:
-        tallies: sums of every agent, by the agent's name.
-        agent: name of the agent.
-        worlds: number of evaluated worlds. The estimate of a measure is None if the measure has no value in some of
-            these worlds.
-        baseline: name of the agent to compare with. If this agent was not evaluated, all comparisons are None.
+        tallies: sums of the measures of every agent, by the agent's name.
+        agent: name of the agent whose measures are estimated.
+        worlds: number of worlds in the evaluation. The estimate of a measure is None if the measure has no value in one
+            of these worlds.
+        baseline: name of the agent with which ``agent`` is compared. If the baseline was not evaluated, all comparisons
+            with it are None.
 
     """
     own = tallies[agent]
@@ -140,13 +145,14 @@ def estimate_all(
 def _estimate(
     measure: Measure, own: AgentTally, baseline: AgentTally | None, worlds: int, whole: str | None
 ) -> Estimate | None:
-    """Return the estimate of one measure, or None if the measure lacks a value in some world or cannot be compared.
+    """Return the estimate of one measure; None if values are missing, or if a comparison has no baseline.
 
     Args:
         measure: the measure.
-        own: sums of the agent.
-        baseline: sums of the agent to compare with; None if there is no such agent.
-        worlds: number of evaluated worlds.
+        own: sums of the agent's measures.
+        baseline: sums of the measures of the agent to compare with; None if there is no such agent.
+        worlds: number of worlds in the evaluation. The result is None if the measure has no value in one of these
+            worlds.
         whole: name of a true/false measure (``MeasureSet.whole``) that must be true in all worlds for a comparison with
             the baseline; None if there is no such condition.
 
@@ -165,14 +171,14 @@ def _estimate(
 
 
 def lower_bounds(tally: AgentTally, worlds: int) -> frozenset[str]:
-    """Return the names of the measures whose means are lower bounds of the true means, for one agent.
+    """Return the names of those measures of one agent whose means are only lower bounds of the true means.
 
-    A set of measures may name a true/false measure (``MeasureSet.whole``) that says whether a world's values are
-    complete. If this measure is false in some world, all means of the set are lower bounds.
+    A set of measures may name a true/false measure (``MeasureSet.whole``) that says whether the set's values in a world
+    are complete. If this measure is false in some world, the means of all measures in the set are lower bounds.
 
     Args:
-        tally: sums of the agent.
-        worlds: number of evaluated worlds.
+        tally: sums of the agent's measures.
+        worlds: number of worlds in the evaluation.
 
     """
 

@@ -45,19 +45,21 @@ _BUILT: dict[str, Mapping[str, Driver]] = {}
 
 @dataclass(frozen=True, slots=True)
 class Lineup:
-    """Description of an evaluation's agents as plain data, from which every worker process builds the same agents.
+    """List of the agents of an evaluation as plain data, from which every worker process builds the same agents.
 
     Args:
-        agents: specs of the agents (``full_brake``, ``ppo+step``), as on the command line.
+        agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that agents minimise, each pair's first impact (``first``) or all impacts (``total``).
-        uncertainty: uncertainty for shields that need one, as text: ``gaps_m=0.5``.
-        measures: names or ``FILE:NAME`` of user measures to load (``load_measures``).
-        reported: names of all user measures that the evaluation reports.
-        sets: names of the sets of measures in the main process. Every worker process must have these sets.
-        same: hash of everything that must be equal in every process (``Lineup.of``).
-        packages: version of each extension package that the main process uses, by name. Every worker process must have
-            these versions.
+        uncertainty: intervals around the reported quantities, for shields that need them, as a text such as
+            ``gaps_m=0.5``; None: no shield needs them.
+        measures: measures of the user to load, each a name or ``FILE:NAME`` (``load_measures``).
+        reported: names of all measures of the user whose values the evaluation reports.
+        sets: names of the sets of measures that the main process has. Every worker process must also have these sets.
+        same: hash of the policies, measures and software versions, which must be equal in every process
+            (``Lineup.of``).
+        packages: version of each extension package that the main process uses, by the package's name. Every worker
+            process must have these versions.
 
     """
 
@@ -73,14 +75,14 @@ class Lineup:
 
     @classmethod
     def of(cls, agents: Sequence[str], scenario: Scenario, **how: Any) -> Lineup:
-        """Return the lineup of these agents, with a hash of their policies, measures and versions.
+        """Return a lineup (list of agents), with a hash of policies, measures and software versions.
 
-        A worker process computes the same hash and refuses the lineup if the two differ (``make``).
+        Every worker process computes this hash again, and refuses the lineup if the result differs (``make``).
 
         Args:
-            agents: specs of the agents, as on the command line.
+            agents: names of the agents as on the command line, such as ``full_brake`` and ``ppo+step``.
             scenario: scenario whose learners the agents drive.
-            how: ``harm_count``, ``uncertainty`` and ``measures``, as the class takes them.
+            how: values of ``harm_count``, ``uncertainty`` and ``measures``, which mean the same as in ``Lineup``.
 
         Raises the errors of ``make_lineup``.
 
@@ -95,7 +97,7 @@ class Lineup:
         return replace(lineup, same=same, packages=versions_used())
 
     def make(self) -> Mapping[str, Driver]:
-        """Return the agents by spec; each process builds them once.
+        """Return the agents by their names on the command line; each process builds the agents only once.
 
         Raises ``InvalidInput`` if this process has other policies, measures or versions than the process that created
         the lineup.
@@ -129,7 +131,7 @@ class Lineup:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _digests(self) -> list[str]:
-        """Return the SHA-256 of every Python file and weights file that a spec or measure names."""
+        """Return the SHA-256 of every Python file and weights file that an agent's or a measure's name contains."""
         named = [part for spec in map(parse_spec, self.agents) if spec.file for part in (spec.file[0], spec.policy)]
         named += [name.rpartition(":")[0] for name in self.measures]
         return [file_sha256(Path(each)) for each in named if each is not None and Path(each).is_file()]
@@ -151,15 +153,15 @@ def evaluate_held(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Evaluation:
-    """Let the agents of a lineup drive all worlds of a sample, and return their outcomes.
+    """Let the agents of ``lineup`` drive all worlds of ``sample``, and return their outcomes.
 
     Args:
-        lineup: the agents.
-        sample: the worlds, which are all held in memory.
+        lineup: the agents to evaluate.
+        sample: worlds in which the agents drive; all of them are kept in memory.
         seed: seed of the worlds, which the result records; None for worlds that were not drawn from a seed.
         jobs: number of processes; None: one process, or with Ray one per core of the cluster.
         ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
-        on_done: function that is called after each chunk with the number of worlds evaluated so far.
+        on_done: function that is called after each chunk of worlds with the number of worlds evaluated so far.
 
     """
     calls: Iterator[Call] = ((_drive, lineup, part, seed, first) for first, part in chunks_of(sample))
@@ -178,7 +180,7 @@ def _drive(lineup: Lineup, part: Sample, seed: int | None, first: int) -> Evalua
 
 
 def _only(outcome: Outcome, names: Sequence[str]) -> Outcome:
-    """Return the outcome without the user measures (``Outcome.metrics``) that ``names`` does not list."""
+    """Return the outcome without those measures of the user (``Outcome.metrics``) that ``names`` does not list."""
     metrics = {c: each for c, each in outcome.metrics.items() if c in names or c.rpartition("_")[0] in names}
     return replace(outcome, metrics=metrics)
 
@@ -193,20 +195,20 @@ def tally_list(
     ray: str | None = None,
     on_done: OnDone | None = None,
 ) -> Tally:
-    """Let the agents of a lineup drive an evaluation list of any length, and return sums over its worlds.
+    """Let the agents of ``lineup`` drive an evaluation list of any length, and return sums of their measures.
 
     The worlds are drawn and driven chunk by chunk, so memory does not grow with the length of the list. Sets of
-    measures that take longer to compute than the episodes themselves are omitted.
+    measures whose computation takes longer than the simulation of the episodes are omitted.
 
     Args:
-        lineup: the agents.
+        lineup: the agents to evaluate.
         episodes: number of worlds in the list, 1 to 10^12.
         seed: seed from which the worlds are drawn.
         objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If objectives are passed, the result also
-            has the harm that each vehicle bears, and the value of each objective for each vehicle.
+            has the sums of the harm that each vehicle bears, and of the value of each objective for each vehicle.
         jobs: number of processes; None: one process, or with Ray one per core of the cluster.
         ray: address of a Ray cluster, or ``local`` for this machine; None: Ray is not used.
-        on_done: function that is called after each chunk with the number of worlds evaluated so far.
+        on_done: function that is called after each chunk of worlds with the number of worlds evaluated so far.
 
     """
     check_whole_number("episodes", episodes, 1, MOST_EPISODES)
@@ -236,7 +238,7 @@ def summarise_tally(lineup: Lineup, tally: Tally, seed: int) -> SummaryTable:
 
     Args:
         lineup: the evaluated agents.
-        tally: result of ``tally_list``.
+        tally: sums over the worlds, from ``tally_list``.
         seed: seed of the evaluation list.
 
     Raises ``PhysicsError`` if every world was left out because of an error.

@@ -21,7 +21,7 @@ from ethbrake_marl.scenario.sample import clusters_of
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Difference between two results in the mean harm per world of one agent: second minus first (m2/s2)."""
+    """Difference of one agent's mean harm per world between two results: second result minus first (m2/s2)."""
 
     agent: str  # name of the agent, the same in both results
     # Whether the agent has the same trained policy in both results, another one, or none in either.
@@ -35,7 +35,7 @@ class Difference:
         return f"{self.agent} {MARK}" if any(each.names for each in self.exploits) else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return the entry for JSON, with agent, policy, exploits, and differences of harm with intervals."""
+        """Return the object for JSON: agent, policy, exploits, and the differences of harm with their intervals."""
         harms = {f"{name}_difference": estimate for name, estimate in self.harms.items()}
         exploits = [list(each.names) for each in self.exploits]
         return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": exploits}
@@ -56,7 +56,7 @@ class Comparison:
 
     @property
     def exploits_line(self) -> str:
-        """Sentence that names agents with exploits, and the result in which they have them; "" without such agents."""
+        """Sentence that says which agents have exploits in which of the two results; "" if no agent has exploits."""
         of_agents: dict[str, Exploits] = {}
         for each in self.differences:
             first, second = each.exploits
@@ -128,7 +128,7 @@ Worlds = dict[str, tuple[Floats, Floats, Texts | None]]
 
 
 def _worlds_of_both(first: Result, second: Result, common: Sequence[str]) -> tuple[Worlds | None, str | None]:
-    """Return (harms of every world in both results, None), or (None, reason why the worlds cannot be paired).
+    """Return (harms in each world of both results, None), or (None, reason why the worlds cannot be paired).
 
     ``common``: names of the agents that both results contain.
     """

@@ -33,27 +33,29 @@ _STAY = "\u00a0"  # a non-breaking space
 
 
 class Conditions(dict[str, Any]):
-    """Dictionary that describes how a result was obtained: scenario, seed, vehicles, scripts, quantities of the worlds.
+    """Dictionary that says how a result was obtained: scenario, seed, vehicles, scripts, and quantities of the worlds.
 
-    ``of`` and ``of_ranges`` return only the quantities, ``of_test`` all entries.
+    ``of`` and ``of_ranges`` return a dictionary with only the quantities; ``of_test`` returns all of these entries.
     """
 
     @classmethod
     def of(cls, worlds: Worlds) -> Conditions:
         """Return every quantity of the worlds by key, such as ``{"gaps_m": [7.0, [5.0, 9.0]]}``.
 
-        A quantity of vehicles or pairs has a list with one entry for each of them, front to rear. A quantity of the
-        whole world has a single entry. An entry is a number if all worlds agree, else ``[smallest, largest]``.
+        The value of a quantity of vehicles or pairs is a list with one entry per vehicle or pair, front to rear. A
+        quantity of the whole world has a single entry. An entry is a number if the quantity is equal in all worlds;
+        otherwise it is ``[smallest, largest]``.
         """
         return cls.of_ranges({key: rule.of(worlds).T for key, rule in QUANTITY.of(worlds).items()})
 
     @classmethod
     def of_ranges(cls, ranges: Mapping[str, Iterable[Any]]) -> Conditions:
-        """Return the same dictionary as ``of``, computed from arrays of values.
+        """Return the same dictionary as ``of``, computed from arrays of the quantities' values.
 
         Args:
-            ranges: key of a quantity -> one array per vehicle or pair (or one for the whole world). An array has the
-                values of all worlds, or only the smallest and the largest value.
+            ranges: key of a quantity -> arrays of its values: one array per vehicle or pair, or a single array for a
+                quantity of the whole world. An array contains the values in all worlds, or only the smallest and the
+                largest of these values.
 
         """
         ends_of = {
@@ -120,7 +122,7 @@ class Conditions(dict[str, Any]):
     def by_recording(self) -> str:
         """Part of a caption that says how many recordings the worlds come from; empty without recordings.
 
-        For instance ``; 95 % intervals by 55 recordings``. With a single recording there are no intervals.
+        Example: ``; 95 % intervals by 55 recordings``. If all worlds come from one recording, there are no intervals.
         """
         number = self.get("recordings", 0)
         many = f"; 95 % intervals by {number:,} recordings" if number else ""
@@ -130,7 +132,7 @@ class Conditions(dict[str, Any]):
     def quantities(self) -> str:
         """All quantities in one line, with symbols and units, such as ``d = 7 m; v = (20, 18, 20) m/s``.
 
-        A value that all vehicles or pairs share is written once.
+        If all vehicles (or pairs) have the same value, the value is written only once.
         """
         parts = []
         for key, (symbol, unit) in _SYMBOLS.items():
@@ -143,14 +145,14 @@ class Conditions(dict[str, Any]):
 
 
 def _plain(tells: Tells) -> Any:
-    """Return what messages contain, as plain data for JSON: one list for all vehicles, or one per vehicle."""
+    """Return the contents of messages as plain data for JSON: one list for all vehicles, or one list per vehicle."""
     return {name: [*each] for name, each in tells.items()} if isinstance(tells, Mapping) else [*tells]
 
 
 def message_words(scenario: Scenario) -> str:
     """Return a text about what messages contain, for instance ``messages of all contain place``.
 
-    The text is empty if the scenario does not set ``tells``.
+    The text is empty if the scenario does not set ``tells``, the key for the contents of messages.
     """
     tells = scenario.v2x.channel.tells
     return "" if tells is None else _message_words(tells)

@@ -42,7 +42,7 @@ T = TypeVar("T")
 class Evaluation:
     """Outcomes of several agents that drove the same vehicles in the same worlds.
 
-    Row k of every array belongs to the same world.
+    Entry k of every array belongs to the same world.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -84,11 +84,11 @@ class Evaluation:
 
     @property
     def task(self) -> Task:
-        """The scenario and the controlled vehicles, as a ``Task``."""
+        """The ``Task`` of this evaluation: its scenario and its controlled vehicles."""
         return Task(self.scenario, self.vehicles)
 
     def once(self, compute: Callable[[Evaluation], T]) -> T:
-        """Return ``compute(self)``, and store the result for later calls with the same function."""
+        """Return ``compute(self)``; later calls with the same function return the stored result."""
         if compute not in self._computed:
             self._computed[compute] = compute(self)
         result: T = self._computed[compute]
@@ -121,7 +121,7 @@ class Evaluation:
         )
 
     def take(self, rows: Ints | Bools) -> Evaluation:
-        """Return the evaluation restricted to some of its worlds, with an empty ``left_out`` and ``rejected`` 0.
+        """Return the evaluation restricted to some of its worlds; its ``left_out`` is empty, and its ``rejected`` is 0.
 
         Args:
             rows: row numbers of the worlds to keep, or a mask [n] that is true for the worlds to keep.
@@ -134,7 +134,7 @@ class Evaluation:
 
     @property
     def hidden(self) -> Bools:
-        """Whether the V2X channel hides something from a controlled vehicle, for each world, [n].
+        """For each world: whether the V2X channel hides something from a controlled vehicle, [n].
 
         The channel hides something if messages arrive late, only from time to time or not at all, if messages omit a
         quantity, or if another vehicle reacts later than its message says.
@@ -166,11 +166,12 @@ class Evaluation:
     def per_world(self, objectives: Sequence[Declared] = ()) -> Columns:
         """Return a table with one row per agent and world, as a dictionary: name of a column -> its values.
 
-        docs/evaluate.md lists the columns. Initial quantities have names such as ``gap_1_m``, ``speed_1_mps``,
-        ``latency_2_s`` and ``restitution``. A missing value is None.
+        docs/evaluate.md lists the columns. Columns of initial quantities have names such as ``gap_1_m``,
+        ``speed_1_mps``, ``latency_2_s`` and ``restitution``. A missing value is None.
 
         Args:
-            objectives: objectives such as ``"social:45"``; each adds columns with its value for every vehicle.
+            objectives: objectives such as ``"social:45"``; each objective adds columns with its value for every
+                vehicle.
 
         """
         n, contexts = self.worlds.n, contexts_of(self)
@@ -202,9 +203,9 @@ class Evaluation:
         return table
 
     def arrays(self, objectives: Sequence[Declared] = ()) -> dict[str, NDArray[Any]]:
-        """Return the columns of ``per_world`` as arrays, by name.
+        """Return the columns of ``per_world`` as a dictionary: name of a column -> array of its values.
 
-        A missing number is NaN, and a missing text is empty. ``objectives`` are as in ``per_world``.
+        A missing number is NaN, and a missing text is empty. ``objectives`` is the same argument as in ``per_world``.
         """
         arrays, of_sets = {}, [each.texts for each in MEASURE_SETS.values()]
         for name, values in self.per_world(objectives).items():
@@ -224,7 +225,7 @@ class Evaluation:
         return DataFrame(self.arrays())
 
     def rescore(self, declared: Sequence[Declared] | None = None) -> Rescores:
-        """Return the mean value of several objectives, for every agent, each vehicle and both counts of harm.
+        """Return the mean value of each objective over the worlds, for every agent, vehicle and count of harm.
 
         Args:
             declared: objectives such as ``"total"`` or ``"social:45"``; None: the standard objectives
@@ -253,7 +254,7 @@ class Evaluation:
         return Sheet(repr(self), ("Agent", share, Column("First-impact harm"), Column("Total harm")), rows, note).html()
 
     def complete(self) -> Evaluation:
-        """Return this evaluation unchanged; raise ``PhysicsError`` with the worlds that were left out, if any."""
+        """Return this evaluation if no world was left out; otherwise raise ``PhysicsError`` with these worlds."""
         if self.left_out:
             raise PhysicsError({left.world: f"{left.agent}: {left.reason}" for left in self.left_out})
         return self

@@ -21,11 +21,11 @@ _TRAINED = 2_000  # number of worlds drawn from the training scenario to find th
 
 
 def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, vehicles: Sequence[int]) -> None:
-    """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds outside the range of its training.
+    """Warn (``Unfamiliar``) about each trained policy that is to drive in worlds unlike its training worlds.
 
-    The range of each quantity is found by drawing worlds from the training scenario, which the policy's manifest
-    contains. If the worlds of this scenario cannot be drawn on this machine, there is no warning. Of the V2X channel,
-    only the latencies and the contents of messages are compared.
+    The worlds are compared with worlds drawn from the training scenario, which the policy's manifest contains. If no
+    worlds of the training scenario can be drawn on this machine, there is no warning. Of the V2X channel, only the
+    latencies and the contents of messages are compared.
 
     Args:
         agents: agents by name; agents without a trained policy are ignored.
@@ -61,7 +61,8 @@ def warn_unfamiliar(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scen
 def _beyond(before: Worlds, worlds: Worlds) -> list[str]:
     """Return descriptions of quantities of ``worlds`` that lie outside the range of the training worlds ``before``.
 
-    Example: ``["latency_s in 40 % of the worlds", "no friction"]``.
+    For instance, ``["latency_s in 40 % of the worlds", "no friction"]`` means that a latency lies outside the training
+    range in 40 % of the worlds, and that friction limits the brakes in the training worlds only.
     """
     unfamiliar, known, here = [], QUANTITY.of(before), QUANTITY.of(worlds)
     for key, rule in here.items():

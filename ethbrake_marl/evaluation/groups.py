@@ -16,11 +16,13 @@ def summarise_by(evaluation: Evaluation, by: str, *, baseline: str = BASELINE) -
     """Return one results table (``summarise``) for each group of worlds, by the group's name, in alphabetical order.
 
     Args:
-        evaluation: evaluation on a mixture, or on a scenario with types of vehicles.
-        by: what the worlds are grouped by, ``scenario`` or the type of a vehicle, such as ``vehicle_2_type``.
-        baseline: name of the agent to compare with.
+        evaluation: evaluation in the worlds of a mixture of scenarios, or of a scenario with vehicle types.
+        by: what the worlds are grouped by: ``scenario`` (one of the mixture's scenarios), or the type of a vehicle,
+            such as ``vehicle_2_type``.
+        baseline: name of the agent with which the other agents are compared.
 
-    Raises ``InvalidInput`` if the worlds have no groups, and ``UnknownName`` for an unknown ``by``.
+    Raises ``InvalidInput`` if the worlds have no groups (they come from one scenario without vehicle types), and
+    ``UnknownName`` if ``by`` is unknown.
 
     >>> import ethbrake_marl as eb
     >>> delays = eb.load_scenario("mixture-delays")

@@ -43,8 +43,8 @@ HASHES = 1 << 256  # sums of hashes are taken modulo this number
 def worlds_sha256(worlds: Worlds, index: Ints) -> str:
     """Return a hash of worlds as 64 hexadecimal digits. Equal worlds have equal hashes on every machine.
 
-    The hash is the SHA-256 of all arrays (little-endian, with their names) and of the numbers of the worlds. For more
-    than 100,000 worlds the hash is ``hash_of_chunks``, which needs less memory.
+    The hash is the SHA-256 of all arrays of ``worlds`` (little-endian, with their names) and of ``index``. For more
+    than 100,000 worlds, ``hash_of_chunks`` computes another hash, which needs less memory.
 
     Args:
         worlds: the n worlds at the alert.
@@ -61,7 +61,7 @@ def _hash_at_once(worlds: Worlds, index: Ints) -> str:
 
 
 def hash_of_chunks(worlds: Worlds, index: Ints) -> int:
-    """Return the sum modulo 2^256 of the SHA-256 of all chunks of 2,500 worlds.
+    """Return a hash of worlds: the SHA-256 of each chunk of 2,500 worlds, added up modulo 2^256.
 
     The first chunk contains the worlds with numbers 0 to 2,499, the second 2,500 to 4,999, and so on.
 
@@ -85,7 +85,7 @@ def _arrays_sha256(arrays: dict[str, np.ndarray]) -> str:
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
-    """Return the arrays of the dataclass ``value`` and of the dataclasses inside it, by name.
+    """Return the arrays that are fields of the dataclass ``value`` or of dataclasses inside it, by the field's name.
 
     Some arrays are omitted if they have no effect: messages and braking profiles if the worlds have none, build-up
     rates of brakes if all are infinite, and weights of harm if all are 1.
@@ -104,7 +104,7 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 def scenario_sha256(scenario: Scenario) -> str:
     """Return the SHA-256 (hexadecimal) of everything in a scenario that affects an episode, including default values.
 
-    Name, title, description and source are excluded.
+    The scenario's name, title, description and source do not affect the result.
     """
     content = scenario.content(without=_WORDS)
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
@@ -121,8 +121,8 @@ def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
 def result_versions() -> dict[str, str]:
     """Return the versions of Python and of every package on which the numbers of a result depend, by name.
 
-    The result includes extension packages that this process used, and the SHA-256 of the user's own Python files that
-    it ran.
+    The result includes the extension packages that this process used. The result also includes the SHA-256 of each
+    Python file of the user that this process ran.
     """
     return own_versions() | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
@@ -142,8 +142,10 @@ def result_identity(
     Args:
         kind: kind of results, such as ``evaluate`` or ``shield``.
         scenario: scenario of the worlds.
-        sample: the worlds. For a file with results on several samples pass None; then ``worlds_sha256`` is omitted.
-        left_out: rows of the sample that were left out because of errors; the hash does not include them.
+        sample: the worlds of the result; None if the file contains results of several samples. Without a sample,
+            ``worlds_sha256`` is omitted.
+        left_out: row numbers of the worlds in ``sample`` that were left out because of errors. The hash does not
+            include these worlds.
 
     """
     identity: dict[str, Any] = {

@@ -18,16 +18,17 @@ from ethbrake_marl.scenario.schema import Scenario
 
 
 def check_agents(agents: Mapping[str, Driver], worlds: Worlds, scenario: Scenario, *, warn: bool = False) -> None:
-    """Let every agent decide once, to find its errors before a long evaluation. Raises the errors of the agents.
+    """Let every agent decide once, so that an error in an agent is raised before a long evaluation.
 
     An agent whose commands do not depend on the state (``state_free``) decides in all worlds, other agents only in the
     first world.
 
     Args:
         agents: agents or teams by name.
-        worlds: worlds at the alert.
+        worlds: worlds at the alert in which the agents are to drive.
         scenario: scenario whose learners the agents drive.
-        warn: also warn about policies that drive in worlds unlike their training worlds (``warn_unfamiliar``).
+        warn: whether to also warn about policies that drive in worlds unlike their training worlds
+            (``warn_unfamiliar``).
 
     """
     if warn:
@@ -54,19 +55,20 @@ def make_lineup(
     alone: bool = False,
     bare: bool = False,
 ) -> dict[str, Driver]:
-    """Build one agent for each spec, and return the agents by spec.
+    """Build one agent for each text in ``specs``, and return a dictionary: text -> agent.
 
     Args:
         specs: texts that name agents (``"full_brake"``, ``"ppo+step"``), as a list or as one text with commas between
             the specs. The name of a group of agents, such as ``ladder``, is replaced by all agents of the group.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
-        uncertainty: uncertainty for shields that need one, as ``make_agent`` takes it.
-        alone: refuse teams, which drive several vehicles.
-        bare: refuse agents with a shield, because the caller adds one; with one learner, also refuse teams.
+        uncertainty: intervals around the reported quantities, for shields that need them, as in ``make_agent``.
+        alone: whether to refuse teams, because the caller needs agents that drive a single vehicle.
+        bare: whether to refuse agents with a shield, because the caller adds a shield. If the scenario has one learner,
+            teams are also refused.
 
-    Raises ``InvalidInput`` for a repeated spec, a missing or unused uncertainty, or a team or shield that is refused.
-    Also raises the errors of ``make_agent``.
+    Raises ``InvalidInput`` for a repeated spec, for an uncertainty that is missing or unused, and for a team or shield
+    that is refused. Also raises the errors of ``make_agent``.
 
     """
     listed = split_specs(specs) if isinstance(specs, str) else specs
@@ -97,14 +99,14 @@ def make_lineup(
 
 
 def make_agents(specs: Sequence[str], scenario: Scenario, *, harm_count: HarmCount = "first") -> dict[str, Agent]:
-    """Build one agent of a single vehicle for each spec, and return the agents by spec.
+    """Build one agent of a single vehicle for each text in ``specs``, and return a dictionary: text -> agent.
 
     Args:
         specs: texts that name agents, such as ``full_brake``.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that optimising agents minimise, ``first`` or ``total``.
 
-    Raises ``InvalidInput`` for a team, and the errors of ``make_lineup``.
+    Raises ``InvalidInput`` if a spec names a team, and the errors of ``make_lineup``.
 
     """
     return make_lineup(specs, scenario, harm_count=harm_count, alone=True)  # type: ignore[return-value]  # no teams

@@ -1,8 +1,8 @@
 """Measures of an agent, and sets of measures: the base class, the registry, and the set of the core package.
 
 A measure computes one value per world from an agent's outcome. Measures that need the same information about the worlds
-form a set. Extensions add sets with entry points of the group ``ethbrake_marl.measure_sets``. Tables, JSON and files
-show the measures of every installed set.
+form a set. Extensions add sets by declaring entry points of the group ``ethbrake_marl.measure_sets``. Results tables,
+JSON results and files with one row per world show the measures of every installed set.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ BASELINE = "full_brake"
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """One measure of an agent. Tables show the mean of its values; for true/false values, the fraction that is true.
+    """One measure of an agent. Tables show the mean of a measure, or how often a true/false measure is true.
 
-    ``of`` is a function that takes the agent's outcome and the context that ``MeasureSet.prepare`` returned. The
-    function returns one value per world, [n], or None if the measure is not defined for this outcome. A measure that
-    compares an agent with the baseline has the name of another measure as ``of``; ``against`` says how the values are
-    compared.
+    The field ``of`` is a function of the agent's outcome and of the context that ``MeasureSet.prepare`` returned. The
+    function returns one value per world, [n], or None if the measure is not defined for this outcome. If the measure
+    compares the agent with the baseline, ``of`` is instead the name of the measure to compare, and ``against`` says
+    how.
     """
 
     name: str  # key in JSON results, different for all measures
@@ -46,32 +46,32 @@ class Measure:
     always: bool = True  # whether JSON shows null for a missing value, instead of omitting the key
 
     def values(self, outcome: Outcome, context: Any) -> Values | None:
-        """Return the measure's value in every world of an outcome, [n].
+        """Return this measure's value in every world of an outcome, [n].
 
-        ``context`` is what the measure's set prepared for the evaluation (``contexts_of``). The result is None if the
-        measure is a comparison with the baseline, if its set does not apply (context ``Silent``), or if the measure is
-        not defined for this outcome.
+        ``context`` is the information about the worlds that the measure's set computed (``contexts_of``). The result is
+        None if the measure is a comparison with the baseline, if its set does not apply (context ``Silent``), or if the
+        measure is not defined for this outcome.
         """
         if isinstance(self.of, str) or isinstance(context, Silent):
             return None
         return self.of(outcome, context)
 
     def column(self) -> Column:
-        """Return the measure's column in a table: heading, name and number format."""
+        """Return the description of this measure's column in a table: heading, name and number format."""
         shown = {"digits": 1, "scale": 100.0, "unit": " %"} if self.percent else {}
         return Column(self.heading, self.name, short=self.short, **shown)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """Context of a set of measures that does not apply to an evaluation, so that its measures have no values."""
+    """Context of a set of measures that does not apply to an evaluation, and whose measures thus have no values."""
 
     because: str  # why the set does not apply: a clause for users, without capital and full stop
 
 
 @dataclass(frozen=True, slots=True)
 class GroupColumn:
-    """Column that a set of measures adds to the table of ``ethbrake evaluate`` on a group of scenarios."""
+    """Column that a set of measures adds to the table that ``ethbrake evaluate`` prints for a group of scenarios."""
 
     column: Column  # heading and number format of the column
     measures: Mapping[HarmCount, str]  # count of harm that the agents minimise -> name of the measure to show
@@ -103,28 +103,29 @@ class MeasureSet:
     not_in_long_lists: str = ""  # why the set does not apply to more than 100,000 worlds; "": the set applies
 
     def prepare(self, evaluation: Any) -> Any:
-        """Return the context of an ``Evaluation``, which ``Measure.of`` gets as its second argument.
+        """Return the context: the information about an ``Evaluation`` that the measures of this set need.
 
-        Return ``Silent`` with a reason if the set does not apply to the evaluation. By default return None.
+        ``Measure.of`` gets the context as its second argument. Return ``Silent`` with a reason if the set does not
+        apply to the evaluation. If a subclass does not override this method, the context is None.
         """
         return None
 
     def row(self, tally: Any, worlds: int, context: Any) -> dict[str, Any]:
-        """Return fields that the set adds to an agent's object in the JSON results; by default none.
+        """Return fields that this set adds to an agent's object in the JSON results; by default none.
 
-        The keys must be the same whether or not the set applies.
+        The fields must have the same keys in every evaluation, even if the set does not apply to it.
 
         Args:
             tally: sums of the agent's measures (``AgentTally``).
-            worlds: number of evaluated worlds.
-            context: what ``prepare`` returned (``Silent`` if the set does not apply); None for more than 100,000
-                worlds.
+            worlds: number of worlds in the evaluation.
+            context: the context that ``prepare`` returned (``Silent`` if the set does not apply); None if there are
+                more than 100,000 worlds.
 
         """
         return {}
 
     def warnings(self, rows: Sequence[Any]) -> Sequence[str]:
-        """Return warnings about a results table, each a clause without capital and full stop; by default none.
+        """Return warnings about a results table, each a clause without capital letter and full stop; by default none.
 
         ``rows`` are the table's rows (``SummaryRow``, one per agent).
         """
@@ -207,7 +208,7 @@ class RegisteredMeasures(MeasureSet):
     """Measures that the user registered with ``register_measure``.
 
     Args:
-        columns: names of their columns, which are the keys of ``Outcome.metrics``.
+        columns: names of the columns of these measures, which are the keys of ``Outcome.metrics``.
 
     """
 
@@ -223,9 +224,9 @@ EPISODE = EpisodeMeasures()
 
 
 def register_measure_set(name: str, measures: MeasureSet) -> None:
-    """Add a set of measures to every evaluation.
+    """Add a set of measures to every later evaluation of this process.
 
-    A package can instead declare an entry point of the group ``ethbrake_marl.measure_sets``.
+    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.measure_sets``.
 
     Args:
         name: name of the set, its key in ``MEASURE_SETS``.
@@ -251,14 +252,15 @@ MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets",
 
 
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:
-    """Return the context of each installed set of measures for an ``Evaluation``, by the set's name.
+    """Return the context (information about the worlds) of each installed set of measures, by the set's name.
 
-    The context is what ``MeasureSet.prepare`` returned: the set's information about the worlds, or ``Silent`` with the
-    reason why the set does not apply. The context is computed once per evaluation.
+    The context is what ``MeasureSet.prepare`` returned. If the set does not apply to the evaluation, the context is
+    ``Silent``, with the reason. The context is computed once per evaluation.
 
     Args:
         evaluation: the evaluation.
-        long_list: whether the evaluation is a chunk of more than 100,000 worlds, to which some sets do not apply.
+        long_list: whether ``evaluation`` is one chunk of a list of more than 100,000 worlds. Some sets do not apply to
+            such a long list.
 
     """
     silent = silent_in_long_lists() if long_list else {}
@@ -271,7 +273,7 @@ def silent_in_long_lists() -> dict[str, Silent]:
 
 
 def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
-    """Return why sets of measures do not apply, by ``MeasureSet.because_key``; None for a set that applies.
+    """Return why each set of measures does not apply (None: it applies), by the set's ``because_key``.
 
     ``contexts`` is the result of ``contexts_of``. Sets without a ``because_key`` are omitted.
     """
@@ -280,10 +282,10 @@ def silent_because(contexts: Mapping[str, Any]) -> dict[str, str | None]:
 
 
 def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
-    """Yield (name, set) for all sets of measures, in the order of JSON results.
+    """Yield the name and the object of every set of measures, in the order of JSON results.
 
-    ``EpisodeMeasures`` and ``RegisteredMeasures`` have the name "". ``columns`` are the keys of ``Outcome.metrics``,
-    the measures that the user registered.
+    The sets ``EpisodeMeasures`` and ``RegisteredMeasures`` have the name "". ``columns`` lists the columns of the
+    measures that the user registered (the keys of ``Outcome.metrics``).
     """
     yield "", EPISODE
     yield "", RegisteredMeasures(columns)
@@ -293,6 +295,6 @@ def every_set(columns: Iterable[str] = ()) -> Iterator[tuple[str, MeasureSet]]:
 def measures(columns: Iterable[str] = ()) -> tuple[Measure, ...]:
     """Return the measures of all sets, in the order of JSON results.
 
-    ``columns`` are the keys of ``Outcome.metrics``, the measures that the user registered.
+    ``columns`` lists the columns of the measures that the user registered (the keys of ``Outcome.metrics``).
     """
     return tuple(measure for _, each in every_set(columns) for measure in each.measures)

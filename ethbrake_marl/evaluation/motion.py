@@ -46,7 +46,8 @@ class EpisodeMotion:
 
 
 def follow_episodes(worlds: Worlds, agent: Driver, scenario: Scenario) -> list[EpisodeMotion]:
-    """Let an agent drive every world as in ``evaluate``, and return the motion of each world, in their order.
+    """Let an agent drive every world as in ``evaluate``, and return the motion of each world, in the order of
+    ``worlds``.
 
     Args:
         worlds: worlds at the alert.
@@ -70,7 +71,7 @@ class _Follower(Tape):
     Args:
         worlds: the worlds at the alert.
         team: agents of the controlled vehicles.
-        engine: engine that runs the episodes; its ``ruling`` says what the shield decided.
+        engine: simulator that runs the episodes; its ``ruling`` says what the shield decided.
 
     """
 
@@ -86,8 +87,8 @@ class _Follower(Tape):
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: commanded accelerations during the step, [n, N].
-            until_s: time at which the step ends, [n].
+            command_mps2: commanded accelerations during the step (m/s2), [n, N].
+            until_s: time since the alert at which the step ends (s), [n].
 
         """
         super().see(before, command_mps2, until_s)
@@ -98,7 +99,7 @@ class _Follower(Tape):
             self._ruling = ruling
 
     def motions(self, episodes: Episodes) -> list[EpisodeMotion]:
-        """Return the recorded motion of each world; ``episodes`` is the result of the finished run."""
+        """Return the recorded motion of each world after all episodes ended; ``episodes`` is their result."""
         n, N = self.worlds.n, self.worlds.N
         impacts, pieces = self.episodes(), self._pieces()
         motions = []
@@ -123,9 +124,9 @@ class _Follower(Tape):
         return motions
 
     def _pieces(self) -> list[Floats]:
-        """Return the motion of each world as k pieces with constant jerks, [k, 1 + 4 N] as in ``EpisodeMotion``.
+        """Return the motion of each world as k stretches of time with constant jerks, [k, 1 + 4 N].
 
-        A world whose episode ends at the alert has a single piece.
+        Each row is as in ``EpisodeMotion.pieces``. If an episode ends at the alert, its motion has a single row.
         """
         parts: list[list[Floats]] = [[] for _ in range(self.worlds.n)]
         way_m = np.zeros(self.worlds.n)
@@ -147,8 +148,8 @@ class _Follower(Tape):
 def join_pieces(pieces: Floats, vehicles: int) -> Floats:
     """Return the same motion with fewer pieces; a piece is a stretch of time in which all jerks are constant.
 
-    A piece is dropped if a continuation of the piece before it leads to the same state within rounding. If several
-    pieces begin within the same 0.1 ms, only the last of them is kept.
+    A piece is dropped if the piece before it, continued to the same time, leads to the same state up to rounding. If
+    several pieces begin within the same 0.1 ms, only the last of these pieces is kept.
 
     Args:
         pieces: time and state at the beginning of each piece, [k, 1 + 4 N], as in ``EpisodeMotion``.
@@ -171,7 +172,7 @@ def state_at(piece: Floats, time_s: float, vehicles: int) -> Floats:
 
     Args:
         piece: time and state at the beginning of the piece, [1 + 4 N].
-        time_s: time since the alert at which the state is wanted (s).
+        time_s: time of the returned state, counted from the alert (s).
         vehicles: number of vehicles, N.
 
     """

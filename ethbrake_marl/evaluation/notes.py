@@ -99,7 +99,7 @@ def _no_impact(rows: Sequence[SummaryRow]) -> str:
 
 
 def _knowledge(rows: Sequence[SummaryRow]) -> str:
-    """Return the note about what the V2X channel hides, about omniscient agents, and about unstated knowledge.
+    """Return the note about what the V2X channel hides, and about what the agents know nevertheless.
 
     The note is empty if the channel hides nothing in these worlds.
     """

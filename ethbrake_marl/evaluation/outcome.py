@@ -72,7 +72,7 @@ class Outcome:
     def join(cls, parts: Sequence[Outcome]) -> Outcome:
         """Join the outcomes of one agent in consecutive chunks of worlds into one outcome.
 
-        A field that is None in one of ``parts`` is None in the result.
+        If a field is None in one of ``parts``, this field is None in the result.
         """
         first, columns = parts[0], dict[str, Any]()
         for name in _COLUMNS:
@@ -85,7 +85,7 @@ class Outcome:
 
     @property
     def collided(self) -> Bools:
-        """Whether at least one impact happened, for each world, [n]."""
+        """For each world: whether at least one impact happened, [n]."""
         return self.ledger.collided
 
     @property
@@ -119,15 +119,15 @@ class Outcome:
 
     @property
     def ended(self) -> NDArray[np.str_]:
-        """How each episode ended, ``at_rest`` or ``horizon``, [n]."""
+        """For each world: how the episode ended (``at_rest`` or ``horizon``), [n]."""
         return np.where(self.at_rest, "at_rest", "horizon")
 
     def borne(self, objectives: Sequence[Declared] = ()) -> dict[str, Floats]:
         """Return the harm that each vehicle bears, and the vehicle's value under each objective (m2/s2).
 
-        The result maps the name of a column to its values [n]. For instance, the columns of Vehicle 2 are
-        ``first_impact_harm_2``, ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2`` and
-        ``social:45_total_2``.
+        The result is a dictionary: name of a column -> its values in the n worlds. For instance, the columns of Vehicle
+        2 are ``first_impact_harm_2``, ``total_harm_2`` and, with ``objectives=["social:45"]``, ``social:45_first_2``
+        and ``social:45_total_2``.
         """
         by_vehicle = {"first_impact_harm": self.vehicle_harm("first"), "total_harm": self.vehicle_harm("total")}
         for objective in objectives:
@@ -137,7 +137,7 @@ class Outcome:
         return {f"{name}_{i + 1}": each[:, i] for name, each in by_vehicle.items() for i in range(each.shape[1])}
 
     def columns(self) -> dict[str, Values | None]:
-        """Return the results of all worlds: name of a column (see docs/evaluate.md) -> values [n], or None."""
+        """Return the columns of a table with one row per world: name (docs/evaluate.md) -> values [n], or None."""
         final, obstacle = self.final, {}
         if (ahead := final.obstacle_ahead).any():
             obstacle = {
@@ -170,7 +170,7 @@ def none_for_nan(column: Values) -> list[Any]:
 
 
 class LeftOut(NamedTuple):
-    """A world that is left out for all agents, because the physics failed to simulate the world with one agent."""
+    """A world that is missing in the results of all agents, because its simulation with one agent failed."""
 
     world: int  # number of the world in its evaluation list, from 0
     seed: int | None  # seed of the evaluation list; None for worlds that the caller passed
@@ -183,7 +183,7 @@ class LeftOut(NamedTuple):
 
     @staticmethod
     def line(worlds: Sequence[str], whole: int) -> str:
-        """Return the note for users that some worlds were left out. The note lists at most ten of these worlds.
+        """Return a note for the user that some worlds were left out; the note lists at most ten of these worlds.
 
         Args:
             worlds: description of each left-out world, with the reason.

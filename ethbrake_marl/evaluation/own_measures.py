@@ -16,10 +16,10 @@ LOADED: dict[str, None] = {}  # all names that ``load_measures`` has loaded so f
 def load_measures(names: Iterable[str]) -> None:
     """Load measures by name. All later evaluations of this process report these measures.
 
-    A name is ``risk``, ``injury``, the name of a measure of an installed package, or ``FILE:NAME``. The name
-    ``my_file.py:measure`` runs the Python file ``my_file.py`` with your permissions, and takes ``measure`` from it: a
-    function, or a ``Part``, which is a function with settings for ``register_measure``. Raises ``UnknownName`` for an
-    unknown name, and ``InvalidInput`` for a measure that cannot be loaded.
+    A name is ``risk``, ``injury``, the name of a measure of an installed package, or ``FILE:NAME``. For
+    ``my_file.py:measure``, the Python file ``my_file.py`` is run with your permissions. The object ``measure`` in this
+    file must be a function, or a ``Part`` (a function together with settings for ``register_measure``). Raises
+    ``UnknownName`` for an unknown name, and ``InvalidInput`` for a measure that cannot be loaded.
     """
     for name in names:
         file, colon, own = name.rpartition(":")

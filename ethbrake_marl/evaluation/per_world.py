@@ -33,15 +33,15 @@ def write_per_world(
 ) -> None:
     """Write a table with one row per agent and world as CSV or Parquet.
 
-    docs/evaluate.md lists the columns. The row of a left-out world has only the world's number and, in the column
-    ``ended``, the reason. If an error occurs, no incomplete file is left behind.
+    docs/evaluate.md lists the columns. The row of a left-out world contains only the agent, the world's number and, in
+    the column ``ended``, the reason. If writing fails, no incomplete file is left behind.
 
     Args:
         path: file to write, with the ending ``.csv`` or ``.parquet``.
         evaluation: outcomes of the agents.
-        objectives: objectives such as ``"social:45"`` (docs/cooperation.md); each adds columns with its value for every
-            vehicle.
-        force: replace an existing file.
+        objectives: objectives such as ``"social:45"`` (docs/cooperation.md). For each objective the table has further
+            columns, with the value of the objective for each vehicle.
+        force: whether to replace an existing file.
 
     Raises ``AlreadyExists`` if the file exists and ``force`` is false, ``InvalidInput`` for a missing folder or another
     ending, ``MissingExtra`` for Parquet without pyarrow.
@@ -69,15 +69,16 @@ Harms = dict[str, dict[int, tuple[float, ...]]]  # agent -> world -> (first-impa
 
 
 def read_harms(path: Path, data: bytes) -> tuple[Harms, dict[int, str]]:
-    """Return (harms of each agent in each world, recording of each world) from a file of ``write_per_world``.
+    """Read a file of ``write_per_world``: the harms of each agent in each world, and each world's recording.
 
-    The second dictionary is empty if the file has no column ``recording``. Left-out worlds are omitted.
+    The result is two dictionaries. The second dictionary is empty if the file has no column ``recording``. Left-out
+    worlds are omitted.
 
     Args:
-        path: name of the file, whose ending decides the format. The file itself is not opened.
+        path: name of the file, whose ending decides the format. The file is not read, because ``data`` is its content.
         data: content of the file.
 
-    Raises ``InvalidInput`` if the file lacks the columns or has invalid values.
+    Raises ``InvalidInput`` if the file lacks a needed column or has an invalid value.
 
     """
     try:
@@ -153,9 +154,11 @@ def results_to_json(
 
     Args:
         rows: rows of the results table, one per agent.
-        rescored: mean values under other objectives (``Evaluation.rescore``), which each agent's object then contains.
-        groups: name of a group of worlds -> rows of the same agents on the worlds of this group (``summarise_by``).
-        per_world: existing file with one row per world; every object then contains its name and hash.
+        rescored: mean values of objectives (``Evaluation.rescore``), to be added to each agent's object.
+        groups: name of a group of worlds -> results of the same agents in this group (``summarise_by``), to be added to
+            each agent's object; None: there are no groups.
+        per_world: existing file with one row per agent and world, whose name and hash are added to each agent's object;
+            None: there is no such file.
         settings: settings of all agents by name, such as ``{"harm_count": "first"}``.
 
     """
@@ -183,7 +186,7 @@ class Result:
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """JSON object of the first agent. Use it to read entries that are equal for all agents, such as the hashes."""
+        """JSON object of the first agent, to read entries that are equal for all agents, such as the hashes."""
         return next(iter(self.rows.values()))
 
     def estimate(self, agent: str, harm: str) -> Estimate:
@@ -201,7 +204,7 @@ class Result:
     def harms(self) -> tuple[Harms, dict[int, str]]:
         """Read the file of ``--per-world`` that belongs to this results file, and return what ``read_harms`` returns.
 
-        Raises ``InvalidInput`` if there is no such file, or if it was changed.
+        Raises ``InvalidInput`` if there is no such file, or if the file was changed later.
         """
         beside = self.about.get("per_world")
         if not isinstance(beside, dict) or not isinstance(beside.get("file"), str):
@@ -272,9 +275,9 @@ def recorded_value(row: Mapping[str, Any], key: str) -> str | None:
 
 
 def _is_mean(mean: Any, interval: Any, draws: int) -> bool:
-    """Return whether ``mean`` is a mean harm, and ``interval`` an interval ``[low, high]`` that contains it.
+    """Return whether ``mean`` is a valid mean harm, and ``interval`` is None or ``[low, high]`` around the mean.
 
-    ``interval`` may be None. If ``draws``, the number of independent worlds, is 1, ``interval`` must be None.
+    If ``draws``, the number of independent worlds or recordings, is 1, ``interval`` must be None.
     """
     ends = [mean, mean] if interval is None else interval
     if not isinstance(ends, list) or len(ends) != 2 or (interval is not None and draws == 1):

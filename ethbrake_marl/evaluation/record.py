@@ -1,7 +1,7 @@
 """Record of one episode at fine time resolution, for figures and viewers.
 
-The episode is first run as in an evaluation. The state at each sample time is then computed from the state and the
-commands at the beginning of the step.
+The agent first drives the episode as in an evaluation. The state at each sample time is then computed from the state
+and the commands at the beginning of the time step that contains the sample time.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ SAMPLE_S = 0.02  # default time between two samples (s)
 
 @dataclass(frozen=True, slots=True)
 class EpisodeRecord:
-    """Motion of one world from the alert to the end of its episode, sampled at k times. Row 0 is the alert.
+    """Motion of one world from the alert to the end of its episode, sampled at k times, the first of which is the
+    alert.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -74,10 +75,10 @@ def record_episode(
 
     Args:
         world: the world at the alert, n = 1.
-        agent: agent or team. The object that you pass does not change.
+        agent: agent or team that drives the controlled vehicles. The object that you pass does not change.
         scenario: scenario of the world, whose scripts drive the other vehicles.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
-        sample_s: largest time between two samples (s). The times of decisions are always among the samples.
+        sample_s: largest time between two samples (s). The state at each decision is always one of the samples.
 
     Raises ``InvalidInput`` if there is not exactly one world, or if ``sample_s`` is not above 0.
 
@@ -103,14 +104,15 @@ def record_episode(
 def _samples(segments: Sequence[tuple[Worlds, Floats, Floats]], sample_s: float) -> Iterator[tuple[Floats, ...]]:
     """Yield the samples of each step: time [k], gaps [k, P], speeds [k, N], positions [k, N], commands [k, N].
 
-    Two samples of a step are at most ``sample_s`` apart (s). The end of a step is sampled as the beginning of the next
-    step, and the end of the last step as its last sample. A world does not contain positions, so Vehicle 1's position
-    is computed from its gap to an obstacle. If the world has no obstacle, an obstacle is assumed that Vehicle 1 cannot
-    reach.
+    Consecutive samples are at most ``sample_s`` seconds apart. The state at the end of a step counts as the first
+    sample of the next step, except for the last step. A world does not contain positions, so Vehicle 1's position is
+    computed from its gap to an obstacle. In a world without an obstacle, an obstacle is placed so far ahead that
+    Vehicle 1 cannot reach it.
 
     Args:
-        segments: steps of one world, each as (world at the beginning, commands [1, N], time of the end [1]).
-        sample_s: largest time between two samples (s).
+        segments: time steps of one episode, each as (world at the beginning of the step, commands [1, N] (m/s2), time
+            of the end of the step [1] (s)).
+        sample_s: largest time between two consecutive samples (s).
 
     """
     front = 0.0  # position of Vehicle 1 at the start of the segment

@@ -13,7 +13,7 @@ from ethbrake_marl.game.harm import HARM_COUNTS, HarmCount
 
 @dataclass(frozen=True, slots=True)
 class Rescored:
-    """Mean value of one objective for each vehicle, when one agent drives. Smaller values are better."""
+    """Mean value of one objective for each vehicle in the results of one agent. Smaller values are better."""
 
     agent: str  # name of the agent
     objective: str  # objective as in scenarios: ``total``, ``own``, ``social:45``
@@ -21,7 +21,7 @@ class Rescored:
     each: tuple[Estimate, ...]  # mean value per world (m2/s2) for each vehicle, front to rear
 
     def to_json(self) -> dict[str, Any]:
-        """Return the entry for JSON, with ``objective``, ``harm_count``, and each vehicle's mean and interval."""
+        """Return the object for JSON: ``objective``, ``harm_count``, and each vehicle's mean with its interval."""
         each = Estimate.side_by_side({f"vehicle_{i + 1}": estimate for i, estimate in enumerate(self.each)})
         return {"objective": self.objective, "harm_count": self.harm_count, **each}
 
@@ -30,7 +30,7 @@ class Rescores(list[Rescored]):
     """List of ``Rescored`` rows, shown by ``print`` and in notebooks as two tables: first-impact and total harm.
 
     Args:
-        rows: rows for each agent, objective and count of harm.
+        rows: one row for each agent, objective and count of harm.
         recordings: number of recordings that the worlds come from; 0: all worlds are independent.
 
     """

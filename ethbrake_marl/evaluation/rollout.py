@@ -1,6 +1,7 @@
 """Evaluate agents: draw a fixed list of worlds, let every agent drive each world once, and measure the results.
 
-The worlds are fixed in advance. Counting the episodes that finish first would favour short episodes, and so crashes.
+The worlds are fixed in advance. If instead the episodes that finish first were evaluated, short episodes would be
+over-represented, and many of these are crashes.
 """
 
 from __future__ import annotations
@@ -58,27 +59,28 @@ def evaluate(
 ) -> Evaluation:
     """Let each agent drive every world once, from the alert to the end of the episode.
 
-    The other vehicles follow the scenario's scripts. The outcome in a world does not depend on the other worlds. If the
-    physics fails in a world with one agent, the world is left out for all agents (``left_out``).
+    Vehicles that no agent controls follow the scenario's scripts. The outcome in a world does not depend on other
+    worlds. If the simulation of a world fails with one agent, the world is left out for all agents (``left_out``).
 
     Args:
         worlds: worlds at the alert, or a sample from ``scenario.sample``; None: draw ``episodes`` worlds from ``seed``.
-        agents: specs as on the command line (``"full_brake,ppo"``, or a list of specs), or a mapping from name to agent
-            or ``Team``. Each controlled vehicle gets a copy of its agent; the objects that you pass do not change.
-            Agents that are built from specs minimise first-impact harm.
+        agents: agents to evaluate: specs as on the command line (``"full_brake,ppo"``, or a list of specs), or a
+            mapping from name to agent or ``Team``. Each controlled vehicle gets a copy of its agent; the objects that
+            you pass do not change. Optimising agents that are built from specs minimise first-impact harm.
         scenario: scenario of the worlds, or its name or path.
         vehicle: the controlled vehicle, by name (``vehicle_2``) or index (0 = front); None: the scenario's learners.
         episodes: number of worlds to draw; None: 10,000.
-        seed: seed of the evaluation list; None: 7. If ``worlds`` is passed, the seed is only recorded in the result.
-        chunk: number of worlds simulated together, which does not change the results; None: 2,500.
+        seed: seed from which the worlds are drawn; None: 7. If ``worlds`` is passed, the seed is only recorded in the
+            result.
+        chunk: number of worlds that are simulated together; None: 2,500. The results do not depend on ``chunk``.
         on_progress: function that is called after each chunk with an agent's name and the number of worlds that the
             agent has driven so far.
-        aftermath: also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the user
-            registered. This takes longer.
+        aftermath: whether to also measure how far Vehicle 1 is shoved, the paper's sampled harm, and measures that the
+            user registered. This takes longer.
 
     Warns (``Unfamiliar``) about policies that drive in worlds unlike their training worlds. Raises ``PhysicsError`` if
-    every world is left out, and ``InvalidInput`` for worlds of another scenario, for worlds after the alert, and for
-    agents that do not fit the controlled vehicles.
+    every world is left out, and ``InvalidInput`` for worlds of another scenario, for worlds that are not at the alert,
+    and for agents that do not fit the controlled vehicles.
 
     """
     scenario = load_scenario(scenario)
@@ -106,7 +108,7 @@ def evaluate(
 
 
 def chunks_of(sample: Sample, size: int = CHUNK) -> Iterator[tuple[int, Sample]]:
-    """Yield consecutive chunks of at most ``size`` worlds, as pairs (row of the first world in the sample, chunk)."""
+    """Split a sample into chunks of at most ``size`` worlds; yield pairs (row of the chunk's first world, chunk)."""
     for first in range(0, sample.worlds.n, size):
         yield first, sample.take(np.arange(first, min(first + size, sample.worlds.n)))
 
@@ -122,16 +124,17 @@ def drive_chunk(
 ) -> Evaluation:
     """Let each agent drive all worlds of one chunk at once, from the alert to the end of their episodes.
 
-    If the physics fails in every world, the result has no worlds.
+    If every simulation fails, the returned ``Evaluation`` contains no world.
 
     Args:
-        sample: the worlds of the chunk.
+        sample: the worlds of the chunk, at the alert.
         agents: agents or teams by name.
         scenario: scenario of the worlds.
         seed: seed of the evaluation list, which is recorded in the result.
         vehicles: indices (0 = front) of the controlled vehicles.
-        first: row of the chunk's first world in the evaluation list, for error messages.
-        aftermath: also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user registered.
+        first: position of the chunk's first world among all evaluated worlds (from 0), for error messages.
+        aftermath: whether to also measure how far Vehicle 1 is shoved, sampled harm, and measures that the user
+            registered.
 
     """
     n, others = sample.worlds.n, [script.name for script in script_agents(scenario, except_for=vehicles).values()]
@@ -178,8 +181,9 @@ def _check_request(worlds: object, agents: object, chunk: object) -> None:
 def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: Mapping[str, Driver]) -> tuple[int, ...]:
     """Return the indices (0 = front) of the vehicles that the agents are to control.
 
-    This is ``vehicle`` (name or index), or all learners of the scenario if ``vehicle`` is None. If the scenario has no
-    learner, return an empty tuple if all agents are teams, and otherwise raise ``InvalidInput``.
+    The result contains ``vehicle`` (name or index) or, if ``vehicle`` is None, all learners of the scenario. For a
+    scenario without learners, ``vehicle`` may be None only if all agents are teams. The result is then empty; otherwise
+    ``InvalidInput`` is raised.
     """
     if vehicle is not None or (not scenario.learners and any(not isinstance(a, Team) for a in agents.values())):
         return (controlled_vehicle(scenario, vehicle),)
@@ -189,8 +193,9 @@ def controlled_vehicles(scenario: Scenario, vehicle: int | str | None, agents: M
 def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
     """Return the index (0 = front) of the single controlled vehicle.
 
-    This is ``vehicle`` (name or index), or the scenario's only learner if ``vehicle`` is None. Raises ``InvalidInput``
-    if ``vehicle`` is None and the scenario does not have exactly one learner, or if another vehicle is a learner.
+    The controlled vehicle is ``vehicle`` (name or index) or, if ``vehicle`` is None, the scenario's only learner.
+    Raises ``InvalidInput`` if ``vehicle`` is None and the scenario does not have exactly one learner, or if any vehicle
+    except ``vehicle`` is a learner.
     """
     learners = scenario.learners
     names = [scenario.vehicle_names[i] for i in learners]
@@ -217,9 +222,9 @@ def controlled_vehicle(scenario: Scenario, vehicle: int | str | None) -> int:
 def _roll_out(
     whole: Worlds, agent: Driver, vehicles: tuple[int, ...], scenario: Scenario, aftermath: bool, rows: Ints
 ) -> Outcome:
-    """Let copies of ``agent`` drive the worlds ``rows`` (row numbers) of ``whole``.
+    """Let copies of ``agent`` drive those worlds of ``whole`` whose row numbers are ``rows``.
 
-    The other arguments are as in ``drive_chunk``.
+    ``vehicles``, ``scenario`` and ``aftermath`` are the same arguments as in ``drive_chunk``.
     """
     team = Team.of(agent, vehicles)
     worlds = scenario.play_pieces(whole.take(rows), tuple(team.drivers))
@@ -263,7 +268,7 @@ def outcome_of(team: Team, episodes: Episodes) -> Outcome:
 
 
 def _read_column(team: Team, memory: Any, what: str, n: int) -> NDArray[np.generic] | None:
-    """Return the entry ``what`` of an agent's memory, one number per world [n], or None if there is no such entry."""
+    """Return the entry ``what`` of an agent's memory (one number per world, [n]), or None if there is no such entry."""
     value = memory.get(what) if isinstance(memory, Mapping) else None
     if value is None:
         return None

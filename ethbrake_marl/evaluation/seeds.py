@@ -1,8 +1,8 @@
-"""Statistics over trainings with different seeds: means whose intervals say what to expect of another seed.
+"""Statistics over training runs with different seeds; the intervals say what to expect of another seed.
 
-There are usually few seeds, and a single bad seed moves a mean a lot. The interquartile mean omits the best and the
-worst quarter. The error of the interquartile mean is estimated with a stratified bootstrap: seeds are resampled within
-each task (scenario), because seeds are random and tasks are not.
+There are usually few training runs, and a single bad run changes their mean a lot. The interquartile mean therefore
+omits the best and the worst quarter of the runs' results. Its error is estimated with a stratified bootstrap: seeds are
+resampled within each task (scenario), because seeds are random and tasks are not.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ _AT_ONCE = 1 << 20  # number of resampled worlds in memory at once (8 MB)
 
 
 def interquartile_mean(tasks: Sequence[ArrayLike], *, resamples: int = RESAMPLES, seed: int = 0) -> Estimate:
-    """Return the interquartile mean of all values, with its stratified bootstrap interval (percentiles).
+    """Return the interquartile mean of the results of training runs, with a stratified bootstrap interval.
 
-    The floor(n / 4) smallest and the floor(n / 4) largest of all n values are omitted. The interval is None if no task
-    has two seeds.
+    Of all n results, the floor(n / 4) smallest and the floor(n / 4) largest are omitted. The ends of the interval are
+    percentiles of the resampled means. The interval is None if no task has results of two seeds.
 
     Args:
-        tasks: results of the trainings on each task (scenario), one number per seed.
+        tasks: results of the training runs on each task (scenario), one number per seed.
         resamples: number of bootstrap resamples.
-        seed: seed of the bootstrap.
+        seed: seed of the bootstrap's random numbers.
 
-    Raises ``InvalidInput`` if there are no tasks, if a task has no values, or if a value is not finite.
+    Raises ``InvalidInput`` if there are no tasks, if a task has no results, or if a result is not finite.
 
     """
     from scipy.stats import bootstrap, trim_mean  # imported here because it takes a second to load
@@ -76,17 +76,17 @@ def mean_over_seeds(
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, with a bootstrap interval.
 
     The bootstrap resamples the seeds of ``values``, the seeds of ``baseline``, and the worlds (or clusters of worlds).
-    The interval is therefore valid for other seeds and other worlds. There is no interval for a single world or
-    cluster. Without a baseline, there is also no interval if all values are 0. Without a baseline, the interval of
-    true/false values always contains Wilson's interval, because bootstrap intervals of nearly constant values are too
-    narrow.
+    The interval therefore says what to expect of other seeds and other worlds. There is no interval if there is only
+    one world or cluster, or if no baseline is given and all values are 0. Without a baseline, the interval of
+    true/false values is widened so that it contains Wilson's interval, because bootstrap intervals of nearly constant
+    values are too narrow.
 
     Args:
-        values: result of the training with each seed in each world, [seeds, worlds].
-        baseline: results to subtract, in the same worlds, [seeds, worlds]; the number of seeds may differ.
-        clusters: name of the cluster of each world, [worlds]. Only clusters are independent of each other. If this is
-            None, all worlds are independent.
-        seed: seed of the bootstrap.
+        values: result of the training run with each seed in each world, [seeds, worlds].
+        baseline: results to subtract, in the same worlds, [seeds, worlds]; the number of seeds may differ from the
+            number in ``values``.
+        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
+        seed: seed of the bootstrap's random numbers.
 
     Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite.
 
@@ -114,15 +114,15 @@ def share_over_seeds(
     """Return the share of the possible reduction: 0 for values as bad as ``worst``, 1 for values as good as ``best``.
 
     The share is ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``, with a bootstrap interval as in
-    ``mean_over_seeds``. Returns None unless the mean of ``best`` is below the mean of ``worst`` and, in more than 95 %
-    of the resamples, the difference of the means is above 0.1 % of the original difference.
+    ``mean_over_seeds``. Returns None unless ``mean(best) < mean(worst)``. Also returns None unless, in more than 95 %
+    of the resamples, ``mean(worst) - mean(best)`` is above 0.1 % of this difference in the original data.
 
     Args:
-        values: harms of the trainings to judge, [seeds, worlds] (m2/s2).
+        values: harms of the training runs to judge, [seeds, worlds] (m2/s2).
         worst: harms of the agent whose share is 0 by definition, in the same worlds, [seeds, worlds].
         best: harms of the agent whose share is 1 by definition, in the same worlds, [seeds, worlds].
-        clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
-        seed: seed of the bootstrap.
+        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
+        seed: seed of the bootstrap's random numbers.
 
     """
     sides = _pair_sides("share_over_seeds", values, worst, best)
@@ -141,10 +141,10 @@ def share_over_seeds(
 
 
 def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
-    """Return each of ``sides`` as an array [seeds, worlds].
+    """Return each of ``sides`` (the results to compare) as an array [seeds, worlds].
 
-    Raises ``InvalidInput`` if the numbers of worlds differ or a value is not finite. ``who`` is the name of the calling
-    function, for the message.
+    Raises ``InvalidInput`` if the numbers of worlds differ, or if a value is not finite. ``who`` is the name of the
+    calling function, for error messages.
     """
     arrays = tuple(np.atleast_2d(np.asarray(side, np.float64)) for side in sides)
     if any(side.ndim != 2 or not side.size or side.shape[1] != arrays[0].shape[-1] for side in arrays):
@@ -160,14 +160,15 @@ def _pair_sides(who: str, *sides: ArrayLike) -> tuple[Floats, ...]:
 def _resampled(
     value: float, sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Texts | None, seed: int
 ) -> Estimate:
-    """Return ``value`` with a bootstrap interval, or without an interval for a single world or cluster.
+    """Return ``value`` with a bootstrap interval, or without an interval if there is only one world or cluster.
 
     Args:
         value: the estimate.
-        sides: arrays [seeds, worlds], whose seeds and common worlds are resampled.
-        of: function of the resampled means [resamples, sides], whose percentiles are the ends of the interval.
-        clusters: name of the cluster of each world, [worlds]; None: all worlds are independent.
-        seed: seed of the bootstrap.
+        sides: results to resample, each an array [seeds, worlds] in the same worlds.
+        of: function that computes a statistic from the resampled means [resamples, sides]. The ends of the interval are
+            percentiles of this statistic.
+        clusters: name of the cluster (recording) of each world, [worlds]; None: all worlds are independent.
+        seed: seed of the bootstrap's random numbers.
 
     """
     worlds = sides[0].shape[1]
@@ -182,13 +183,13 @@ def _resampled(
 def _resample_means(sides: Sequence[Floats], cluster: Ints, resamples: int, seed: int) -> Floats:
     """Return the mean of each side (array of results) in each bootstrap resample, [resamples, sides].
 
-    Seeds are resampled separately for each side. The clusters are resampled once for all sides together. A drawn
-    cluster contributes all its worlds.
+    Seeds are resampled separately for each of ``sides``. Clusters of worlds are resampled once for all of them, and a
+    drawn cluster contributes all its worlds.
 
     Args:
-        sides: arrays [seeds, worlds].
+        sides: results to resample, each an array [seeds, worlds] in the same worlds.
         cluster: number of each world's cluster, from 0, [worlds].
-        resamples: number of resamples.
+        resamples: number of bootstrap resamples.
         seed: seed of the random numbers.
 
     """

@@ -31,7 +31,7 @@ CHUNK = 500  # number of worlds simulated together, to limit memory; does not ch
 
 
 class VehicleRow(NamedTuple):
-    """Results of one vehicle of the line behind a shield in step mode."""
+    """Results of one vehicle of the line while the agent drives with a shield in step mode."""
 
     vehicle: str  # name of the vehicle, such as ``vehicle_2``
     replaced: float | None  # fraction of the vehicle's decisions that the shield replaced; None: it has no shield
@@ -64,7 +64,7 @@ class ModeRow:
     policy_sha256: Mapping[str, str] = field(default_factory=dict)  # vehicle's name -> SHA-256 of its policy
 
     def to_json(self) -> dict[str, Any]:
-        """Return the row's JSON object. Missing values are null; intervals are ``[low, high]``."""
+        """Return the row as an object for JSON; missing values are null, and intervals are ``[low, high]``."""
         shares = self.verdicts or (None,) * len(VERDICTS)
         return {
             "agent": self.agent,
@@ -91,7 +91,7 @@ class ShieldModes(list[ModeRow]):
         return all(row.against_episode is None for row in self)
 
     def to_json(self, sample: Sample, task: Task) -> list[dict[str, Any]]:
-        """Return the content of a results file of ``ethbrake shield``: one object per row.
+        """Return the content of a results file of ``ethbrake shield``: one object per agent and mode.
 
         Args:
             sample: the worlds that were passed to ``compare_modes``.
@@ -106,7 +106,7 @@ class ShieldModes(list[ModeRow]):
         return [about | row.to_json() for row in self]
 
     def sheets(self) -> list[Sheet]:
-        """Return tables for a terminal: harm of each agent and mode; for teams also the harm of each vehicle."""
+        """Return tables for a terminal: harm of each agent in each mode; for teams also each vehicle's harm."""
         share, teams = partial(Column, digits=1, scale=100.0, unit=" %"), self.of_teams
         head = [Column("agent, mode", text=True), Column("harm", interval="hidden")]
         head += [Column("minus no shield" if teams else "minus episode mode", sign="+")]
@@ -136,22 +136,24 @@ def compare_modes(
     clusters: Texts | None = None,
     on_progress: Callable[[str, int], None] | None = None,
 ) -> ShieldModes:
-    """Compare every agent without a shield, with a shield in episode mode, and in step mode, in the same worlds.
+    """Compare every agent in the same worlds: without a shield, with one in episode mode, and with one in step mode.
 
-    Step mode is also run with rollouts of the policy only at the alert (``step-alert``). For teams, which have no
-    episode mode, step mode is also run with a cap of each vehicle's harm (``step-cap``). For each decision that step
-    mode replaced, the episode is simulated again with the policy driving unshielded from this decision on. If the
-    physics fails in a world with one agent, the world is left out for all agents, and ``left_out`` of each row lists
-    it.
+    Two variants of step mode are also compared. In ``step-alert`` the shield simulates the policy's rollout only at the
+    alert. In ``step-cap`` the shield limits each vehicle's harm (``cap="baseline"``). ``step-cap`` is for teams only,
+    which have no episode mode. For each decision that step mode replaced, the episode is simulated again; from this
+    decision on, the policy drives without a shield. If the simulation of a world fails with one agent, the world is
+    left out for all agents, and every row lists it in ``left_out``.
 
     Args:
         agents: agents or teams by name, without a shield. The objects that you pass do not change.
         worlds: worlds at the alert.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        behind: whether ``agents`` already have shields. If so, the policies behind episode and step shields are
-            compared, and all other agents are ignored; the result is empty if no agent has such a shield.
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
-        on_progress: function that is called with an agent's name and the number of worlds that it has driven so far.
+        behind: whether ``agents`` already have shields. If they have, the policies of agents with a shield in episode
+            or step mode are compared, and all other agents are ignored. If no agent has such a shield, the result is
+            empty.
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
+        on_progress: function that is called with an agent's name and the number of worlds that the agent has driven so
+            far.
 
     Raises ``InvalidInput`` if a shield refuses the scenario, ``PhysicsError`` if every world is left out.
 
@@ -178,7 +180,7 @@ def compare_modes(
 
 
 class _Part(NamedTuple):
-    """Results of one chunk of worlds in one mode. ``shielded`` and ``verdicts`` exist in step mode only."""
+    """Results of one chunk of worlds in one mode of the shield. Only step mode has ``shielded`` and ``verdicts``."""
 
     harm: Floats  # [n] harm of the line in each world (m2/s2)
     moving: int  # number of worlds in which a vehicle still moves at the horizon
@@ -193,9 +195,9 @@ def _compare(
     clusters: Texts | None,
     on_progress: Callable[[str, int], None] | None,
 ) -> list[ModeRow]:
-    """Return the rows of all agents and modes. The arguments are as in ``compare_modes``.
+    """Return the result rows of all agents and modes; the arguments are the same as in ``compare_modes``.
 
-    Raises ``PhysicsError`` with the worlds in which the physics failed.
+    Raises ``PhysicsError`` with the worlds whose simulation failed.
     """
     rows = []
     for name, agent in agents.items():
@@ -236,15 +238,16 @@ def _measured(worlds: Worlds, agent: Driver, task: Task) -> dict[Mode, _Part]:
 def _row(
     agent: str, mode: Mode, parts: list[_Part], harm: Mapping[Mode, Floats], task: Task, clusters: Texts | None
 ) -> ModeRow:
-    """Return the row of an agent in one mode.
+    """Return the result row of one agent with the shield in one mode.
 
     Args:
         agent: name of the agent.
         mode: the shield's mode.
-        parts: results of all chunks of worlds in this mode.
-        harm: mode -> harm of the agent in every world, [n]. The row compares its mode with the other modes.
+        parts: results of the agent in this mode, one entry for each chunk of worlds.
+        harm: mode of the shield -> harm of the agent in every world (m2/s2), [n]. The returned row also contains the
+            differences from the harm in other modes.
         task: the scenario, the controlled vehicles, and the count of harm that the shield bounds.
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     """
 

@@ -4,9 +4,10 @@ The worlds of an evaluation list are independent draws, and every agent drives t
 score interval, means have the t interval. Comparisons with a baseline are paired by world, which removes the spread
 between easy and hard worlds. Sums are exact, so results do not depend on the order of the worlds.
 
-Worlds that come from the same recording form a *cluster*, and only clusters are independent of each other. Errors are
-then cluster-robust with the factor G / (G - 1) for G clusters, and t has G - 1 degrees of freedom (Cameron and Miller
-2015, "A practitioner's guide to cluster-robust inference", Journal of Human Resources 50(2)).
+Worlds that come from the same recording form a *cluster*, and only clusters are independent of each other. If worlds
+have clusters, standard errors are cluster-robust with the factor G / (G - 1) for G clusters, and t has G - 1 degrees of
+freedom (Cameron and Miller 2015, "A practitioner's guide to cluster-robust inference", Journal of Human Resources
+50(2)).
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ Texts = NDArray[np.str_]
 def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
     """Return the exact sum of ``values`` [n], or of the products ``values * others``, without rounding.
 
-    A float64 is a whole number of 53 bits times a power of two. The whole numbers with the same power are added as
-    Python integers, which never overflow. The result therefore does not depend on the order of the values, and sums of
-    chunks can be added without error. Raises ``InvalidInput`` unless all numbers are finite.
+    Each float64 is a whole number of 53 bits times a power of two. Whole numbers that belong to the same power of two
+    are added as Python integers, which never overflow. The result therefore does not depend on the order of the values,
+    and sums over chunks of worlds can be added without error. Raises ``InvalidInput`` unless all numbers are finite.
     """
     wholes, powers = _in_wholes(values)
     if others is not None:
@@ -43,11 +44,11 @@ def exact_sum(values: Floats, others: Floats | None = None) -> Fraction:
 
 
 def cluster_sums(values: Floats, clusters: Texts) -> dict[str, tuple[int, Fraction]]:
-    """Return the number of values in each cluster, and their exact sum, by the cluster's name.
+    """Return a dictionary: name of a cluster -> number of values in the cluster, and exact sum of these values.
 
     Args:
-        values: the values, [n].
-        clusters: name of the cluster of each value, [n].
+        values: numbers to add, [n].
+        clusters: name of the cluster (recording) of each value, [n].
 
     Raises ``InvalidInput`` if a value is not finite, or if the arrays have different lengths.
 
@@ -80,7 +81,7 @@ _UPPER = 0.5 + 0.5 * CONFIDENCE  # quantile at the upper end of an interval
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """Number, exact sum and exact sum of squares of values. Moments of chunks can be added in any order.
+    """Number of values, their exact sum, and the exact sum of their squares. Two ``Moments`` can be added.
 
     >>> import numpy as np
     >>> from ethbrake_marl.evaluation.statistics import Moments
@@ -100,11 +101,11 @@ class Moments:
 
     @classmethod
     def of(cls, values: Floats, clusters: Texts | None = None) -> Moments:
-        """Return the moments (number, sum and sum of squares) of values.
+        """Return the moments of ``values``: their number, their sum, and the sum of their squares.
 
         Args:
-            values: the values, [n].
-            clusters: name of the cluster of each value, [n]; None: all values are independent.
+            values: numbers, one per world, [n].
+            clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
 
         Raises ``InvalidInput`` if a value is not finite.
 
@@ -121,7 +122,7 @@ class Moments:
         return Moments(self.count + other.count, total, squares, negative, clusters)
 
     def minus(self, other: Moments, products: Fraction) -> Moments:
-        """Return the moments of the differences ``value - other`` in each world.
+        """Return the moments of the differences ``value - other``, one difference per world.
 
         Args:
             other: moments of the values to subtract, in the same worlds.
@@ -134,20 +135,21 @@ class Moments:
 
     @property
     def independent(self) -> int:
-        """Number of independent draws: number of clusters if there are clusters, else number of values."""
+        """Number of independent draws: the number of clusters or, without clusters, the number of values."""
         return len(self.clusters) or self.count
 
     @property
     def mean(self) -> float:
-        """Mean of the values, computed exactly and then rounded. Raises ``ZeroDivisionError`` without values."""
+        """Mean of the values, computed exactly and then rounded. Without values, ``ZeroDivisionError`` is raised."""
         return float(self.total / self.count)
 
     @property
     def standard_error(self) -> float:
         """Standard error of the mean, ``s / sqrt(n)``, where s is the standard deviation with n - 1 degrees of freedom.
 
-        With G clusters the standard error is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where D_g is the sum of the
-        deviations from the mean in cluster g. Raises ``ZeroDivisionError`` for fewer than two values or clusters.
+        With G clusters, the standard error is ``sqrt(G / (G - 1) * sum of D_g ** 2) / n``, where n is the number of
+        values, and D_g the sum of the deviations from the mean in cluster g. Raises ``ZeroDivisionError`` for fewer
+        than two values or clusters.
         """
         n = self.count
         if self.clusters:
@@ -157,20 +159,20 @@ class Moments:
 
     @property
     def estimate(self) -> Estimate:
-        """Mean with its t interval (see the function ``mean``). Raises ``ZeroDivisionError`` without values."""
+        """Mean with its t interval (see the function ``mean``). Without values, ``ZeroDivisionError`` is raised."""
         estimate = self._around(self.mean, self.standard_error if self.independent > 1 else 0.0)
         return estimate if self.negative else of_amounts(estimate, nothing=not self.squares)
 
     @property
     def share(self) -> Estimate:
-        """Mean p of values that are 0 or 1, with Wilson's interval (``rate``).
+        """Mean p of values, each of which is 0 or 1, with Wilson's interval (``rate``).
 
-        With G clusters, Wilson's interval is computed for an effective number of independent draws. The effective
-        number is ``1 + p (1 - p) / error ** 2``, the number with which independent draws would have the same standard
-        error, but at most the number of values. If all values agree, the effective number is G. The effective number is
-        then multiplied by ``(z / t) ** 2``, because the standard error has G - 1 degrees of freedom (Korn and Graubard
-        1998, "Confidence intervals for proportions with small expected number of positive counts estimated from survey
-        data", Survey Methodology 24). There is no interval for a single cluster.
+        With G clusters, Wilson's interval is computed for an effective number of independent draws: the number of
+        independent draws that would have the same standard error, ``1 + p (1 - p) / error ** 2``, but at most the
+        number of values. If all values are equal, this number is G. The number is then multiplied by ``(z / t) ** 2``,
+        with z and t the quantiles of the normal and the t distribution, because the standard error has G - 1 degrees of
+        freedom (Korn and Graubard 1998, "Confidence intervals for proportions with small expected number of positive
+        counts estimated from survey data", Survey Methodology 24). There is no interval for a single cluster.
         """
         if not self.clusters:
             return rate(int(self.total), self.count)
@@ -187,12 +189,13 @@ class Moments:
 
         The residuals ``values - r * others`` have mean 0, so the error is
         ``std(residuals) / (sqrt(n) * abs(mean(others)))``. The square of the error is
-        ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where x are the values, y the others, Sx and Sy
-        their sums, and Qxx, Qxy and Qyy the sums of products. With clusters, x and y are the sums of the clusters.
+        ``n * (Qxx Sy^2 - 2 Sx Sy Qxy + Sx^2 Qyy) / ((n - 1) * Sy^4)``, where n is the number of values, x are the
+        values, y are the others, Sx and Sy are their sums, and Qxx, Qxy and Qyy are the sums of x x, x y and y y. With
+        clusters, n is the number of clusters, and x and y are the sums of values and others in each cluster.
 
         Args:
-            others: moments of the denominator, in the same worlds.
-            products: exact sum over all worlds of ``value * other``.
+            others: moments of ``others``, the values in the denominator, in the same worlds.
+            products: exact sum over all worlds of the product ``value * other``.
 
         """
         n, x, y, xx, yy = self.independent, self.total, others.total, self.squares, others.squares
@@ -208,7 +211,7 @@ class Moments:
         """Return ``1 - mean(values) / mean(baseline)`` with its interval; None if the baseline's mean is 0.
 
         Args:
-            baseline: moments of the baseline, in the same worlds.
+            baseline: moments of the baseline's values, in the same worlds.
             products: exact sum over all worlds of ``value * baseline``.
 
         """
@@ -218,9 +221,10 @@ class Moments:
         return self._around(1.0 - float(self.total / baseline.total), error)
 
     def _around(self, value: float, error: float) -> Estimate:
-        """Return ``value`` with the interval ``value -+ t error``, or without an interval for a single draw.
+        """Return ``value`` with the interval ``value -+ t error``, or without an interval if there is only one draw.
 
-        ``error`` is the standard error. The degrees of freedom of t are the number of independent draws minus 1.
+        ``error`` is the standard error of ``value``. The degrees of freedom of t are the number of independent draws
+        minus 1.
         """
         if self.independent < 2:
             return Estimate(value, None)
@@ -232,9 +236,9 @@ def of_amounts(estimate: Estimate, *, nothing: bool) -> Estimate:
     """Return the estimate of a mean of non-negative values, with an interval that does not extend below 0.
 
     Args:
-        estimate: the estimate with the usual interval.
-        nothing: whether all values are 0. If so, the result has no interval: the sample shows that other values are
-            rare, but not how large they are.
+        estimate: mean with an interval that may extend below 0.
+        nothing: whether all values are 0. In this case the result has no interval: zeros show that larger values are
+            rare, but not how large such values can be.
 
     """
     if nothing or estimate.interval is None:
@@ -252,8 +256,8 @@ def rate(successes: int, count: int) -> Estimate:
     """Return the share ``p = successes / count`` with Wilson's score interval, which lies within [0, 1].
 
     The interval has the centre ``(p + z^2/2n) / (1 + z^2/n)`` and the half-width
-    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``, where n is the count and z the normal quantile. Raises
-    ``InvalidInput`` unless 0 <= successes <= count and count >= 1.
+    ``z / (1 + z^2/n) sqrt(p (1 - p) / n + z^2/4n^2)``, where n is ``count``, and z the quantile of the normal
+    distribution. Raises ``InvalidInput`` unless 0 <= successes <= count and count >= 1.
     """
     if not (count >= 1 and 0 <= successes <= count):
         raise InvalidInput(
@@ -266,7 +270,7 @@ def wilson(p: float, count: float) -> tuple[float, float]:
     """Return the ends (low, high) of Wilson's 95 % score interval of a share.
 
     Args:
-        p: observed share, 0 to 1. ``p * count`` need not be a whole number.
+        p: observed share, 0 to 1. The number of successes, ``p * count``, need not be a whole number.
         count: number of independent draws, not necessarily a whole number.
 
     """
@@ -280,14 +284,15 @@ def wilson(p: float, count: float) -> tuple[float, float]:
 
 
 def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
-    """Return the mean of values with the interval ``mean -+ t s / sqrt(n)``; t has n - 1 degrees of freedom.
+    """Return the mean of n values with its 95 % t interval, ``mean -+ t s / sqrt(n)``.
 
+    In the formula, s is the standard deviation, and t the quantile of the t distribution with n - 1 degrees of freedom.
     The interval assumes that the mean is normally distributed, which is nearly true for thousands of worlds. If no
     value is negative, the interval does not extend below 0. If all values are 0, there is no interval.
 
     Args:
-        values: the values, [n].
-        clusters: name of the cluster of each value, [n]; None: all values are independent.
+        values: numbers to average, one per world, [n].
+        clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
 
     Raises ``InvalidInput`` if ``values`` is empty or not finite.
 
@@ -296,11 +301,11 @@ def mean(values: Floats, clusters: Texts | None = None) -> Estimate:
 
 
 def share_of(truths: Bools, clusters: Texts | None = None) -> Estimate:
-    """Return the fraction of true values, with the interval of ``Moments.share``.
+    """Return the fraction of values that are true, with Wilson's interval (``Moments.share``).
 
     Args:
-        truths: the values, [n].
-        clusters: name of the cluster of each value, [n]; None: all values are independent.
+        truths: true/false values, one per world, [n].
+        clusters: name of the cluster (recording) of each value, [n]; None: all values are independent.
 
     """
     return Moments.of(check(truths), clusters).share
@@ -310,9 +315,9 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
     """Return the mean of ``values - baseline`` with its t interval.
 
     Args:
-        values: the values, [n].
-        baseline: the values to subtract, in the same worlds, [n].
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        values: numbers from which the baseline is subtracted, one per world, [n].
+        baseline: numbers to subtract, in the same worlds, [n].
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     Raises ``InvalidInput`` if the lengths differ, or if an array is empty or not finite.
 
@@ -322,17 +327,18 @@ def paired_difference(values: Floats, baseline: Floats, clusters: Texts | None =
 
 
 def unpaired_difference(value: Estimate, n: int, baseline: Estimate, m: int) -> Estimate:
-    """Return ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
+    """Return the difference ``value - baseline`` of two means over n and m independent worlds, with Welch's interval.
 
-    The standard errors s1 and s2 of the two means are the half-widths of their t intervals, divided by the t quantiles.
-    The difference has the standard error ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))``
-    degrees of freedom. If one of the two means has no interval, the difference has no interval either.
+    The standard errors s1 and s2 of the two means are computed from their t intervals: each is half of the interval's
+    width, divided by the quantile of the t distribution. The difference has the standard error
+    ``s = sqrt(s1^2 + s2^2)``, with ``s^4 / (s1^4 / (n - 1) + s2^4 / (m - 1))`` degrees of freedom. If one of the two
+    means has no interval, the difference has no interval either.
 
     Args:
-        value: first mean with its interval.
-        n: number of worlds of the first mean; with clusters, number of its clusters.
-        baseline: second mean with its interval.
-        m: number of worlds of the second mean; with clusters, number of its clusters.
+        value: mean from which the baseline is subtracted, with its interval.
+        n: number of worlds of ``value`` or, with clusters, number of their clusters.
+        baseline: mean to subtract, with its interval.
+        m: number of worlds of ``baseline`` or, with clusters, number of their clusters.
 
     """
     difference = value.value - baseline.value
@@ -355,9 +361,9 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
     """Return ``1 - mean(values) / mean(baseline)`` with its interval by the delta method (``Moments.ratio_error``).
 
     Args:
-        values: the values, [n].
-        baseline: values of the baseline in the same worlds, [n].
-        clusters: name of the cluster of each world, [n]; None: all worlds are independent.
+        values: numbers to compare with the baseline, one per world, [n].
+        baseline: numbers of the baseline, in the same worlds, [n].
+        clusters: name of the cluster (recording) of each world, [n]; None: all worlds are independent.
 
     Returns None if the baseline's mean is 0. Raises ``InvalidInput`` if the lengths differ, or if an array is empty or
     not finite.
@@ -368,12 +374,12 @@ def relative_decrease(values: Floats, baseline: Floats, clusters: Texts | None =
 
 
 def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Floats:
-    """Return ``values`` as an array of floats, [n].
+    """Check ``values``, and return them as an array of floats, [n].
 
     Args:
         values: the numbers.
-        who: name of the calling function, for the message.
-        each: what each number belongs to (``world`` or ``seed``), for the message.
+        who: name of the calling function, for error messages.
+        each: what each number belongs to (``world`` or ``seed``), for error messages.
 
     Raises ``InvalidInput`` unless the array is one-dimensional, not empty and finite.
 
@@ -387,7 +393,7 @@ def check(values: ArrayLike, who: str = "statistics", each: str = "world") -> Fl
 
 
 def _check_pair(values: Floats, baseline: Floats, clusters: Texts | None) -> tuple[Moments, Moments, Fraction]:
-    """Return the moments of ``values`` and of ``baseline``, and the exact sum of their products."""
+    """Return the moments of ``values`` and of ``baseline``, and the exact sum of the products ``value * baseline``."""
     data, reference = check(values), check(baseline)
     if data.shape != reference.shape:
         raise InvalidInput(

@@ -49,8 +49,8 @@ class SummaryTable(list[SummaryRow]):
     """List with one row per agent, which ``print`` and notebooks show as a results table.
 
     Args:
-        rows: results of each agent.
-        beside: rows from another source to print below; None: no such rows.
+        rows: one row of results for each agent.
+        beside: rows from another source, to print below the agents; None: there are no such rows.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -88,7 +88,8 @@ class SummaryTable(list[SummaryRow]):
         """Return the explanations of the columns: heading of the column -> text.
 
         Columns whose headings agree up to a comma, such as "Decrease, total" and "Decrease, first-impact", have one
-        common explanation under the heading "Decrease". Measures that the user registered come last.
+        common explanation under the heading "Decrease". The explanations of measures that the user registered come
+        last.
         """
         about = {each.heading.partition(",")[0]: each.about for each in measures() if each.about and each.heading}
         own = [registered_measure(column) for column in self[0].metrics] if self else []
@@ -97,8 +98,8 @@ class SummaryTable(list[SummaryRow]):
     def sheet(self) -> Sheet:
         """Return the table with all columns: agent, its knowledge, and every measure that has a heading.
 
-        Measures that the user registered come last. Means that are lower bounds of the true means
-        (``SummaryRow.bounds``) are marked ``≥``. Rows from other sources follow below the agents.
+        The columns of measures that the user registered come last. Means that are lower bounds of the true means
+        (``SummaryRow.bounds``) are marked ``≥``. Rows from other sources stand below the agents.
         """
         columns = [each.column() for each in measures() if each.heading]
         columns += [Column(heading_of(name), COLUMN + name) for name in (self[0].metrics if self else ())]
@@ -139,7 +140,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [Column("Agent,\nwhat it knows", text=True), *columns], lines, self._conditions(), gap=1)
 
     def _narrow(self) -> tuple[str, ...]:
-        """Return the names of the measures that a narrow terminal shows."""
+        """Return the names of the measures that the table in a narrow terminal shows."""
         last: tuple[str, ...] = EPISODE.narrow
         for _, each in every_set():
             if self and any(self[0].estimates.get(name) is not None for name in each.narrow):
@@ -187,7 +188,7 @@ class SummaryTable(list[SummaryRow]):
     def notes(self) -> list[Note]:
         """Return the notes to print below the table: notes about the agents, then notes about rows of other sources.
 
-        Each note is a pair: kind (``note`` or ``quiet``) and text.
+        Each note is a pair: its kind (``note``, or ``quiet`` for a less prominent note) and its text.
         """
         return [*notes_of(self), *(self.beside.notes if self and self.beside else ())]
 
@@ -197,7 +198,8 @@ def summarise(evaluation: Evaluation, *, baseline: str = BASELINE) -> SummaryTab
 
     Args:
         evaluation: outcomes of the agents, from ``evaluate``.
-        baseline: name of the agent to compare with. If this agent was not evaluated, the table has no comparisons.
+        baseline: name of the agent with which the other agents are compared. If the baseline was not evaluated, the
+            table has no comparisons.
 
     """
     contexts = contexts_of(evaluation)
@@ -231,10 +233,11 @@ def summarise_sums(
     Args:
         tallies: name of an agent -> sums of its measures.
         conditions: scenario, number and quantities of the worlds (``Conditions.of_test``).
-        contexts: name of a set of measures -> context that the set prepared for these worlds (``contexts_of``).
+        contexts: name of a set of measures -> information that the set computed once for these worlds
+            (``contexts_of``).
         knows: name of an agent -> what the agent says that it knows about the line.
         policies: name of an agent -> SHA-256 of the policy of each vehicle, by the vehicle's name.
-        baseline: name of the agent to compare with.
+        baseline: name of the agent with which the other agents are compared.
         shared: fields of ``SummaryRow`` that are equal in all rows, such as ``worlds_sha256``.
 
     """

@@ -19,8 +19,8 @@ from ethbrake_marl.files.sheet import Estimate
 class SummaryRow:
     """Results of one agent over all worlds of an evaluation. Harms are means per world, m2/s2.
 
-    ``row["harm_decrease_total"]`` is the estimate of the measure that has this name in JSON, or None if the measure is
-    not defined in these worlds.
+    ``row[name]`` is the estimate of a measure, by the measure's name in JSON, such as ``row["harm_decrease_total"]``.
+    The estimate is None if the measure is not defined in these worlds.
 
     >>> import ethbrake_marl as eb
     >>> scenario = eb.load_scenario("paper-random")
@@ -96,7 +96,7 @@ class SummaryRow:
         return f"{self.agent} {MARK}" if self.exploits.names else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return the agent's object in JSON results. Missing values are null; intervals are ``[low, high]``."""
+        """Return the row as an object for JSON; missing values are null, and intervals are ``[low, high]``."""
         registered = RegisteredMeasures(n.removeprefix(COLUMN) for n in self.estimates if n.startswith(COLUMN))
         more: dict[str, Any] = {}
         for name, each in MEASURE_SETS.items():
@@ -125,7 +125,7 @@ class SummaryRow:
         }
 
     def _estimates_of(self, of: MeasureSet) -> dict[str, Any]:
-        """Return JSON entries of a set of measures, such as ``{"total_harm": 37, "total_harm_interval": [30, 44]}``."""
+        """Return the estimates of a set for JSON, such as ``{"total_harm": 37, "total_harm_interval": [30, 44]}``."""
         there = {m.name: self.estimates[m.name] for m in of.measures if m.name in self.estimates}
         optional = {measure.name for measure in of.measures if not measure.always}
         return Estimate.side_by_side({name: each for name, each in there.items() if each or name not in optional})

@@ -1,4 +1,4 @@
-"""Sums of all agents' measures over a chunk of worlds. Sums of chunks can be added in any order with equal results."""
+"""Sums of all agents' measures over a chunk of worlds. Sums of chunks can be added in any order."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Range = tuple[float, float]  # smallest and largest value
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """Sums of all agents' measures over some worlds of an evaluation list. ``+`` adds the sums over other worlds."""
+    """Sums of all agents' measures over some of the worlds. ``tally + other`` covers the worlds of both."""
 
     worlds: int = 0  # number of worlds, without left-out worlds
     hidden: int = 0  # number of worlds in which the V2X channel hides something from a controlled vehicle
@@ -37,13 +37,14 @@ class Tally:
 
     @classmethod
     def of(cls, part: Evaluation, objectives: Sequence[str] | None = None, *, long_list: bool = True) -> Tally:
-        """Return the sums over the worlds of an evaluation.
+        """Return the sums of all agents' measures over the worlds of an evaluation.
 
         Args:
-            part: outcomes of the agents in a chunk of worlds.
-            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list, even an empty one,
-                the sums include the harm that each vehicle bears, and the value of each objective for each vehicle.
-            long_list: omit sets of measures that do not apply to more than 100,000 worlds.
+            part: evaluation of the agents in a chunk of worlds.
+            objectives: objectives such as ``"social:45"`` (docs/cooperation.md). If this is a list (an empty list is
+                enough), the result also has the sums of the harm that each vehicle bears, and of the value of each
+                objective for each vehicle.
+            long_list: whether to omit the sets of measures that do not apply to more than 100,000 worlds.
 
         """
         worlds = part.worlds
@@ -84,7 +85,7 @@ class Tally:
         )
 
     def rescore(self, objectives: Sequence[str], vehicles: int) -> Rescores:
-        """Return the mean value of each objective, for every agent, each vehicle and both counts of harm.
+        """Return the mean value of each objective over the worlds, for every agent, vehicle and count of harm.
 
         Args:
             objectives: objectives such as ``social:45``; the tally must have been computed with these objectives.

@@ -10,11 +10,11 @@ from ethbrake_marl.physics.state import Floats, Worlds
 
 
 class Tape:
-    """Recorder of all impacts, and optionally all steps, of a batch of episodes. ``see`` is called after each step.
+    """Recorder of all impacts, and optionally all time steps, of a batch of episodes. Call ``see`` after each step.
 
     Args:
         worlds: the n worlds at the alert.
-        steps: record every step in addition to the impacts.
+        steps: whether to record every time step in addition to the impacts.
 
     """
 
@@ -30,8 +30,8 @@ class Tape:
 
         Args:
             before: the worlds at the beginning of the step.
-            command_mps2: commanded accelerations during the step, [n, N].
-            until_s: time at which the step ends, [n]; where the episode has ended, the time of its end.
+            command_mps2: commanded accelerations during the step (m/s2), [n, N].
+            until_s: time at which the step ends (s), [n]; in a world whose episode has ended, the end of the episode.
 
         """
         moving = until_s > before.time_s

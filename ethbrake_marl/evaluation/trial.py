@@ -29,10 +29,10 @@ TRIED_CANDIDATES = 16  # number of candidates of a searching script while a scen
 def load_runnable(
     name_or_path: str, settings: Sequence[Override] = (), *, drives: Literal["nobody", "one", "some"] = "nobody"
 ) -> Scenario:
-    """Load a scenario, and let each of its scripts decide once in one world, to find errors in the scripts.
+    """Load a scenario, and find errors in its scripts by letting each script decide once in one world.
 
     Args:
-        name_or_path: name of a scenario, or path of a YAML file.
+        name_or_path: name of a scenario, or path of its YAML file.
         settings: settings ``KEY=VALUE`` that override values of the file.
         drives: number of learners that the scenario must have: exactly one (``one``), at least one (``some``), or any
             number (``nobody``).
@@ -73,18 +73,19 @@ def load_runnable(
 def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
     """Simulate ``worlds`` of a scenario, and count the worlds in which something unusual happens.
 
-    Learners brake fully; the other vehicles follow their scripts. Scripts that search try only a few candidates, to
-    save time. The result has these keys:
+    Learners brake fully; the other vehicles follow their scripts. To save time, scripts that search for good commands
+    try only a few commands. The result has these keys:
 
     - ``early_impacts``: number of worlds with an impact before a learner may act;
     - ``moving_at_horizon``: number of worlds in which a vehicle still moves at the horizon;
     - ``vehicle_1_late``: number of worlds in which Vehicle 1 has a latency;
-    - ``commands_out_of_range``: name of a vehicle -> row of a world -> error message, where a script commanded more
-      than the vehicle's capacity;
+    - ``commands_out_of_range``: name of a vehicle -> row of a world in which its script commanded more than the
+      vehicle's capacity -> error message;
     - ``not_state_free``: name of a vehicle -> its script, for scripts that react to the state of the world;
-    - ``refused_by``: name of an agent, shield or setting that refuses such scripts -> error message.
+    - ``refused_by``: name of an agent, shield or setting that refuses scripts that react to the state of the world ->
+      error message.
 
-    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds in which the physics fails.
+    Raises ``InvalidInput`` for an error in a script, ``PhysicsError`` for worlds whose simulation fails.
     """
     searches = {
         scenario.vehicle_names[i]: f"{ScriptSpec.parse(script).name}:{TRIED_CANDIDATES}"
@@ -130,9 +131,9 @@ def try_scenario(scenario: Scenario, worlds: Worlds) -> dict[str, Any]:
 
 
 def _refusals(scenario: Scenario, worlds: Worlds) -> dict[str, str]:
-    """Try all agents, shields and settings on ``worlds``, and return the error message of each that fails.
+    """Try agents, shields and a setting on ``worlds``, and return the error message of each that refuses the scenario.
 
-    The keys of the result are specs of agents, ``+SHIELD`` for shields, and names of settings.
+    A key of the result is the spec of an agent, ``+`` and the name of a shield, or ``early_impacts: reject``.
     """
 
     def drive_by(spec: str, needs: Mapping[str, Any]) -> None:

@@ -38,10 +38,11 @@ _LONGEST_OWNERS = 30  # longest text of vehicle or pair names, in characters
 def drawn_alike(worlds: Worlds, scenario: Scenario) -> dict[str, dict[str, Floats]]:
     """Return the values of every quantity that differs between worlds.
 
-    A group consists of the vehicles (or pairs) for which the scenario declares the same smallest and largest value. The
-    result maps the key of a quantity to a dictionary from group to values [n, entries], as in
-    ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``. The name of a group lists its vehicles; "" stands for
-    all vehicles (or pairs) of the line. Worlds without the quantity are omitted.
+    The vehicles (or pairs) for which the scenario declares the same smallest and largest value form a group. The result
+    maps the key of a quantity to a dictionary: name of a group -> values [n, number of vehicles or pairs]. An example
+    is ``{"gaps_m": {"": values}, "mass_t": {"vehicle_2": values}}``. The name of a group lists its vehicles; it is ""
+    if the group contains all vehicles (or pairs) of the line. Values of a quantity come only from worlds that have this
+    quantity.
     """
     of_quantities: dict[str, dict[str, Floats]] = {}
     for key, rule in QUANTITY.of(worlds).items():

@@ -1,4 +1,4 @@
-"""Train policies, and load trained policies. Loading does not import torch; training does."""
+"""Train policies, and load trained policies. Loading a policy does not import torch; training one does."""
 
 from typing import TYPE_CHECKING
 

@@ -23,10 +23,11 @@ def make_policy_agent(argument: None, settings: AgentSettings) -> Driver:
 
     Args:
         argument: not used.
-        settings: settings with the agent's spec and the scenario. The spec is the name of a shipped policy
-            (``universal``), or names a run or a policy bundle (``ppo@PATH``).
+        settings: the text that names the agent (spec), the path of its policy, and the scenario. The spec is the name
+            of a shipped policy (``universal``), or contains the path of a run or a policy bundle (``ppo@PATH``).
 
-    Raises ``InvalidInput`` if another algorithm trained the policy, and the errors of loading the policy.
+    Raises ``InvalidInput`` if another algorithm than the spec names trained the policy. Also raises the errors of
+    loading a policy.
 
     """
     spec, path = settings.spec, settings.policy

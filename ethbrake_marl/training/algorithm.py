@@ -30,24 +30,25 @@ class Algorithm(ABC):
         """Return a new model on the CPU, whose random numbers depend on the recipe's seed only.
 
         Args:
-            training: recipe and scenario.
-            environment: vectorised environment to learn in, with one row for each learner of each world.
+            training: recipe and scenario of the training.
+            environment: vectorised environment to learn in, with one row for each learner in each world.
 
         """
 
     def actors(self, model: BaseAlgorithm) -> tuple[BasePolicy, ...]:
         """Return the policies inside the model that choose actions.
 
-        There is one policy for all learners or, in the scheme ``independent``, one for each learner, front to rear.
+        The result contains one policy for all learners or, in the scheme ``independent``, one policy for each learner,
+        front to rear.
         """
         return (model.policy,)
 
     def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of the weights of a policy, by their names in a policy bundle.
+        """Return a copy of a policy's weights: name of a tensor in a policy bundle -> its values.
 
         Args:
             actor: one of the policies that ``actors`` returns.
-            network: description of the bundle's network.
+            network: description of the network in the policy bundle.
 
         """
         return tensors_of(actor, network)
@@ -64,9 +65,9 @@ class Algorithm(ABC):
         return {}
 
     def log_noise(self, model: BaseAlgorithm) -> Tensor | None:
-        """Return the logarithm of the model's exploration noise, or None if there is none.
+        """Return the logarithm of the model's exploration noise, or None if the model has no such noise.
 
-        The training stops with an error if the noise is not finite and positive.
+        If the noise is not finite and positive, the training stops with an error.
         """
         log_std: Tensor | None = getattr(model.policy, "log_std", None)
         return None if log_std is None else log_std.detach()

@@ -1,4 +1,4 @@
-"""Callback of a training: between updates it measures policies, logs, writes checkpoints, and may stop the training."""
+"""Callback of a training run: between updates, it measures policies, logs, writes checkpoints, and may stop the run."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ StopAt = Callable[[Mapping[str, float]], str | None]
 
 
 class StopRequested(Exception):
-    """Internal exception that leaves the training loop between two updates.
+    """Internal exception by which the callback leaves Stable-Baselines3's training loop between two updates.
 
     The argument of the exception is the reason that ``StopAt`` returned, or None after Ctrl-C.
     """
 
 
 class Watchers(NamedTuple):
-    """Functions that a training calls: to measure its policies, to ask whether to stop, and to report progress."""
+    """Functions that a training run calls: to measure its policies, to ask whether to stop, and to report progress."""
 
     evaluate: Evaluate | None  # takes the current policies and returns their metrics; None: no measurements
     stop_at: StopAt | None  # takes the metrics of an evaluation; returns a reason to stop, or None to continue
@@ -53,14 +53,14 @@ class Watchers(NamedTuple):
 
 
 class RunCallback(BaseCallback):
-    """Callback that measures, logs and writes checkpoints between two updates, and stops the training on request.
+    """Callback that measures policies, logs and writes checkpoints between two updates, and stops the run on request.
 
-    Its work (``_between_updates``) is done before the first rollout, after each update, and at the end of the training.
-    To stop the training, it writes a checkpoint and raises ``StopRequested``.
+    The callback works (``_between_updates``) before the first rollout, after each update, and at the end of the
+    training. To stop the training, the callback writes a checkpoint and raises ``StopRequested``.
 
     Args:
         run: folder of the run.
-        learner: the model that learns, with its algorithm and training.
+        learner: the model that learns, its algorithm, and the recipe and scenario.
         watchers: functions to measure the policies, to ask whether to stop, and to report progress.
 
     """
@@ -117,7 +117,7 @@ class RunCallback(BaseCallback):
             self._write_checkpoint()
 
     def _take_policies(self) -> None:
-        """Copy the current weights into ``course`` as policies, unless this was already done after this update.
+        """Copy the current weights as policies into ``course``, unless it already has the weights of this update.
 
         Raises ``TrainingDiverged`` if a weight is not finite.
         """
@@ -158,7 +158,7 @@ class RunCallback(BaseCallback):
         return sum(float(e["r"]) for e in episodes) / len(episodes) if episodes else None
 
     def tell(self, note: str = "") -> None:
-        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, printed once."""
+        """Report the progress of the training to ``on_progress``. ``note`` is a message for the user, shown once."""
         if self._watchers.on_progress is None:
             return
         course = self.course
@@ -175,7 +175,7 @@ class RunCallback(BaseCallback):
         )
 
     def _write_checkpoint(self) -> None:
-        """Write a checkpoint of the current state, unless there already is one."""
+        """Write a checkpoint of the current state, unless the folder of this checkpoint already exists."""
         folder = self.run.checkpoint(self.course.steps)
         if not folder.exists():
             write_checkpoint(folder, self._state())
@@ -201,9 +201,9 @@ class RunCallback(BaseCallback):
         return TrainingState(numbers, arrays)
 
     def restore(self, state: TrainingState) -> None:
-        """Restore model and progress from a checkpoint, so that the training continues from it.
+        """Restore model and progress from a checkpoint, so that the training continues from this checkpoint.
 
-        Raises ``CorruptBundle`` if the checkpoint belongs to another model.
+        Raises ``CorruptBundle`` if the checkpoint does not fit this model.
         """
         numbers, course = state.numbers, self.course
         try:

@@ -14,7 +14,7 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
     Args:
         arguments: positional arguments of Stable-Baselines3's ``ActorCriticPolicy``.
-        own: number of entries at the beginning of a row that the actor sees (the vehicle's observation).
+        own: number of entries at the beginning of an observation row that the actor sees (the vehicle's observation).
         settings: keyword arguments of ``ActorCriticPolicy``.
 
     """
@@ -28,13 +28,13 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of an actor, which takes the first ``own`` entries of a row, and a critic, which takes all entries.
+    """Hidden layers of an actor that sees the first entries of an observation row, and of a critic that sees all.
 
     Args:
-        own: number of entries that the actor takes.
-        whole: number of entries of a row.
+        own: number of entries of an observation row that the actor sees.
+        whole: number of all entries of an observation row.
         net_arch: sizes of the layers, as in Stable-Baselines3's ``ActorCriticPolicy``.
-        activation_fn: activation, as in Stable-Baselines3's ``ActorCriticPolicy``.
+        activation_fn: activation function, as in Stable-Baselines3's ``ActorCriticPolicy``.
 
     """
 

@@ -1,4 +1,4 @@
-"""Checkpoint of a training between two updates: a folder with arrays and JSON, written atomically."""
+"""Checkpoint of a training run between two updates: a folder with arrays and JSON, written atomically."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MOST_CHECKPOINTS = 2  # number of checkpoints to keep; if the newest is damaged,
 
 
 class TrainingState(NamedTuple):
-    """State of a training between two updates, from which the training continues as if it had not stopped."""
+    """State of a training run between two updates, from which the training continues as if it had not stopped."""
 
     numbers: dict[str, Any]  # counters, settings and log, as plain data for JSON
     arrays: Arrays  # weights, optimiser states, environment and random generators, by name
@@ -49,7 +49,8 @@ class TrainingState(NamedTuple):
 def write_checkpoint(folder: Path, state: TrainingState) -> None:
     """Write ``state`` as a checkpoint to a new ``folder``, and delete all but the two newest checkpoints.
 
-    If the write fails, no incomplete checkpoint is left: all bytes are on the disk before the folder gets its name.
+    If writing fails, no incomplete checkpoint is left behind, because the folder gets its name only after all bytes are
+    on the disk.
     """
     arrays = {name: np.ascontiguousarray(array).reshape(array.shape) for name, array in state.arrays.items()}
     with new_folder(folder) as partial:
@@ -104,7 +105,7 @@ def _digest(arrays: BufferedReader, numbers: Mapping[str, Any]) -> str:
 
 
 def checkpoint_folders(folder: Path) -> list[Path]:
-    """Return the folders of all checkpoints inside ``folder``, newest first. Their content is not checked."""
+    """Return the folders of all checkpoints inside ``folder``, newest first; the checkpoints are not checked."""
     folders = (path for path in folder.glob("step_*") if path.is_dir() and not path.is_symlink())
     return sorted(folders, reverse=True)
 

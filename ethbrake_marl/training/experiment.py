@@ -67,7 +67,7 @@ class Experiment:
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """Texts that ``ethbrake run`` prints about a report that it has written."""
+    """Tables and texts that ``ethbrake run`` prints about a report that it has written."""
 
     tables: tuple[Any, ...]  # tables to print instead of the results table
     note: str  # text that says where the report is
@@ -81,7 +81,7 @@ MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report, a
 def register_run_report(name: str, make: MakeReport) -> None:
     """Register a function that writes a report into the folder of every later ``ethbrake run``.
 
-    A package can instead declare an entry point of the group ``ethbrake_marl.run_reports``.
+    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.run_reports``.
 
     Args:
         name: name of the report, which must differ from the names of other reports.
@@ -120,29 +120,31 @@ def run_experiment(
     settings: Sequence[str] = (),
     on_progress: OnProgress | None = None,
 ) -> ExperimentResult:
-    """Train the learners, compare them, with and without a shield, with the baselines, and write results and reports.
+    """Train the learners, compare them (with and without a shield) with the baselines, and write results and reports.
 
-    All agents minimise the count of harm that the learners are trained for (``reward.harm_count`` of the recipe).
-    Installed extensions write reports about the results.
+    All compared agents minimise the count of harm that the learners are trained for (``reward.harm_count`` of the
+    recipe). Installed extensions write reports about the results.
 
-    Ctrl-C during the training stops it after the current update, and the policy so far is evaluated. A second Ctrl-C,
-    or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the policy. A report may
-    train further policies. Ctrl-C during such a training stops it, and the report is written without its result
-    (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
+    Ctrl-C during the training stops the training after the current update, and the policy trained so far is evaluated.
+    A second Ctrl-C, or Ctrl-C during the evaluation, raises ``KeyboardInterrupt``; the folder still contains the
+    policy. Some reports train further policies. Ctrl-C during this training stops it, and the report is written without
+    these policies (``ExperimentResult.interrupted``). ``run.json`` records how the run ended.
 
     Args:
         scenario: scenario with at least one learner. Several learners are trained as a team, with the recipe's scheme.
         directory: the new folder of the run.
-        recipe: recipe of the training.
-        steps: number of decisions of all learners; None: the recipe's number.
+        recipe: recipe of the training, which also defines the reward.
+        steps: number of decisions of all learners together in the training; None: the recipe's number.
         seed: seed of the training; None: the recipe's seed.
         episodes: number of worlds of the evaluation list.
         list_seed: seed of the evaluation list.
-        force: replace an earlier run.
-        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files, for ``config.json``.
+        force: whether to replace an earlier run in ``directory``.
+        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files; ``config.json`` records
+            them.
         on_progress: function that is called with the progress of training, evaluation and reports.
 
-    Raises the errors of ``train`` and ``evaluate``, and ``AlreadyExists``, before the training, for an existing run.
+    Raises the errors of ``train`` and ``evaluate``, and ``AlreadyExists`` before the training if ``directory`` exists
+    and ``force`` is false.
 
     """
     started = time.monotonic()
@@ -198,14 +200,16 @@ def compared_agents(
     """Return the agents to compare, by name: baselines, and the trained policy or team with and without a shield.
 
     With one learner, the trained agent is ``trained policy``, and ``hybrid`` is this policy with the paper's shield.
-    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a step shield. For
-    several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i brakes fully.
+    With several learners, the trained agent is ``trained team``, and ``hybrid`` is this team with a shield in step
+    mode. For several learners there is also a team ``all but vehicle_i`` for each learner i, in which vehicle i brakes
+    fully.
 
     Args:
-        trained: the trained policy or policies.
+        trained: the trained policy, or one trained policy for each learner.
         scenario: scenario whose learners the agents drive.
         harm_count: count of harm that baselines minimise and shields bound, ``first`` or ``total``.
-        baselines: specs of the baselines; None means ``BASELINES``, or ``TEAM_BASELINES`` for several learners.
+        baselines: names of the baselines as on the command line; None: ``BASELINES`` for one learner,
+            ``TEAM_BASELINES`` for several learners.
 
     """
     several = len(scenario.learners) > 1
@@ -254,7 +258,8 @@ def write_results(
 def results_csv(rows: Sequence[SummaryRow]) -> str:
     """Return a results table as CSV text, with one line per agent.
 
-    The columns ``x_low`` and ``x_high`` are the ends of the interval of column ``x``. Missing values are empty.
+    The columns ``x_low`` and ``x_high`` are the ends of the interval of column ``x``. A missing value is an empty
+    field.
     """
     lines = []
     for entry in (row.to_json() for row in rows):
@@ -268,10 +273,11 @@ def results_csv(rows: Sequence[SummaryRow]) -> str:
 
 @contextmanager
 def _status(run: RunDirectory) -> Iterator[None]:
-    """Context manager around the evaluation of a run, which records its status in ``run.json``.
+    """Context manager for the evaluation of a run, which records the status of the run in ``run.json``.
 
-    The status is ``running`` and, after an exception, ``interrupted`` (Ctrl-C) or ``failed``, with the error. The names
-    of the new files are also recorded (``RunDirectory.WRITTEN``), so that ``resume`` can delete these files.
+    The status is ``running`` during the evaluation. After an exception, the status is ``interrupted`` (Ctrl-C) or
+    ``failed``, and the error is recorded. The names of the new files are also recorded (``RunDirectory.WRITTEN``), so
+    that ``resume`` can delete these files.
     """
     _note(run, "running", "evaluation", None)
     before = {path.name for path in run.path.iterdir()}
@@ -286,7 +292,7 @@ def _status(run: RunDirectory) -> Iterator[None]:
 
 
 def _note(run: RunDirectory, status: str, stage: str, reason: str | None) -> None:
-    """Update status, stage, reason and end time in ``run.json``. Other entries, such as ``wall_s``, do not change."""
+    """Write status, stage, reason and end time into ``run.json``; other entries, such as ``wall_s``, do not change."""
     content = read_object(run.status)
     ended = None if status == "running" else datetime.now(UTC).isoformat(timespec="seconds")
     run.write_json(run.status, {**content, "status": status, "stage": stage, "ended_utc": ended, "reason": reason})

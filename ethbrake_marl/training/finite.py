@@ -1,4 +1,4 @@
-"""Checks that stop a training if an observation, a reward, a loss, a gradient or a weight is not finite."""
+"""Checks that stop a training run if an observation, a reward, a loss, a gradient or a weight is not finite."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ LOSSES = ("loss", "policy_loss", "value_loss", "policy_gradient_loss", "actor_lo
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """An observation, reward, loss, gradient or weight is not finite. The last policy with finite weights was saved."""
+    """Raised if an observation, reward, loss, gradient or weight is not finite; the last finite policy is saved."""
 
 
 def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
     """Make every optimiser of the model raise ``TrainingDiverged`` before a step with a gradient that is not finite.
 
     Args:
-        model: the model; its optimisers are changed.
-        algorithm: the algorithm of the model, which lists its optimisers.
+        model: the model, whose optimisers are changed.
+        algorithm: learning algorithm of the model, which lists the model's optimisers.
 
     """
     hint = "learning_rate or max_grad_norm" if hasattr(model, "max_grad_norm") else "learning_rate"
@@ -41,11 +41,11 @@ def refuse_gradients(model: BaseAlgorithm, algorithm: Algorithm) -> None:
 
 
 def weights_are_finite(model: BaseAlgorithm, algorithm: Algorithm) -> bool:
-    """Return whether every weight of the model is finite, and its exploration noise is finite and positive.
+    """Return whether every weight of the model is finite, and the model's exploration noise is finite and positive.
 
     Args:
         model: the model.
-        algorithm: the algorithm of the model, which returns its exploration noise (``log_noise``).
+        algorithm: learning algorithm of the model, whose ``log_noise`` returns the model's exploration noise.
 
     """
     logarithm = algorithm.log_noise(model)

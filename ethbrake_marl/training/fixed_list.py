@@ -34,7 +34,7 @@ Measure = Callable[[Training], Evaluate]  # function that returns the ``Evaluate
 def measure_on_list(training: Training) -> Evaluate:
     """Draw the fixed list of worlds, and return a function that measures policies on this list.
 
-    The function takes a ``Policy`` or ``PolicyTeam``, and returns the metrics of ``measure_team``.
+    The returned function takes a ``Policy`` or ``PolicyTeam``, and returns the metrics of ``measure_team``.
     """
     names, worlds = training.scenario.vehicle_names, fixed_list(training)
 
@@ -46,20 +46,20 @@ def measure_on_list(training: Training) -> Evaluate:
 
 
 def measure_full_braking(training: Training) -> dict[str, float]:
-    """Return the metrics of ``measure_team`` on the fixed list of worlds for learners that brake fully."""
+    """Return the metrics (``measure_team``) of learners that brake fully, on the fixed list of worlds."""
     scenario = training.scenario
     braking: Any = make_agents(["full_brake"], scenario)["full_brake"]
     return measure_team(training, fixed_list(training), Team(dict.fromkeys(scenario.learners, braking), "full_brake"))
 
 
 def fixed_list(training: Training) -> Worlds:
-    """Return the worlds of the fixed list, at the alert."""
+    """Return the worlds, at the alert, of the fixed list on which policies are measured."""
     plan = training.recipe.evaluation
     return training.scenario.sample(plan.worlds, plan.seed).worlds
 
 
 def measure_team(training: Training, worlds: Worlds, team: Team) -> dict[str, float]:
-    """Let a team drive worlds, and return its metrics, each a mean over the worlds.
+    """Let a team drive ``worlds``, and return metrics of the team, each a mean over these worlds.
 
     The metrics are ``first_impact_harm``, ``total_harm``, ``collision_rate`` and ``horizon_rate``, with the same values
     as in ``evaluate``. If a learner has another objective than the harm of the line, the result also has the objective
@@ -90,7 +90,7 @@ def measure_team(training: Training, worlds: Worlds, team: Team) -> dict[str, fl
 def drive_list(worlds: Worlds, team: Team, scenario: Scenario) -> Iterator[Episodes]:
     """Let a team drive worlds from the alert, and yield the results of each chunk of 2,500 worlds.
 
-    Worlds in which the physics fails are left out. Raises ``PhysicsError`` if every world is left out.
+    Worlds whose simulation fails are left out. Raises ``PhysicsError`` if every world is left out.
     """
     scripts = [script.name for script in script_agents(scenario, except_for=team.drivers).values()]
     failed: dict[int, str] = {}

@@ -1,8 +1,8 @@
-"""Independent learners: one PPO per learner, with its own network and optimiser; all learners share the worlds.
+"""Independent learners: one PPO per learner, with its own network and optimiser; all learners drive in the same worlds.
 
 The last entry of an observation row is the number of its learner (``make_sb3_vec_env(..., appended="number")``).
-Rollouts are collected for all learners together. Each learner then learns from its own rows, with Stable-Baselines3's
-``PPO.train``.
+Rollouts are collected for all learners together. Each learner then learns from the observation rows that have its
+number, with Stable-Baselines3's ``PPO.train``.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from torch import Tensor, nn
 class SeparatePolicies(BasePolicy):
     """One actor-critic policy for each learner, each with its own optimiser, behind the interface of a single policy.
 
-    The last entry of an observation row is the number of its learner (0 = foremost). Learners whose numbers are in
-    ``resting`` do not explore: they take the mean action.
+    The last entry of an observation row is the number of the learner that observes it (0 = foremost). Learners whose
+    numbers are in ``resting`` do not explore: they take the mean action.
 
     Args:
         observation_space: space of an observation row.
         action_space: space of one learner's action.
         lr_schedule: learning rate as a function of the fraction of the training that remains.
         use_sde: whether to use state-dependent exploration.
-        columns: for each learner, front to rear, the columns of a row that the learner observes.
+        columns: for each learner, front to rear, the columns of an observation row that the learner observes.
         network: other keyword arguments of ``ActorCriticPolicy``.
 
     """
@@ -72,8 +72,8 @@ class SeparatePolicies(BasePolicy):
         """Return actions [n, 1], values [n, 1] and log-probabilities [n] for n observation rows.
 
         Args:
-            observation: F features and the number of the learner in each row, [n, F + 1].
-            deterministic: whether all learners take the mean action, without exploration.
+            observation: n observation rows, each with F features and the number of the learner, [n, F + 1].
+            deterministic: whether all learners take the mean action instead of exploring.
 
         """
         count = len(observation)
@@ -84,7 +84,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Return the critics' values [n, 1] for observation rows [n, F + 1]."""
+        """Return the critics' values [n, 1] for n observation rows, each with F features and the learner's number."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
@@ -102,17 +102,17 @@ class SeparatePolicies(BasePolicy):
 
 
 class IndependentPPO(PPO):
-    """One PPO for each learner, all in the same worlds.
+    """PPO with a separate policy for each learner; all learners drive in the same worlds.
 
-    Without ``turns``, all learners learn in every update. With ``turns``, one learner learns at a time, and the others
-    take their mean actions; all turns have about the same number of updates. The columns of the log have names such as
-    ``vehicle_2/loss``.
+    If ``turns`` is None, all learners learn in every update. If ``turns`` is a number, only one learner learns at a
+    time, and the other learners take their mean actions. The learner changes from turn to turn, and all turns have
+    about the same number of updates. The columns of the log have names such as ``vehicle_2/loss``.
 
     Args:
-        env: vectorised environment in which the last entry of a row is the number of its learner.
+        env: vectorised environment in which the last entry of an observation row is the number of the learner.
         names: names of the learners, front to rear.
         turns: number of turns of each learner during the training; None: all learners learn in every update.
-        columns: for each learner, front to rear, the columns of a row that the learner observes.
+        columns: for each learner, front to rear, the columns of an observation row that the learner observes.
         settings: other keyword arguments of ``PPO``.
 
     """
@@ -130,9 +130,10 @@ class IndependentPPO(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        """Collect rollouts as PPO does; only learners that learn in this update explore.
+        """Collect rollouts as PPO does; only learners that learn in the next update explore.
 
-        The arguments are the same as in Stable-Baselines3. Returns False if the callback stopped the training.
+        The arguments are the same as in the method of Stable-Baselines3's ``PPO``. Returns False if the callback
+        stopped the training.
         """
         everyone = range(len(self.names))
         self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
@@ -140,7 +141,7 @@ class IndependentPPO(PPO):
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def train(self) -> None:
-        """Update each learner whose turn it is with ``PPO.train``, from its own rows and with its own optimiser."""
+        """Update each learner whose turn it is with ``PPO.train``, from its own data and with its own optimiser."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
         parts = {number: self._part(buffer, number) for number in self._learning}
         try:
@@ -157,7 +158,7 @@ class IndependentPPO(PPO):
     def _whose_turn(self, turns: int) -> int:
         """Return the number of the learner (0 = foremost) that learns in the next update.
 
-        The result depends only on the number of steps so far, so a resumed training has the same turns.
+        The result depends only on the number of decisions so far, so a resumed training has the same turns.
         """
         rollout = self.n_envs * self.n_steps
         planned = -(-self._total_timesteps // rollout)
@@ -165,7 +166,7 @@ class IndependentPPO(PPO):
         return stretch % len(self.names)
 
     def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
-        """Return a new buffer with the rows of learner ``number`` (0 = foremost)."""
+        """Return a new rollout buffer with the data of learner ``number`` (0 = foremost)."""
         own = self.policy.policies[number].observation_space
         count = len(self.names)
         part = RolloutBuffer(

@@ -1,4 +1,4 @@
-"""Logs of a training, which are ``progress.csv`` and TensorBoard events."""
+"""Logs of a training run, which are ``progress.csv`` and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def open_logs(run: RunDirectory, state: TrainingState | None) -> list[KVWriter]:
 
     Args:
         run: folder of the run.
-        state: checkpoint from which the training continues. Rows of the logs after this checkpoint are dropped. If this
-            is None, the logs begin empty.
+        state: checkpoint from which the training continues; None: the logs begin empty. Log rows that were written
+            after this checkpoint are dropped.
 
-    Returns the two writers, for ``output_formats`` of Stable-Baselines3's logger.
+    Returns one writer for each of the two logs, for ``output_formats`` of Stable-Baselines3's logger.
 
     """
     run.progress.unlink(missing_ok=True)  # the path may be a link, whose target must not be overwritten

@@ -27,7 +27,7 @@ def capture_model(model: Model, algorithm: Algorithm) -> tuple[dict[str, Any], A
 
     Args:
         model: the model of Stable-Baselines3, with its environment.
-        algorithm: the algorithm of the model, which lists its optimisers and other learned tensors.
+        algorithm: learning algorithm of the model, which lists the model's optimisers and other learned tensors.
 
     Returns two dictionaries: counters and settings as plain data for JSON, and arrays by name.
 
@@ -59,11 +59,11 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
     """Put a state that ``capture_model`` returned into a new model of the same recipe.
 
     Args:
-        model: the new model, which must have a logger. The model is changed.
-        algorithm: the algorithm of the model.
-        state: the captured numbers and arrays.
+        model: the new model, which must have a logger; its state is replaced.
+        algorithm: learning algorithm of the model.
+        state: checkpoint with the dictionaries that ``capture_model`` returned.
 
-    Raises various errors of Python, NumPy and torch if the state belongs to another model.
+    Raises various errors of Python, NumPy and torch if the state does not fit the model.
 
     """
     numbers, arrays = state
@@ -83,7 +83,7 @@ def restore_model(model: Model, algorithm: Algorithm, state: TrainingState) -> N
 
 
 def _captured_weights(model: Model, algorithm: Algorithm) -> Arrays:
-    """Return the weights of the model's policy, its other learned tensors, and its optimisers' states, by name."""
+    """Return the weights of the model's policy, other learned tensors, and the states of the optimisers, by name."""
     arrays = {f"policy.{name}": _copy(tensor) for name, tensor in model.policy.state_dict().items()}
     arrays |= {name: _copy(tensor) for name, tensor in algorithm.learned_beside(model).items()}
     for name, optimizer in algorithm.optimizers(model).items():
@@ -109,7 +109,7 @@ def _restore_weights(model: Model, algorithm: Algorithm, rates: Mapping[str, flo
 
 
 def _captured_rows(model: Model) -> Arrays:
-    """Return the last observation of each row of the environment, and returns and lengths of the latest episodes.
+    """Return the latest observation of every learner, and the returns and lengths of the latest episodes.
 
     Stable-Baselines3 needs these arrays to continue the rollouts and to log mean returns.
     """
@@ -151,14 +151,14 @@ def _restore_log(model: Model, pending: Mapping[str, Any]) -> None:
 
 
 def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
-    """Restore the content of a replay buffer.
+    """Restore the captured content of a replay buffer.
 
     Args:
-        memory: the buffer of Stable-Baselines3, which is changed.
-        place: pair (position of the next entry, whether the buffer is full).
-        arrays: content of the buffer, by name.
+        memory: the replay buffer of Stable-Baselines3, whose content is replaced.
+        place: captured pair (position of the buffer's next entry, whether the buffer is full).
+        arrays: captured arrays by name; the names of the buffer's arrays begin with ``replay.``.
 
-    Raises ``ValueError`` for an invalid position.
+    Raises ``ValueError`` if the position is invalid, or if an array does not fit the buffer.
 
     """
     position, full = place
@@ -173,7 +173,7 @@ def _restore_replay(memory: Any, place: Any, arrays: Arrays) -> None:
 
 
 def _try_step(optimizer: torch.optim.Optimizer) -> None:
-    """Take a step with a copy of ``optimizer``; torch raises an error if its state does not fit its weights."""
+    """Take a step with a copy of ``optimizer``; torch raises an error if the state does not fit the weights."""
     tried = copy.deepcopy(optimizer)
     for group in tried.param_groups:
         for weights in group["params"]:
@@ -182,10 +182,10 @@ def _try_step(optimizer: torch.optim.Optimizer) -> None:
 
 
 def check_counter(name: str, value: object, kind: type) -> None:
-    """Raise ``ValueError`` unless a counter has the right type and range.
+    """Raise ``ValueError`` unless a counter of a checkpoint has the right type and range.
 
     Args:
-        name: name of the counter, for the message.
+        name: name of the counter, for the error message.
         value: the counter's value.
         kind: required type. If this type is ``int``, the value must be from 0 to 2^53 - 1.
 
@@ -196,7 +196,7 @@ def check_counter(name: str, value: object, kind: type) -> None:
 
 
 def _like(model: NDArray[Any], arrays: Arrays, name: str) -> NDArray[Any]:
-    """Return ``arrays[name]``; raise ``ValueError`` unless it is finite and has the shape and type of ``model``."""
+    """Return ``arrays[name]``; raise ``ValueError`` unless it is finite, with shape and type of the array ``model``."""
     array = arrays[name]
     if (array.shape, array.dtype) != (model.shape, model.dtype) or not np.isfinite(array).all():
         raise ValueError(f"{name}: must be finite numbers of type {model.dtype} and shape {model.shape}")

@@ -1,4 +1,4 @@
-"""Build the environment and the model of a training, and create policies from the model's weights."""
+"""Build the environment and the model of a training run, and create policies from the model's weights."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Model = BaseAlgorithm  # a model of Stable-Baselines3
 
 
 class Learner(NamedTuple):
-    """A model that learns, together with its algorithm and its training."""
+    """A model that learns, with its learning algorithm, and the recipe and scenario of the training."""
 
     training: Training  # recipe and scenario
     algorithm: Algorithm  # algorithm of the model, which reads its policies, optimisers and other learned tensors
     model: Model  # the model of Stable-Baselines3
 
     def policies(self) -> Trained:
-        """Return a copy of the current policy, or one policy for each learner in the scheme ``independent``."""
+        """Return a copy of the current policy or, in the scheme ``independent``, of each learner's current policy."""
         actors = self.algorithm.actors(self.model)
         return make_policies(
             self.training, self.model.num_timesteps, lambda k, network: self.algorithm.tensors(actors[k], network)
@@ -37,7 +37,7 @@ class Learner(NamedTuple):
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """Build the vectorised environment of a training, with one row for each learner of each world."""
+    """Build the vectorised environment for a training run, with one row for each learner in each world."""
     recipe = training.recipe
     appended: dict[Scheme, Appended] = {"independent": "number", "centralised": "state"}
     return make_sb3_vec_env(
@@ -52,11 +52,11 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVecEnv) -> Model:
-    """Build the model of a training. Its optimisers raise ``TrainingDiverged`` for gradients that are not finite.
+    """Build the model of a training run. The optimisers raise ``TrainingDiverged`` for gradients that are not finite.
 
     Args:
-        algorithm: the algorithm of the training's recipe.
-        training: recipe and scenario.
+        algorithm: the learning algorithm that the recipe names.
+        training: recipe and scenario of the training.
         environment: the environment to learn in, from ``make_environment``.
 
     Raises ``InvalidInput`` if the model normalises observations with ``VecNormalize``.
@@ -75,13 +75,13 @@ def make_model(algorithm: Algorithm, training: Training, environment: EthBrakeVe
 def make_policies(
     training: Training, steps: int, tensors: Callable[[int, NetworkSpec], Mapping[str, Float32s]]
 ) -> Trained:
-    """Return one policy for all learners, or one for each learner in the scheme ``independent``.
+    """Return one policy for all learners, or one policy for each learner in the scheme ``independent``.
 
     Args:
-        training: recipe and scenario.
-        steps: number of decisions from which the weights were learned, which the policy records.
-        tensors: function that takes the number k of a policy (0 = foremost learner) and its network, and returns the
-            weights of the policy by name.
+        training: recipe and scenario of the training.
+        steps: number of decisions from which the weights were learned; the policies record this number.
+        tensors: function that takes the number k of a policy (0 = foremost learner) and the description of its network,
+            and returns the weights of the policy by name.
 
     """
     recipe, scenario = training.recipe, training.scenario

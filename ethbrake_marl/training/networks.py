@@ -15,11 +15,11 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 
 
 def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
-    """Return a copy of the weights of a policy, by their names in a policy bundle.
+    """Return a copy of a policy's weights: name of a tensor in a policy bundle -> its values.
 
     Args:
         policy: policy of Stable-Baselines3's PPO or SAC.
-        spec: description of the bundle's network, which must have the same layers as ``policy``.
+        spec: description of the network in the policy bundle, which must have the same layers as ``policy``.
 
     """
     state = policy.state_dict()
@@ -29,8 +29,9 @@ def tensors_of(policy: BasePolicy, spec: NetworkSpec) -> dict[str, Float32s]:
 def sb3_names(spec: NetworkSpec) -> dict[str, str]:
     """Return the names of a network's tensors: name in a policy bundle -> name in Stable-Baselines3's policy.
 
-    ``spec`` is the description of the network. The network belongs to PPO if its ``output`` is ``clip``, else to SAC.
-    Stable-Baselines3 also numbers the activations, so its number of a hidden layer is twice the number in a bundle.
+    ``spec`` describes the network. If ``spec.output`` is ``clip``, the network belongs to PPO, else to SAC.
+    Stable-Baselines3 also numbers the activations, so hidden layer k of a bundle has the number 2 k in
+    Stable-Baselines3.
     """
     if spec.output == "clip":
         ours = {"policy": ("mlp_extractor.policy_net", "action_net"), "value": ("mlp_extractor.value_net", "value_net")}
@@ -48,7 +49,7 @@ def sb3_names(spec: NetworkSpec) -> dict[str, str]:
 
 
 def tensors_of_layers(name: str, layers: nn.Sequential) -> dict[str, Float32s]:
-    """Return a copy of the weights of a perceptron, by their names in a policy bundle.
+    """Return a copy of a perceptron's weights: name of a tensor in a policy bundle -> its values.
 
     Args:
         name: name of the network in the bundle, such as ``policy`` or ``gate``. The names of all tensors begin with
@@ -71,7 +72,7 @@ def copy_of(tensor: Tensor) -> Float32s:
 
 
 def ppo_arguments(shape: NetworkShape) -> dict[str, Any]:
-    """Return ``policy_kwargs`` of Stable-Baselines3's PPO for the key ``network`` of a recipe.
+    """Return ``policy_kwargs`` of Stable-Baselines3's PPO for the value of the key ``network`` of a recipe.
 
     Actor and critic are separate networks with orthogonal initial weights.
     """

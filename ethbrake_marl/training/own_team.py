@@ -21,7 +21,7 @@ from ethbrake_marl.training.team import TeamFile, bundle_of
 
 
 class GaussianActor(Protocol):
-    """Actor with a normally distributed action, whose mean a perceptron computes.
+    """Actor that draws its action from a normal distribution, whose mean a perceptron computes.
 
     The environment receives the action clipped to [-1, 1].
     """
@@ -43,11 +43,12 @@ def save_team(
     If all learners have the same actor object, it is saved once, as a shared policy.
 
     Args:
-        folder: folder to write into.
+        folder: folder in which the team is saved.
         actors: actor of each learner, by the vehicle's name.
-        env: environment in which the actors were trained. The team records its scenario, observations and reward.
-        seed: seed of the training, which is recorded.
-        steps: number of decisions of the training, which is recorded.
+        env: environment in which the actors were trained. The team records the scenario, observations and reward of
+            this environment.
+        seed: seed of the training; the team records this seed.
+        steps: number of decisions of the training; the team records this number.
 
     Raises ``InvalidInput`` if an actor is not a perceptron with ReLU or Tanh, or if learners that share an actor
     observe different features.

@@ -22,9 +22,10 @@ class Ppo(Algorithm):
     """Algorithm PPO: one policy for all learners (optionally with a central critic), or one policy per learner."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
-        """Return a new PPO model for a training, which learns in ``environment``.
+        """Return a new PPO model for a training run, which learns in ``environment``.
 
-        The training's scheme decides between a shared policy, a central critic, and independent learners.
+        The training's scheme decides whether the model has a shared policy, a central critic, or one policy for each
+        learner.
         """
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)
@@ -57,7 +58,7 @@ class Ppo(Algorithm):
         return tuple(model.policy.policies) if isinstance(model, IndependentPPO) else (model.policy,)
 
     def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimiser as ``policy``, or the optimisers of independent learners by the vehicle's name."""
+        """Return the optimiser under the name ``policy``; for independent learners, return one per vehicle's name."""
         if isinstance(model, IndependentPPO):
             return dict(zip(model.names, (member.optimizer for member in model.policy.policies), strict=True))
         return {"policy": model.policy.optimizer}

@@ -1,4 +1,4 @@
-"""``Course``: last policy, best policy and evaluations of a training so far."""
+"""``Course``: last policy, best policy and evaluations of a training run so far."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ RETURN = "episode_return"
 
 @dataclass
 class Course:
-    """Last policy, best policy and evaluations of a running training.
+    """Last policy, best policy and evaluations of a training run in progress.
 
     The best policy is the policy with the smallest mean of the learners' objectives on the fixed list of worlds. If all
-    learners have the harm of the line as objective, the best policy is the policy with the least harm in
-    ``harm_count``. Without evaluations there is no best policy.
+    learners have the harm of the line as objective, the best policy is the policy with the least harm of the line
+    (``harm_count`` says which impacts count). Without evaluations there is no best policy.
     """
 
     harm_count: HarmCount = "first"  # count of harm by which the best policy is chosen
@@ -39,7 +39,7 @@ class Course:
 
     @property
     def wall_s(self) -> float:
-        """Wall time spent on this training so far (s), without the time between a stop and the resume."""
+        """Wall time spent on this training so far (s), without the time between a stop and the call of ``resume``."""
         return self.wall_before_s + time.monotonic() - self.started
 
     @property
@@ -51,7 +51,8 @@ class Course:
         """Record an evaluation of ``policy``, and remember the policy if it is the best so far.
 
         Args:
-            policy: the evaluated policy, at the current ``steps`` and ``updates``.
+            policy: the evaluated policy, which is the policy after ``self.steps`` decisions and ``self.updates``
+                updates.
             metrics: metrics of the policy by name, such as ``total_harm``.
             episode_return: mean return of the latest training episodes; None if no episode has ended yet.
 
@@ -64,7 +65,7 @@ class Course:
             self.best, self.best_harm = policy, metrics[name]
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything but the policies as plain data for JSON, for ``restore``."""
+        """Return the content of this object except the policies as plain data for JSON, for ``restore``."""
         return {
             "evaluations": self.evaluations,
             "best_harm": None if math.isinf(self.best_harm) else self.best_harm,
@@ -74,7 +75,7 @@ class Course:
         }
 
     def restore(self, content: Mapping[str, Any]) -> None:
-        """Set everything but the policies from ``content``, a result of ``to_json``."""
+        """Restore the values that ``to_json`` returned (everything except the policies) from ``content``."""
         self.evaluations = [dict(entry) for entry in content["evaluations"]]
         self.best_harm = math.inf if content["best_harm"] is None else float(content["best_harm"])
         self.wall_before_s = float(content["wall_s"])

@@ -1,4 +1,4 @@
-"""Global random generators, which Stable-Baselines3 uses: isolate the caller's generators, capture and restore them."""
+"""Protect, capture and restore the global random generators, which Stable-Baselines3 uses."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 def own_random_state() -> Iterator[None]:
     """Context manager that restores the global random generators of Python, NumPy and torch at its end.
 
-    Inside, torch uses one thread. With such small networks, a second thread makes training 3 to 15 times slower if
-    another process uses the cores.
+    Inside the ``with`` block, torch uses one thread. Our networks are so small that a second thread makes training 3 to
+    15 times slower if another process uses the processor cores.
     """
     states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
     torch.set_num_threads(1)
@@ -33,7 +33,7 @@ def own_random_state() -> Iterator[None]:
 def capture_generators() -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """Return the states of the global random generators of Python, NumPy and torch, for ``restore_generators``.
 
-    The first result is plain data for JSON, the second a dictionary of arrays by name.
+    The result is two dictionaries: plain data for JSON, and arrays by name.
     """
     state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     version, python_state, gauss = random.getstate()
@@ -53,8 +53,8 @@ def restore_generators(numbers: Mapping[str, Any], arrays: Mapping[str, NDArray[
     """Set the global random generators to the states that ``capture_generators`` returned.
 
     Args:
-        numbers: first result of ``capture_generators``.
-        arrays: second result of ``capture_generators``; other arrays are ignored.
+        numbers: first dictionary that ``capture_generators`` returned.
+        arrays: second dictionary that ``capture_generators`` returned; other arrays in it are ignored.
 
     """
     position, has_gauss, cached = numbers["numpy"]

@@ -1,4 +1,4 @@
-"""``TrainingRecipe``: the settings of a training, read from a YAML file."""
+"""``TrainingRecipe``: the settings of a training run, read from a YAML file."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ class LearningRate(FileModel):
 
 
 class Shape(FileModel):
-    """Base class for the value of a recipe's key ``network``, which describes the networks.
+    """Base class for the value of a recipe's key ``network``, which describes the networks to train.
 
-    A subclass declares the keys as fields. A subclass needs the fields ``policy`` (sizes of the actor's hidden layers,
-    such as ``[64, 64]``) and ``activation``, unless it overrides ``spec``.
+    A subclass declares the keys inside ``network`` as fields. A subclass needs the fields ``policy`` (sizes of the
+    actor's hidden layers, such as ``[64, 64]``) and ``activation``, unless it overrides ``spec``.
     """
 
     def spec(self, observation_size: int, **more: Any) -> NetworkSpec:
@@ -72,7 +72,7 @@ class Shape(FileModel):
 
         Args:
             observation_size: number of features of an observation.
-            more: fields of ``NetworkSpec`` that replace the values for a plain actor.
+            more: fields of ``NetworkSpec`` whose values differ from those of such an actor.
 
         """
         shape: Any = self  # subclasses declare the fields
@@ -95,7 +95,7 @@ class NetworkShape(Shape):
 
         Args:
             observation_size: number of features of an observation.
-            more: further fields of ``NetworkSpec``.
+            more: further fields of the returned ``NetworkSpec``.
 
         """
         return super().spec(observation_size, value_hidden=self.value, **more)
@@ -110,10 +110,11 @@ class EvaluationPlan(FileModel):
 
 
 class TrainingRecipe(FileModel):
-    """Settings of a training that all algorithms have: algorithm, reward, seed, checkpoints and measurements.
+    """Settings of a training run that all algorithms have: algorithm, reward, seed, checkpoints and measurements.
 
-    An *update* is one round of collecting decisions and learning from them. Each algorithm has a subclass with its own
-    keys. ``Field(description=...)`` explains a key; new files, the JSON Schema and the documentation show this text.
+    An *update* is one round of collecting decisions and learning from them. Each algorithm has a subclass of this
+    class, with further keys. The text in ``Field(description=...)`` explains a key in new recipe files, in the JSON
+    Schema and in the documentation.
 
     >>> import ethbrake_marl as eb
     >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
@@ -199,20 +200,20 @@ class TrainingRecipe(FileModel):
         return 1
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. The default accepts all."""
+        """Raise ``InvalidInput`` if the recipe does not fit the number of learners. By default, every number fits."""
 
     def begins(self, scenario: Scenario) -> str | None:
         """Return a description of the initial weights for a scenario, or None if the initial weights are random."""
         return None
 
     def derived(self) -> dict[str, float]:
-        """Return numbers computed from the keys, by name, which ``config.json`` records; by default none."""
+        """Return numbers for ``config.json`` that are computed from the recipe's keys, by name; by default none."""
         return {}
 
     def scheme_for(self, scenario: Scenario) -> Scheme:
-        """Return the scheme in which the scenario's learners train, such as ``single`` or ``shared``.
+        """Return the scheme (how the scenario's learners train together), such as ``single`` or ``shared``.
 
-        If the recipe does not set a scheme, it is ``single`` for one learner and ``shared`` for several. Raises
+        If the recipe does not set a scheme, the scheme is ``single`` for one learner and ``shared`` for several. Raises
         ``InvalidInput`` if no vehicle learns, or if the scheme or the recipe does not fit the number of learners.
         """
         learners, where = len(scenario.learners), f"scenario {scenario.name!r}"
@@ -235,7 +236,7 @@ class TrainingRecipe(FileModel):
         return scheme
 
     def make_algorithm(self) -> Any:
-        """Return a new object of the recipe's algorithm, a ``training.algorithm.Algorithm``."""
+        """Return a new object of the recipe's learning algorithm (a ``training.algorithm.Algorithm``)."""
         algorithm = ALGORITHMS[self.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
 
@@ -261,8 +262,9 @@ class TrainingRecipe(FileModel):
     def file(name_or_path: str | Path) -> Path:
         """Return the path of a recipe's file.
 
-        A text with a path separator or the ending ``.yaml`` is a path, and the file need not exist. Any other text must
-        be the name of a shipped recipe; otherwise ``UnknownName`` is raised.
+        If the argument contains a path separator or ends in ``.yaml``, the argument is a path, and the file need not
+        exist. If the argument is anything else, it must be the name of a shipped recipe; an unknown name raises
+        ``UnknownName``.
         """
         text = str(name_or_path)
         if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
@@ -274,7 +276,7 @@ class TrainingRecipe(FileModel):
 
     @staticmethod
     def of(content: Any) -> TrainingRecipe:
-        """Return the recipe whose keys and values are ``content``, a mapping as in a YAML file.
+        """Return the recipe whose keys and values are ``content``, a mapping such as a YAML file contains.
 
         Raises ``InvalidInput`` if the content is invalid; the message names the key.
         """
@@ -283,7 +285,7 @@ class TrainingRecipe(FileModel):
     def new_text(self, name: str) -> str:
         """Return the text of a commented YAML file for a new recipe that has the values of this recipe.
 
-        Save the text as ``<name>.yaml``. Raises ``InvalidInput`` for an invalid name.
+        The text must be saved as ``<name>.yaml``. Raises ``InvalidInput`` for an invalid name.
         """
         check_file_name("recipe", name)
         words = {
@@ -297,7 +299,7 @@ class TrainingRecipe(FileModel):
     def text(self, head: str) -> str:
         """Return the text of a commented YAML file with all keys of this recipe, below the comment ``head``.
 
-        Keys without a value are commented out.
+        Keys whose value is None are commented out.
         """
         lines = [head, schema_lines("recipe", "train --schema")]
         values, meanings = self.model_dump(mode="json"), key_meanings(type(self))
@@ -327,7 +329,8 @@ class TrainingRecipe(FileModel):
     def json_schema() -> dict[str, Any]:
         """Return the JSON Schema of recipe files, with which editors complete and check YAML.
 
-        The schema includes registered algorithms and measures. The allowed keys depend on ``algorithm``.
+        The schema includes registered algorithms and measures. The allowed keys depend on the value of the key
+        ``algorithm``.
         """
         classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
         places, whole = models_json_schema(
@@ -363,9 +366,9 @@ class TrainingRecipe(FileModel):
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return the descriptions of all keys in recipes of a class, by key.
+    """Return the description of every key that recipes of this class have, by key.
 
-    If a class declares a key without a description, the description of its base class is used.
+    If a class declares a key without a description, the description in its base class is used.
     """
     meanings: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
@@ -378,17 +381,17 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 
 
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
-    """Register an algorithm, for recipes with ``algorithm: name``.
+    """Register a learning algorithm, which recipes select with ``algorithm: NAME``.
 
-    A package can instead declare an entry point of the group ``ethbrake_marl.algorithms``: a ``Part`` with the recipe
-    class and the algorithm.
+    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.algorithms``: a
+    ``Part`` with the recipe class and the algorithm.
 
     Args:
         name: name of the algorithm, with 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
-        recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which checks YAML files.
+        recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which also checks their YAML files.
         algorithm: class of the algorithm, a subclass of ``training.algorithm.Algorithm``, or the text
-            ``"module:class"``. With a text, the module (and torch, which takes seconds) is not imported before a
-            training.
+            ``"module:class"``. If the text is given, the module (and torch, whose import takes seconds) is imported
+            only when a training run begins.
 
     Raises ``InvalidInput`` for an invalid name or a class that lacks a required method, and ``AlreadyExists`` if
     another algorithm has the name.
@@ -426,9 +429,9 @@ def algorithm_names() -> tuple[str, ...]:
 def load_recipe(name_or_path: str | Path) -> TrainingRecipe:
     """Read and check a recipe.
 
-    ``name_or_path`` is the name of a shipped recipe (``ppo``), or the path of a file. A text with a path separator or
-    the ending ``.yaml`` is a path. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for invalid
-    content; the message contains file, line, key, value and what would be right.
+    ``name_or_path`` is the name of a shipped recipe (``ppo``), or the path of a file. An argument that contains a path
+    separator or ends in ``.yaml`` is a path. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for
+    invalid content; the message contains file, line, key, value and what would be right.
     """
     return _checked(TrainingRecipe.file(name_or_path))
 
@@ -456,7 +459,7 @@ def _checked(source: Path | Document) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the allowed keys at the place of an unknown key, one of which an error message suggests.
+        """Return the keys that are allowed where an unknown key stands; an error message suggests one of them.
 
         ``path`` contains the keys that lead to the unknown key, such as ``("reward", "harm")``.
         """

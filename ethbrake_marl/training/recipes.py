@@ -64,7 +64,7 @@ class PpoRecipe(TrainingRecipe):
         return self
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the training has fewer updates than all learners together have turns."""
+        """Raise ``InvalidInput`` if the training has fewer updates than all learners together have turns to learn."""
         updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
         if self.turns is not None and self.turns * learners > updates:
             raise InvalidInput(
@@ -86,14 +86,17 @@ class SquashedShape(Shape):
 
         Args:
             observation_size: number of features of an observation.
-            more: further fields of ``NetworkSpec``.
+            more: further fields of the returned ``NetworkSpec``.
 
         """
         return super().spec(observation_size, output="tanh", **more)
 
 
 class SacRecipe(TrainingRecipe):
-    """Recipe of SAC: an update adds ``steps_per_update`` decisions of every learner to a replay buffer, and learns."""
+    """Recipe of SAC, which learns from a replay buffer.
+
+    An update adds ``steps_per_update`` decisions of every learner to the buffer, and learns from decisions in it.
+    """
 
     algorithm: Literal["sac"]
     batch_size: int = Field(ge=2, description=BATCH_SIZE)
@@ -144,7 +147,7 @@ class SacRecipe(TrainingRecipe):
         return self.gradient_steps / (self.n_envs * self.steps_per_update)
 
     def derived(self) -> dict[str, float]:
-        """Return ``{"update_ratio": ...}``, the number of gradient steps per decision, for ``config.json``."""
+        """Return the number of gradient steps per decision as ``{"update_ratio": ...}``, for ``config.json``."""
         return {"update_ratio": self.update_ratio}
 
 

@@ -1,4 +1,4 @@
-"""``RunDirectory``: the folder of a run, which contains a training and its results."""
+"""``RunDirectory``: the folder of a run, which contains a training run and its results."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ class RunDirectory:
         Args:
             config: content of ``config.json``.
             team: content of ``team.json``; None: the file is not written.
-            force: replace an earlier run (a folder with a ``run.json``) or an empty folder.
+            force: whether to replace an earlier run (a folder with a ``run.json``) or an empty folder.
 
-        Returns this object. Raises ``AlreadyExists`` if the path exists and may not be replaced.
+        Returns this object. Raises ``AlreadyExists`` if the folder exists and may not be replaced.
 
         """
         path, is_run = self.path, self.status.is_file()
@@ -81,15 +81,15 @@ class RunDirectory:
         return self
 
     def write_json(self, file: Path, content: Mapping[str, Any]) -> None:
-        """Write ``content`` as JSON to ``file``, a path in this folder. After an error the old file is unchanged."""
+        """Write ``content`` as JSON to ``file``, a path in this folder. If writing fails, the old file is unchanged."""
         write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
 
     def write_status(self, status: RunStatus, **more: Any) -> None:
-        """Write a new ``run.json`` with this status, the old start time and, unless ``running``, the end time.
+        """Write ``run.json`` anew: status, start time of the run and, unless the status is ``running``, its end time.
 
         Args:
-            status: the status.
-            more: further entries of ``run.json``.
+            status: the status of the run.
+            more: further entries to write into ``run.json``.
 
         """
         now = datetime.now(UTC).isoformat(timespec="seconds")
@@ -141,13 +141,14 @@ class RunDirectory:
     def chosen_by(cls, evaluations: Sequence[Mapping[str, Any]], harm_count: HarmCount, prefix: str = "") -> str:
         """Return the name of the metric that is smallest for the best policy.
 
-        The metric is ``objective`` if every evaluation has an entry ``objective``, else the harm of the line in
-        ``harm_count``.
+        The metric is ``objective`` if every evaluation has an entry ``objective``, otherwise the harm of the line
+        (``first_impact_harm`` or ``total_harm``, as ``harm_count`` says).
 
         Args:
-            evaluations: evaluations, or rows of ``progress.csv``.
+            evaluations: evaluations of a training run (``TrainResult.evaluations``), or rows of ``progress.csv``.
             harm_count: count of harm that the training minimises.
-            prefix: prefix of metrics in ``evaluations`` and in the result (``eval/`` for rows of ``progress.csv``).
+            prefix: prefix of the metrics' names in ``evaluations`` and in the result: ``eval/`` for rows of
+                ``progress.csv``.
 
         """
         with_objective = evaluations and all(
@@ -156,13 +157,13 @@ class RunDirectory:
         return prefix + (cls.OBJECTIVE if with_objective else cls.HARM[harm_count])
 
     def rows(self) -> list[dict[str, str]]:
-        """Return the rows of ``progress.csv``, each as a dictionary from column to text."""
+        """Return the rows of ``progress.csv``, each as a dictionary: name of a column -> text."""
         return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def cpu_s(self) -> dict[int, float]:
         """Return the processor time of learning (s) up to each evaluation, by the number of decisions so far.
 
-        Raises ``InvalidInput`` if ``run.json`` has no such record.
+        Raises ``InvalidInput`` if ``run.json`` does not record the processor time.
         """
         recorded = read_object(self.status).get("cpu_s") or {}
         if not recorded:
@@ -170,5 +171,5 @@ class RunDirectory:
         return {int(steps): float(spent) for steps, spent in recorded.items()}
 
     def column(self, name: str) -> dict[int, float]:
-        """Return the values of a column of ``progress.csv``, by the number of decisions. Empty cells are omitted."""
+        """Return a column of ``progress.csv``: number of decisions so far -> value. Missing values are omitted."""
         return {int(row["steps"]): float(row[name]) for row in self.rows() if row.get(name)}

@@ -19,7 +19,7 @@ class Sac(Algorithm):
     """Algorithm SAC, with one policy for all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> SAC:
-        """Return a new SAC model for a training, seeded by its recipe, which learns in ``environment``."""
+        """Return a new SAC model for a training run, seeded by its recipe, which learns in ``environment``."""
         recipe = training.recipe
         assert isinstance(recipe, SacRecipe)
         automatic = recipe.ent_coef == "auto"

@@ -1,4 +1,4 @@
-"""Train policies, or resume a training: build the model, learn, evaluate, save."""
+"""Train policies, or resume a training run: build the model, let it learn, measure its policies, save them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _BUSY = "another process is training in this folder"
 
 @dataclass(frozen=True, slots=True)
 class TrainResult:
-    """Result of ``train`` or ``resume``: the policies and the course of the training.
+    """Result of ``train`` or ``resume``: the policies, and the evaluations during the training.
 
     ``trained`` is the best policy: the policy with the least harm on the fixed list of worlds, or the last policy if
     nothing was measured.
@@ -62,7 +62,7 @@ class TrainResult:
 
     @property
     def agent(self) -> str:
-        """Spec of the trained agent, for ``make_agent`` and ``--agents``, such as ``ppo@runs/mine``."""
+        """Text that names the trained agent for ``make_agent`` and ``--agents``, such as ``ppo@runs/mine``."""
         return self.training.agent_in(self.directory)
 
     @property
@@ -113,9 +113,9 @@ def train(
     """Train the learners of a scenario, and write the folder of the run.
 
     Ctrl-C stops the training after the current update (status ``interrupted``); a second Ctrl-C raises
-    ``KeyboardInterrupt``. In both cases, and after an error, ``policy/`` contains the best policy so far, and
-    ``policy-last/`` the last policy with finite weights. ``resume`` continues the training. The same recipe, scenario
-    and seed give exactly the same policy on the same machine.
+    ``KeyboardInterrupt``. After Ctrl-C or an error, ``policy/`` contains the best policy so far, and ``policy-last/``
+    the last policy with finite weights. ``resume`` continues a stopped training. The same recipe, scenario and seed
+    give exactly the same policy on the same machine.
 
     Args:
         recipe: a recipe, its name, or the path of its file.
@@ -124,17 +124,18 @@ def train(
         scheme: how several learners train together; None: the recipe's scheme.
         turns: number of turns of each independent learner (docs/train.md); None: the recipe's number.
         seed: seed of the training; None: the recipe's seed.
-        steps: number of decisions of all learners; None: the recipe's number. The training ends with a whole update, so
-            the learners may make a few more decisions.
-        force: replace an earlier run.
-        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files, for ``config.json``.
-        measure: function that takes the training and returns a function that measures its policies. Policies are
-            measured before the first update, every few updates (a key of the recipe), and at the end. By default the
-            policies are measured on the fixed list of worlds in the recipe. If this is None, policies are not measured.
+        steps: number of decisions of all learners together; None: the recipe's number. The training ends with a whole
+            update, so the learners may make a few more decisions.
+        force: whether to replace an earlier run in ``directory``.
+        settings: settings ``KEY=VALUE`` by which recipe and scenario differ from their files; ``config.json`` records
+            them.
+        measure: function that takes a ``Training`` and returns a function that measures policies; None: policies are
+            not measured. By default, policies are measured on the fixed list of worlds that the recipe defines.
+            Measurements take place before the first update, every few updates (a key of the recipe), and at the end.
         stop_at: function that takes an evaluation (an entry of ``TrainResult.evaluations``), and returns a reason to
             stop the training with status ``interrupted``, or None to continue.
-        on_progress: function that is called with the progress. By default the progress is printed on stderr. If this is
-            None, the progress is not printed.
+        on_progress: function that is called with the progress of the training; None: the progress is not reported. By
+            default, the progress is printed on stderr.
 
     Raises ``AlreadyExists`` for an existing directory if ``force`` is false, ``InvalidInput`` if recipe and scenario do
     not fit each other, ``TrainingDiverged`` if a number is not finite.
@@ -157,22 +158,24 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Continue a training that was stopped or killed. The resulting policies are exactly the same as without the stop.
+    """Continue a training run that was stopped or killed. The policies are exactly the same as without the stop.
 
     The training continues from the newest undamaged checkpoint, or from the beginning if there is no such checkpoint.
-    Rows of the logs after this checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about the
-    earlier policy are deleted.
+    Log rows that were written after this checkpoint are dropped. Results and reports that ``ethbrake run`` wrote about
+    the earlier policy are deleted.
 
     Args:
         directory: the folder of the run.
-        measure: the same argument as in the call of ``train``.
-        stop_at: the same argument as in the call of ``train``. This function is called only with new evaluations.
-        on_progress: as in ``train``.
-        other_versions: accept a checkpoint that was written by other versions of packages. The resulting policies may
-            differ from the policies of an uninterrupted training.
+        measure: the same argument as in ``train``.
+        stop_at: the same argument as in ``train``. Evaluations that were made before the stop are not passed to it
+            again.
+        on_progress: the same argument as in ``train``.
+        other_versions: whether to accept a checkpoint that other versions of packages wrote. The resulting policies may
+            then differ from the policies of an uninterrupted training.
 
-    Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if
-    ``config.json`` was edited after the checkpoint was written, and for a checkpoint of other versions.
+    Raises ``InvalidInput`` if the folder contains no training or a finished training, if another process is training in
+    the folder, if ``config.json`` was edited after the checkpoint was written, or if other versions of packages wrote
+    the checkpoint.
 
     """
     run = RunDirectory(Path(directory))
@@ -190,17 +193,18 @@ def resume(
 def build(
     training: Training, run: RunDirectory, measure: Measure | None, stop_at: StopAt | None, on_progress: Told
 ) -> Iterator[RunCallback]:
-    """Context manager that builds environment and model of a training, and yields the callback to pass to ``learn``.
+    """Context manager that builds environment and model of a training run, and yields the callback to pass to
+    ``learn``.
 
-    Inside, Ctrl-C stops the training after the current update. At the end, the environment is closed, and the global
-    random generators are restored.
+    Inside the ``with`` block, Ctrl-C stops the training after the current update. At the end of the block, the
+    environment is closed, and the global random generators are restored.
 
     Args:
-        training: recipe and scenario.
-        run: folder of the run; nothing is written yet.
-        measure: as in ``train``.
-        stop_at: as in ``train``.
-        on_progress: as in ``train``.
+        training: recipe and scenario of the training.
+        run: folder of the run, into which this function does not write yet.
+        measure: the same argument as in ``train``.
+        stop_at: the same argument as in ``train``.
+        on_progress: the same argument as in ``train``.
 
     """
     evaluate = None if measure is None else measure(training)
@@ -211,7 +215,7 @@ def build(
 
 
 def learn(callback: RunCallback, state: TrainingState | None, notes: Sequence[str] = ()) -> TrainResult:
-    """Run a training until it ends or is stopped, save the policies, and return the result.
+    """Train until the training ends or is stopped, save the policies, and return the result.
 
     The policies are also saved if the training ends with an error.
 
@@ -296,7 +300,7 @@ def save(callback: RunCallback, status: RunStatus, reason: str | None) -> None:
 
 
 def _check_unfinished(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput`` if the training has finished, even if the evaluation of ``ethbrake run`` has not."""
+    """Raise ``InvalidInput`` if the training has finished, even if ``ethbrake run`` has not evaluated it yet."""
     status = read_object(run.status)
     resumable = any(run.checkpoints.glob("step_*"))
     if status["status"] == "finished" or (status.get("stage") is not None and not resumable):
@@ -309,7 +313,7 @@ def _check_unfinished(run: RunDirectory, training: Training) -> None:
 def _newest_checkpoint(
     run: RunDirectory, training: Training, other_versions: bool
 ) -> tuple[TrainingState | None, list[str]]:
-    """Return the newest undamaged checkpoint (None if there is none), and error messages about newer, damaged ones.
+    """Return the newest undamaged checkpoint (or None), and error messages about damaged newer checkpoints.
 
     Raises ``InvalidInput`` if the checkpoint belongs to another training, or if other versions of packages wrote it
     (unless ``other_versions``).

@@ -25,10 +25,10 @@ class Settings(NamedTuple):
     measures: tuple[str, ...] = ()  # names of additional measures that an evaluation reports
 
     def change(self, recipe: TrainingRecipe, tell: Callable[[str], None] | None = None) -> TrainingRecipe:
-        """Return the recipe with the new values of ``self.recipe``. Keys that the recipe's class lacks are ignored.
+        """Return the recipe with the values that ``self.recipe`` sets; keys that the recipe does not have are ignored.
 
         Args:
-            recipe: the recipe.
+            recipe: the recipe to change.
             tell: function that is called with a note for the user if ``gamma`` and ``reward.shaping_discount``, which
                 should be equal, differ because only one of them was set.
 
@@ -57,8 +57,8 @@ def read_settings(
 
     Args:
         texts: settings ``KEY=VALUE`` as the user wrote them; None: there are no settings.
-        recipes: recipes of the command, whose keys may be set.
-        of_agents: settings of agents that the command allows, such as ``harm_count``.
+        recipes: recipes that the command uses; their keys may be set.
+        of_agents: names of agents' settings that the command allows, such as ``harm_count``.
 
     Raises ``UnknownName`` for an unknown key, and ``InvalidInput`` for an ambiguous key or an invalid value.
 

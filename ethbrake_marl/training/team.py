@@ -26,7 +26,7 @@ def bundle_of(scheme: Scheme, vehicle: str) -> str:
     """Return the folder of a learner's policy, relative to the folder of the run.
 
     Args:
-        scheme: how the learners train together.
+        scheme: how the learners train together, such as ``shared`` or ``independent``.
         vehicle: name of the learner, such as ``vehicle_2``.
 
     """
@@ -96,8 +96,8 @@ def load_team(
         vehicles: indices (0 = front) of the vehicles to drive; None: the scenario's learners. Other learners of the run
             are omitted.
 
-    Raises ``InvalidInput`` if the folder has no team, if the team is for a line of another length, or if it has no
-    policy for one of the vehicles; ``CorruptBundle`` for a damaged team.
+    Raises ``InvalidInput`` if the folder has no ``team.json``, if the team is for a line of another length, or if the
+    team has no policy for one of the vehicles. Raises ``CorruptBundle`` if ``team.json`` is damaged.
 
     """
     path, scenario = Path(folder), scenario if isinstance(scenario, Scenario) else load_scenario(scenario)

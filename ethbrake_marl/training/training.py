@@ -1,4 +1,4 @@
-"""``Training``: the combination of a recipe and a scenario, from which a training is run."""
+"""``Training``: the combination of a recipe and a scenario, which together define a training run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ethbrake_marl.training.team import TeamFile, bundle_of
 class Training:
     """Combination of a recipe and a scenario, with the learners and observations that follow from them.
 
-    Use ``Training.of`` to create one.
+    Use ``Training.of`` to create a ``Training``.
     """
 
     recipe: TrainingRecipe  # the recipe, with all changes
@@ -39,14 +39,15 @@ class Training:
 
     @classmethod
     def of(cls, recipe: TrainingRecipe | str | Path, scenario: Scenario | str | Path, **changes: Any) -> Training:
-        """Combine a recipe and a scenario.
+        """Return the combination of a recipe and a scenario.
 
-        Learners observe the features that the recipe lists or, if it lists none, the features of the scenario.
+        Learners observe the features that the recipe lists or, if the recipe lists none, the features that the scenario
+        lists.
 
         Args:
             recipe: a recipe, its name, or the path of its file.
             scenario: a scenario, its name, or the path of its file.
-            changes: new values for keys of the recipe.
+            changes: new values for keys of the recipe, such as ``seed=3``.
 
         Raises ``InvalidInput`` if recipe and scenario do not fit each other: no vehicle learns, the scheme needs
         another number of learners, or one policy would drive learners that observe different features.
@@ -69,13 +70,13 @@ class Training:
 
     @property
     def columns(self) -> list[list[int]]:
-        """Columns of an environment row that each learner observes, for all learners from front to rear."""
+        """For each learner, front to rear: the columns of an observation row that the learner observes."""
         place = {feature.name: column for column, feature in enumerate(self.observation.features)}
         return [[place[feature.name] for feature in spec.features] for spec in self.observations.values()]
 
     @property
     def begins(self) -> str | None:
-        """Description of the initial weights; None if they are random."""
+        """Description of the initial weights; None if the initial weights are random."""
         return self.recipe.begins(self.scenario)
 
     def content(self) -> dict[str, dict[str, Any]]:
@@ -88,7 +89,7 @@ class Training:
 
     @property
     def identity(self) -> str:
-        """SHA-256 of ``content()``, in hexadecimal digits. Trainings with equal hashes give the same policy."""
+        """SHA-256 of ``content()``, in hexadecimal digits. Training runs with equal hashes give the same policy."""
         return self.identity_of(self.content())
 
     @staticmethod
@@ -99,7 +100,7 @@ class Training:
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
         """Return the content of ``config.json``: recipe, scenario, seeds, versions and settings.
 
-        ``settings`` are the settings ``KEY=VALUE`` by which recipe and scenario differ from their files.
+        ``settings`` are texts ``KEY=VALUE`` that say how recipe and scenario differ from their files.
         """
         recipe = self.recipe
         return {
@@ -117,7 +118,7 @@ class Training:
         return file.model_dump(mode="json")
 
     def agent_in(self, folder: Path) -> str:
-        """Return the spec of the agent that this training writes to the run's ``folder``, such as ``ppo@runs/mine``."""
+        """Return the text that names the agent trained in the run's ``folder``, such as ``ppo@runs/mine``."""
         several, algorithm = len(self.drivers) > 1, self.recipe.algorithm
         return f"{'team' if several else algorithm if algorithm in AGENTS else 'policy'}@{folder}"
 
@@ -131,13 +132,13 @@ class Training:
 
 
 def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
-    """Return the training that the configuration of a run describes.
+    """Return the recipe and scenario that the configuration of a run describes.
 
     Args:
         run: folder of the run, which error messages name.
         config: content of the run's ``config.json``.
 
-    Raises ``InvalidInput`` for an invalid configuration, and for a training by another library.
+    Raises ``InvalidInput`` if the configuration is invalid, or if another library trained the policies.
 
     """
     if "library" in config:
@@ -155,7 +156,7 @@ def recorded_training(run: RunDirectory, config: Mapping[str, Any]) -> Training:
 
 
 def check_same_training(run: RunDirectory, training: Training) -> None:
-    """Raise ``InvalidInput`` if a run is another training; the message names the keys that differ."""
+    """Raise ``InvalidInput`` if recipe or scenario of a run differ from ``training``; the message names the keys."""
     recorded = recorded_training(run, read_object(run.config))
     if recorded.identity == training.identity:
         return
