@@ -1,7 +1,7 @@
 """Checks of a scenario that concern several fields together.
 
-Each check raises a pydantic error for the first mistake that it finds. The error contains the path inside the file and
-the value.
+Each check raises a pydantic error for the first mistake that it finds. The error contains the invalid value and its
+path (keys and indices) inside the file.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _check_speeds(scenario: ScenarioFields) -> None:
 
 
 def _check_derived(scenario: ScenarioFields) -> None:
-    """Raise an error if a gap (from a time gap) or the distance of the obstacle (from a margin) is too large."""
+    """Raise an error if a gap (computed from a time gap) or obstacle distance (from a margin) is too large."""
     largest = QUANTITY.usual["gaps_m"].high
     for pair, (_, high) in enumerate(scenario.bounds("gaps_m") if scenario.time_gaps_s is not None else ()):
         right = f"gives gaps up to {high:g} m at the speed of vehicle_{pair + 2}; a gap must not be above {largest:g} m"
