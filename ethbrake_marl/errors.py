@@ -86,7 +86,7 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
 
     ``path``: the user's file; the last line of this file in the traceback is reported. If ``path`` is None, the
-    innermost line of the traceback is reported. An error of this package is described by its message alone.
+    innermost line of the traceback is reported. For an error of this package, the description is only its message.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -129,7 +129,7 @@ class UnknownName(InvalidInput):
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """A file or a registered name exists already. ``force`` (``--force``) allows overwriting a file."""
+    """A file or a registered name exists already. With ``force`` (``--force``) an existing file is overwritten."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
@@ -161,7 +161,7 @@ class MissingExtra(EthBrakeError, ImportError):
 def naming_extras() -> Iterator[None]:
     """Context manager: raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
 
-    All other import errors pass unchanged.
+    Any other import error is raised unchanged.
     """
     try:
         yield
@@ -184,7 +184,7 @@ def _missing(package: str) -> MissingExtra:
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):
-    """Some worlds of a batch could not be advanced. The cause is a defect of the physics kernel, never of the input.
+    """Some worlds of a batch could not be simulated. The cause is a defect of the physics kernel, never of the input.
 
     The failure does not affect the other worlds of the batch, so a caller may compute the batch again without the
     failed worlds (``physics.left_out.leaving_out_failed``).
@@ -235,7 +235,7 @@ class AgentFailed(InvalidInput):
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
         """Context manager: change the agent's name in an ``AgentFailed`` error to ``name``, which the user knows.
 
-        ``others``: names of the agents of the other vehicles; an error of one of these agents passes unchanged.
+        ``others``: names of the agents of the other vehicles; an error of one of these agents keeps the agent's name.
         """
         try:
             yield
@@ -268,14 +268,14 @@ class UncertifiedStep(EthBrakeError):
 def new_name(name: object, known: Collection[str]) -> str | None:
     """Return the new name if ``name`` was renamed and the new name is in ``known``; otherwise None.
 
-    Words between colons are renamed one by one.
+    If ``name`` contains colons, each word between them is looked up separately.
     """
     new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
     return new if new != name and new in known else None
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name, which shows its new name, a similar name, or all known names.
+    """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
 
     Args:
         kind: kind of thing that should have the name, for example ``scenario``.
@@ -297,7 +297,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 def refuse_shipped_path(path: str, agent: str = "") -> None:
     """Raise ``UnknownName`` if ``path`` is ``shipped`` or ``shipped/NAME``, the former way to name a shipped policy.
 
-    ``agent``: the name before the ``@``, in ``agent@path``; "" for a path alone.
+    ``agent``: the name before the ``@``, in ``agent@path``; empty if there is no ``@``.
     """
     folder, _, name = path.partition("/")
     if folder == "shipped":

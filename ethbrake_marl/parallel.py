@@ -45,11 +45,11 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
     Args:
         calls: tuples (function, argument, ...) with module-level functions. If ``calls`` is a generator, each tuple is
-            requested shortly before its call starts.
-        jobs: number of calls that run at once. None means 1 without Ray, and the number of cores with Ray. A single
-            call at a time without Ray runs in this process.
-        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. None: run in processes of joblib,
-            without Ray.
+            taken from it shortly before the call starts.
+        jobs: number of calls that run at once. If ``jobs`` is None, the number is 1 without Ray, and the number of
+            cores with Ray. With one call at a time and without Ray, the calls run in this process.
+        ray: ``local`` to start Ray on this machine, or the address of a Ray cluster. If ``ray`` is None, the calls run
+            in processes of joblib.
 
     Raises the error of a call that fails; ``WorkerLost`` if a worker process is killed (Ray repeats the call instead);
     ``MissingExtra`` if joblib or Ray is not installed; ``InvalidInput`` if no cluster answers at the address.
@@ -142,7 +142,7 @@ def own_signals() -> Iterator[None]:
 def _backend(ray: str | None, jobs: int | None) -> Iterator[tuple[dict[str, Any], int]]:
     """Context manager: start joblib's backend; yield its settings and the number of calls that run at once.
 
-    The arguments have the same meaning as in ``run_each``.
+    ``ray`` and ``jobs`` have the same meaning as in ``run_each``.
     """
     if ray is None:
         yield {"backend": "loky", "inner_max_num_threads": 1}, jobs or 1

@@ -50,7 +50,7 @@ def file_sha256(path: Path) -> str:
 def files_run() -> dict[str, str]:
     """Return the SHA-256 of every Python file that this process ran, and of the files that they use, by file name.
 
-    If several files have the same name, their hashes are joined by commas.
+    If several files have the same name, the value is a text with all their hashes, separated by commas.
     """
     files = {name: set(several) for name, several in _READ.items()}
     for path, (sha256, _) in _RUN.items():

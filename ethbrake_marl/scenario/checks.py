@@ -26,8 +26,8 @@ MOST_SAMPLES = 1_000  # largest number of samples that a vehicle may have to sto
 def check_whole(scenario: ScenarioFields) -> None:
     """Check the fields of a scenario that depend on each other; raise a pydantic error for the first mistake.
 
-    The checks concern quantities that are declared twice, time step, horizon, latencies, channel, speeds, gaps,
-    obstacle and scripts.
+    The checks concern time step, horizon, latencies, channel, speeds, gaps, obstacle, scripts, and quantities that are
+    declared twice.
     """
     alone = "speed_deviations_mps" in scenario.model_fields_set and scenario.line_speed_mps is None
     right = "can be used only with line_speed_mps, the speed to which the deviations are added"

@@ -270,7 +270,7 @@ Quantity = Annotated[
 
 
 class WithLoad(_Distribution):
-    """``{with_load: [empty, full]}``: a linear function of the vehicle's load (0 to 1); allowed in vehicle types only.
+    """``{with_load: [empty, full]}``: linear in the vehicle's load, from load 0 to load 1; only in vehicle types.
 
     ``spread`` is the distribution, around 0, of a random amount that is added to each vehicle's value.
     """

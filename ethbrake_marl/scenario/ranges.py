@@ -58,7 +58,7 @@ class Ranges:
 
 
 def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform number draws each random quantity: name -> (stream, column)."""
+    """Return which uniform number draws each random quantity: name -> (stream of random numbers, column)."""
     used: list[str] = []
 
     def note(key: str) -> Floats:
@@ -79,9 +79,10 @@ def _of_quantities(scenario: ScenarioFields) -> dict[str, Place]:
 
 
 def _of_types(scenario: ScenarioFields) -> dict[str, Place]:
-    """Return which uniform numbers draw vehicle types and loads: name -> (stream, column).
+    """Return which uniform numbers draw vehicle types and loads: name -> (stream of random numbers, column).
 
-    Numbers without effect are left out: a type if only one is possible, a load if no quantity depends on it.
+    Numbers without effect are left out: the number of a vehicle's type if only one type is possible, and the number of
+    its load if no quantity depends on the load.
     """
     if scenario.types_of_line is None:
         return {}

@@ -1,4 +1,4 @@
-"""Draw worlds from a scenario. World k of a seed is the same, bit for bit, for any number of drawn worlds."""
+"""Draw worlds from a scenario. For a given seed, world k is the same, bit for bit, for any number of worlds."""
 
 from __future__ import annotations
 
