@@ -278,7 +278,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
 
     Args:
-        kind: kind of thing that should have the name, for example ``scenario``.
+        kind: what the name should be a name of, for example ``scenario``.
         name: the unknown name.
         known: the known names.
         may_be_own: true if users can register names of this kind. The message then says that the user's own name must

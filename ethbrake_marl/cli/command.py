@@ -133,7 +133,7 @@ class Out:
         """Print the result of the command on stdout.
 
         Args:
-            content: plain data, printed if JSON is requested.
+            content: result as plain data (dictionaries, lists, texts, numbers), printed if JSON is requested.
             shown: texts and tables, printed if JSON is not requested.
             end: characters printed after each text.
 

@@ -329,9 +329,9 @@ _FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of evalua
 def compare_command(first: Annotated[Path, _FILE], second: Annotated[Path, _FILE], as_json: JsonOption = False) -> None:
     """Show how harm differs between two results.
 
-    Shows the second result minus the first, for agents of the same name. Both results must come from the same command
-    and the same worlds of the same scenario. Confidence intervals are paired by world if both folders have the files of
-    --per-world.
+    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. Both
+    results must come from the same command and the same worlds of the same scenario. Confidence intervals are paired by
+    world if both folders have the files of --per-world.
     """
     with Out(as_json=as_json) as out:
         comparison = evaluation.compare_results(evaluation.read_result(first), evaluation.read_result(second))
@@ -363,11 +363,11 @@ def shield_command(
     settings: SettingsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare agents without and behind the shield.
+    """Compare agents without and with the shield.
 
-    Each agent is run in the same worlds without a shield, in episode mode and in step mode. A team of several learners
-    is run in the same worlds without a shield, in step mode, and in step mode with caps. Name the agents without a
-    shield: full_brake, not full_brake+step. The shield bounds first-impact harm, or total harm with --set
+    Each agent runs in the same worlds without a shield, with the shield in episode mode, and with the shield in step
+    mode. A team of several learners runs without a shield, in step mode, and in step mode with caps. Name the agents
+    without a shield: full_brake, not full_brake+step. The shield bounds first-impact harm, or total harm with --set
     harm_count=total. For each action that step mode replaced, the table says what harm the replaced action would have
     caused: more (the replacement was needed), the same (harmless) or less (costly).
     """
@@ -385,7 +385,7 @@ def shield_command(
 
 
 def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluation.ShieldModes:
-    """Compare agents without and behind the shield in the worlds of ``sample``, and show the progress on stderr.
+    """Compare agents without and with the shield in the worlds of ``sample``, and show the progress on stderr.
 
     ``agents``: names of agents without a shield, with commas between them.
     """
@@ -398,7 +398,7 @@ def _measure_modes(out: Out, agents: str, sample: Sample, task: Task) -> evaluat
 
 
 def _tell_left_out(out: Out, left_out: LeftOutRows, whole: int) -> None:
-    """If worlds were left out of the results, print on stderr which of the ``whole`` number of worlds they are."""
+    """Print on stderr which worlds were left out of the results, if any; ``whole``: number of all worlds."""
     if left_out:
         texts = [f"world {world} of seed {evaluation.LIST_SEED} ({reason})" for world, reason in left_out]
         out.note(evaluation.LeftOut.line(texts, whole))

@@ -361,8 +361,8 @@ def scenario_sample(
     """Draw worlds, and show them as a table or picture.
 
     The table has a column for each quantity that is not fixed in the scenario; `eb.read_worlds` reads such a table. The
-    picture shows distributions, pairs of quantities, and three worlds. The same scenario, seed and number of worlds
-    give the same worlds on every machine.
+    picture shows the distributions of quantities, scatter plots of pairs of quantities, and three worlds. The same
+    scenario, seed and number of worlds give the same worlds on every machine.
     """
     with Out(as_json=as_json, force=force) as out:
         out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")

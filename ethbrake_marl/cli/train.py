@@ -205,7 +205,8 @@ def train_command(
 def _show(out: Out, result: training.TrainResult, scenario: str | None = None) -> None:
     """Print the harm of the trained agent and of full braking on stdout, and how the training ended on stderr.
 
-    ``scenario``: name or path of the scenario from the command line; None: the name of the training's scenario.
+    ``scenario``: name or path of the scenario in the command that is printed; None: the name of the scenario of the
+    training run.
     """
     from ethbrake_marl.training.fixed_list import measure_full_braking
     from ethbrake_marl.training.progress import objective_in_words

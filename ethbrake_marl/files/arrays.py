@@ -142,7 +142,7 @@ class ArrayArchive:
     def unpack(self, wanted: Sequence[ArrayRow]) -> dict[str, NDArray[Any]]:
         """Return the arrays by name, read-only, after checking their names, types and shapes against ``wanted``.
 
-        Raises the same ``ValueError`` as ``check_arrays``.
+        Raises ``ValueError`` in the same cases as ``check_arrays``.
         """
         check_arrays(self.headers, wanted)
         arrays = {}

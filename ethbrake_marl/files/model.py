@@ -1,6 +1,6 @@
 """Pydantic models of files, and the error message for the first mistake in a file.
 
-The message contains the place of the mistake, the invalid value, and what would be valid.
+The error message contains the place of the mistake, the invalid value, and what would be valid.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
     """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
 
-    The message names file, line, key and value, and says what would be valid.
+    The error message names file, line, key and value, and says what would be valid.
 
     Args:
         source: path of the file, or the parsed document.
@@ -198,7 +198,7 @@ class Mistake(NamedTuple):
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """Return the first mistake in ``error``, for files that programs write and for settings in code."""
+    """Return the first mistake in pydantic's ``error``, for files that programs write and for settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "is an unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))

@@ -340,8 +340,8 @@ def parquet_file(
 ) -> Iterator[Callable[..., None]]:
     """Context manager: yield a function ``add(columns)`` that appends rows to a new Parquet file.
 
-    ``columns`` maps column names to arrays of equal length; ``add(columns, together=True)`` writes these rows as one
-    row group. The file appears only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
+    ``columns`` maps column names to arrays of equal length. With ``add(columns, together=True)`` the appended rows form
+    one row group. The file appears only if the block ends without error. Raises ``MissingExtra`` if pyarrow is not
     installed.
 
     Args:

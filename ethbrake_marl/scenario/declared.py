@@ -225,7 +225,7 @@ class ScenarioFields(FileModel):
     @field_validator("table")
     @classmethod
     def _columns_of_line(cls, value: Table | None, info: ValidationInfo) -> Table | None:
-        """Check that each column of the table fits this number of vehicles, and that its numbers are in range."""
+        """Check that each column of the table fits the number of vehicles, and has only numbers in range."""
         if value is None or "vehicles" not in info.data:
             return value
         known = columns_of_table({**QUANTITY.usual, **QUANTITY.optional}, info.data["vehicles"])
@@ -243,7 +243,7 @@ class ScenarioFields(FileModel):
     @field_validator(*QUANTITY.declared)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Check that all possible values of a quantity are in range, and that a list has the right length."""
+        """Check that all possible values of a quantity are in range, and that a list has the required length."""
         rule, vehicles = QUANTITY.declared[str(info.field_name)], info.data.get("vehicles")
         if value is None:
             return value

@@ -40,10 +40,10 @@ def build_members(
 ) -> tuple[Document, tuple[AnyScenario, ...]]:
     """Build the scenarios listed under the key ``mixture``; return the completed document and these scenarios.
 
-    Keys next to ``mixture`` replace the same keys in every listed scenario. Shared settings, such as ``vehicles``, are
-    added to the document if all scenarios have the same value. If the list is invalid, the function returns the
-    unchanged document and no scenarios, and the schema rejects the document later. Raises ``InvalidInput`` naming the
-    invalid scenario, or the key that must have the same value in all scenarios but has not.
+    Keys that stand beside ``mixture`` in the file replace the same keys in every listed scenario. Shared settings, such
+    as ``vehicles``, are added to the document if all scenarios have the same value. If the list is invalid, the
+    function returns the unchanged document and no scenarios, and the schema rejects the document later. Raises
+    ``InvalidInput`` naming the invalid scenario, or the key that must have the same value in all scenarios but has not.
 
     Args:
         document: parsed file with a key ``mixture``.
@@ -86,7 +86,7 @@ def _member_document(document: Document, i: int, entry: Mapping[str, Any], besid
         document: parsed file of the mixture.
         i: position of the scenario in the mixture's list, from 0.
         entry: content of the mixture's list at this position.
-        beside: keys and values next to ``mixture``, which replace the same keys of the scenario.
+        beside: keys and values that stand beside ``mixture`` in the file; they replace the same keys of the scenario.
 
     """
     own = {key: value for key, value in entry["scenario"].items() if key not in WORDS}

@@ -59,7 +59,7 @@ class ScriptSpec(NamedTuple):
 
     @property
     def deceleration_mps2(self) -> float | None:
-        """Deceleration a of ``constant:a`` (m/s2, negative for driving); None for any other script.
+        """Deceleration a of a script ``constant:a`` (m/s2, negative for driving); None for any other script.
 
         Raises ``InvalidInput`` if the deceleration is missing or not a finite number.
         """
@@ -87,7 +87,7 @@ class ScriptSpec(NamedTuple):
 
     @property
     def hardest_mps2(self) -> float | None:
-        """Largest deceleration (m/s2) of ``constant:a`` or a ``profile``; None for any other script."""
+        """Largest deceleration (m/s2) of a script ``constant:a`` or ``profile``; None for any other script."""
         return max(braking for _, braking in self.pieces) if self.name == _PROFILE else self.deceleration_mps2
 
     def is_state_free(self) -> bool:

@@ -254,7 +254,7 @@ def _range(key: str, low: float, high: float, positive: bool = False) -> dict[st
         key: key of the quantity.
         low: smallest allowed value.
         high: largest allowed value.
-        positive: whether ``low`` itself is excluded.
+        positive: True: the value ``low`` itself is not allowed.
 
     """
     limits = {"exclusiveMinimum" if positive else "minimum": low, "maximum": high}
